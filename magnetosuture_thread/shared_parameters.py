@@ -38,6 +38,14 @@ _QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
         -2.0 * math.pi,
         2.0 * math.pi,
     ),
+    "friction_feedback": (
+        "all",
+        "which commands the thread's friction slows: all, or those of the operator only, while procedures and paths "
+        "keep limits of their own",
+        "",
+        None,
+        None,
+    ),
     "driver_timeout": (
         0.2,
         "without new currents for this long the coil drivers switch off by themselves; whole tenths for RoboClaw "
@@ -48,6 +56,8 @@ _QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
     ),
 }
 
+_CHOICES = {"friction_feedback": ("all", "operator")}
+
 SHARED_PARAMETERS = tuple(_QUANTITIES)
 """Names of the shared parameters."""
 
@@ -55,4 +65,5 @@ SHARED_PARAMETERS = tuple(_QUANTITIES)
 def shared_parameter(name: str) -> Any:
     """Return the dataclass field of a shared parameter."""
     default, description, unit, minimum, maximum = _QUANTITIES[name]
-    return quantity(default, description, unit=unit, minimum=minimum, maximum=maximum)
+    choices = _CHOICES.get(name, ())
+    return quantity(default, description, unit=unit, minimum=minimum, maximum=maximum, choices=choices)

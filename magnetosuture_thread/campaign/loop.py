@@ -241,6 +241,8 @@ class ClosedLoop:
             force = np.full(2, np.nan) if forces is None else forces.needle_force
             self.bridge.feedforward.update(force, stamp, now)
         self._condition = replace(condition_of(result), drift=self._drift)
+        if self.setup.coils.friction_feedback != "all":
+            self._condition = replace(self._condition, slowdown=1.0)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
         if self._recorder is not None:

@@ -267,11 +267,13 @@ class CoilBridge:
             output = replace(self._zero_output(now, arrival, selected, ()), publish=True)
             self._stopped = None
             return output
+        # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
+        slowed = selected.source == OPERATOR or self._settings.friction_feedback == "all"
         filtered = self._filter.filter(
             selected.velocity,
             pose.tail,
             pose.heading,
-            slowdown=1.0 if no_prediction else self.prediction_monitor.slowdown,
+            slowdown=self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0,
             max_speed=self._settings.speed_without_prediction if no_prediction else math.inf,
             previous=self._velocity,
             elapsed=elapsed,

@@ -100,6 +100,7 @@ class CoilBridgeSettings(Configuration):
     prediction_timeout: float = quantity(
         0.5, "margins of the thread model are valid for this long", unit="s", minimum=0.05, maximum=5.0
     )
+    friction_feedback: str = shared_parameter("friction_feedback")
     without_prediction: str = quantity(
         "stop",
         "behaviour while the thread is not predicted: stop, or slow, to speed_without_prediction",

@@ -137,7 +137,7 @@ class ThreadForecaster:
         friction = NO_FRICTION
         if law is not None:
             friction = np.array([law.threshold, law.beta, law.stuck_speed, friction_averaging])
-        self._model = RolloutModel(
+        self._slowed = RolloutModel(
             rod=formulation.rod,
             near=formulation.workspace.data,
             around=around.data,
@@ -152,6 +152,9 @@ class ThreadForecaster:
             friction=friction,
             drag=np.zeros(5) if drag is None else drag.numbers(thread),
         )
+        unslowed = friction.copy()
+        unslowed[1] = 1.0  # the factor of each node; which nodes are under friction stays
+        self._unslowed = self._slowed._replace(friction=unslowed)
         self._workers = max(1, os.cpu_count() or 1) if workers is None else max(1, workers)
         self._room = 2 * (thread.segments + 1)  # for contacts
         self._buffers: SimpleQueue[RolloutBuffers] = SimpleQueue()
@@ -182,7 +185,9 @@ class ThreadForecaster:
         path = lay_behind_needle(fixed, pose.heading, self.thread.length, radius)
         return chain_inside(path, self.thread.segments, self.thread.segment_length, radius)
 
-    def forecast(self, start: ForecastStart, commands: Vector | Controller, horizon: float = 3.0) -> Forecast:
+    def forecast(
+        self, start: ForecastStart, commands: Vector | Controller, horizon: float = 3.0, *, slowed: bool = True
+    ) -> Forecast:
         """Return what happens from a start under a command.
 
         Args:
@@ -190,6 +195,7 @@ class ThreadForecaster:
             commands: velocity of the tip [m/s]: one that is held, shape (2,), one for each step, shape (k, 2), or a
                 function of time, tail and heading that is asked before every step, as a path follower.
             horizon: a whole number of steps to the nearest [s].
+            slowed: whether the friction law slows the commands; see `friction_feedback` of the coil bridge.
 
         Raises:
             InvalidInputError: start or commands are not finite or of another shape, the needle is inside of a shape or
@@ -200,13 +206,18 @@ class ThreadForecaster:
         buffers = self._take_buffers()
         try:
             if callable(commands):
-                return self._controlled(start, commands, steps, buffers)
-            return self._held(start, self._sequence(commands, steps), steps, buffers)
+                return self._controlled(start, commands, steps, buffers, slowed)
+            return self._held(start, self._sequence(commands, steps), steps, buffers, slowed)
         finally:
             self._buffers.put(buffers)
 
     def forecasts(
-        self, start: ForecastStart | Sequence[ForecastStart], commands: Sequence[Vector] | Vector, horizon: float = 3.0
+        self,
+        start: ForecastStart | Sequence[ForecastStart],
+        commands: Sequence[Vector] | Vector,
+        horizon: float = 3.0,
+        *,
+        slowed: bool = True,
     ) -> list[Forecast]:
         """Return a batch of forecasts, on all cores: each is equal to what `forecast` returns.
 
@@ -214,6 +225,7 @@ class ThreadForecaster:
             start: of all, or one for each.
             commands: of each: velocities to hold, shape (m, 2), or sequences, shape (m, k, 2) [m/s].
             horizon: of all [s].
+            slowed: whether the friction law slows the commands.
 
         Raises:
             InvalidInputError: see `forecast`; or there are more than `MAX_BATCH`, or as many starts as not commands.
@@ -232,7 +244,7 @@ class ThreadForecaster:
         def work(index: int) -> Forecast:
             buffers = self._take_buffers()
             try:
-                return self._held(starts[index], sequences[index], steps, buffers)
+                return self._held(starts[index], sequences[index], steps, buffers, slowed)
             finally:
                 self._buffers.put(buffers)
 
@@ -242,19 +254,23 @@ class ThreadForecaster:
             self._pool = ThreadPoolExecutor(self._workers, "forecast")
         return list(self._pool.map(work, range(count)))
 
-    def _held(self, start: ForecastStart, commands: Points, steps: int, buffers: RolloutBuffers) -> Forecast:
+    def _held(
+        self, start: ForecastStart, commands: Points, steps: int, buffers: RolloutBuffers, slowed: bool
+    ) -> Forecast:
+        model = self._slowed if slowed else self._unslowed
         while True:
             state, record = self._begin(start, buffers), self._record(steps)
             self._set_force(start, record)
-            code, done = roll_out(self._model, buffers, state, commands, self.step, 0, steps, record)
+            code, done = roll_out(model, buffers, state, commands, self.step, 0, steps, record)
             if code != NO_ROOM:
                 return self._result(start, record, commands, code, done)
             self._room = max(self._room, 2 * len(buffers.step.node))
             buffers = self._make_buffers()
 
     def _controlled(
-        self, start: ForecastStart, controller: Controller, steps: int, buffers: RolloutBuffers
+        self, start: ForecastStart, controller: Controller, steps: int, buffers: RolloutBuffers, slowed: bool
     ) -> Forecast:
+        model = self._slowed if slowed else self._unslowed
         state, record, commands = self._begin(start, buffers), self._record(steps), np.zeros((steps, 2))
         self._set_force(start, record)
         code, done = ENDED, 0
@@ -264,9 +280,9 @@ class ThreadForecaster:
             if velocity.shape != (2,) or not np.isfinite(velocity).all():
                 raise InvalidInputError("controller's command", velocity.tolist(), "two finite numbers [m/s]")
             commands[done] = velocity
-            code, done = roll_out(self._model, buffers, state, commands, self.step, done, done + 1, record)
+            code, done = roll_out(model, buffers, state, commands, self.step, done, done + 1, record)
         if code == NO_ROOM:  # a controller may remember, so it is not asked again: the commands so far are repeated
-            forecast = self._held(start, commands[: done + 1], done + 1, buffers)
+            forecast = self._held(start, commands[: done + 1], done + 1, buffers, slowed)
             return replace(forecast, problem=f"more than {len(buffers.contacts.node)} contacts at once")
         return self._result(start, record, commands, code, done)
 
@@ -294,7 +310,7 @@ class ThreadForecaster:
         vertices = np.array(start.vertices, np.float64, order="C")
         velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
         heading = np.asarray(start.pose.heading, np.float64)
-        pulled = self._model.drag[0] > 0.0 and start.needle_force is not None
+        pulled = self._slowed.drag[0] > 0.0 and start.needle_force is not None
         x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
         return RolloutState(
             vertices,
@@ -344,7 +360,7 @@ class ThreadForecaster:
         return np.ascontiguousarray(np.broadcast_to(given, (steps, 2)))
 
     def _attached(self, pose: NeedlePose) -> Vector:
-        (x, y), (along, left) = pose.heading, self._model.offset
+        (x, y), (along, left) = pose.heading, self._slowed.offset
         return np.asarray(pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
     def _check_start(self, start: ForecastStart) -> None:

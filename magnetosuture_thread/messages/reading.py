@@ -139,8 +139,8 @@ def pose_covariance(message: Any) -> NDArray[np.float64] | None:
     return np.asarray(covariance)
 
 
-def filtered_command(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
-    """Return the stamp [ns], the commanded and the filtered velocity, shapes (2,) [m/s], of a FilterState.
+def filtered_command(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np.float64], str]:
+    """Return stamp [ns], commanded and filtered velocity, shapes (2,) [m/s], and followed input of a FilterState.
 
     Raises:
         InvalidInputError: a velocity is not finite, or the stamp no time.
@@ -149,7 +149,7 @@ def filtered_command(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np
     commanded, filtered = np.array([[v.x, v.y] for v in (message.commanded, message.filtered)])
     if not (np.isfinite(commanded).all() and np.isfinite(filtered).all()):
         raise InvalidInputError(FILTER_STATE.name, [*commanded, *filtered], "finite velocities [m/s]")
-    return stamp, commanded, filtered
+    return stamp, commanded, filtered, message.source
 
 
 def margins_of(message: Any) -> Margins:

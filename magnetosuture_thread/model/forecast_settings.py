@@ -27,5 +27,6 @@ class ForecastSettings(Configuration):
         minimum=2.5e-5,
         maximum=0.05,
     )
+    friction_feedback: str = shared_parameter("friction_feedback")
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")

@@ -50,7 +50,7 @@ class ThreadForecasts:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
-        self._command: tuple[int, np.ndarray, np.ndarray] | None = None  # stamp, commanded, filtered
+        self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
         self._published = topics.FORECAST.publisher(node)
         self._markers = topics.THREAD_MARKERS.publisher(node)
         topics.FILTER_STATE.subscribe(node, self.on_filter_state)
@@ -92,7 +92,8 @@ class ThreadForecasts:
         Raises:
             InvalidInputError: path, speed or horizon are out of bounds, or nothing is estimated yet.
         """
-        follower = make_path_follower(request, self._session.settings)
+        settings = self._session.settings
+        follower = make_path_follower(request, settings)
         forecaster = self._forecaster()
         if self._last is None or forecaster is None:
             raise InvalidInputError("forecast", "no estimate yet", "a thread that is estimated, in a scene")
@@ -102,7 +103,8 @@ class ThreadForecasts:
         def command(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
             return follower.compute_command(time, tail, heading).velocity
 
-        forecast = forecaster.forecast(ForecastStart(pose, result.estimate.positions), command, request.horizon)
+        start, slowed = ForecastStart(pose, result.estimate.positions), settings.friction_feedback == "all"
+        forecast = forecaster.forecast(start, command, request.horizon, slowed=slowed)
         answer.success = True
         answer.forecast = forecast_message(MESSAGES, MESSAGES.time(result.stamp), forecast)
         return answer
@@ -111,11 +113,12 @@ class ThreadForecasts:
         forecaster = self._forecaster()
         if forecaster is None or result.estimate is None:
             return None
-        commanded, filtered = np.zeros(2), None
+        commanded, filtered, source = np.zeros(2), None, ""
         if self._command is not None and abs(result.stamp - self._command[0]) <= MAX_COMMAND_AGE:
-            _, commanded, filtered = self._command
+            _, commanded, filtered, source = self._command
         start = ForecastStart(pose, result.estimate.positions, tip_velocity=filtered)
-        return forecaster.forecast(start, commanded, self._session.settings.forecast_horizon)
+        slowed = source == "operator" or self._session.settings.friction_feedback == "all"
+        return forecaster.forecast(start, commanded, self._session.settings.forecast_horizon, slowed=slowed)
 
     def _forecaster(self) -> ThreadForecaster | None:
         """Return the forecaster of the settings and the scene in force; None without a scene."""

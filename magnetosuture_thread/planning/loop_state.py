@@ -127,7 +127,7 @@ class LoopState:
             None if self._vertices is None else self._vertices(),
             self._tension,
             0 if margins is None else margins.friction_nodes,
-            1.0 if margins is None else margins.slowdown,
+            1.0 if margins is None or self._settings.friction_feedback != "all" else margins.slowdown,
             problem,
             self._drift,
         )

@@ -24,6 +24,7 @@ class NeedlePlannerSettings(Configuration):
     needle_curvature: float = shared_parameter("needle_curvature")
     thread_length: float = shared_parameter("thread_length")
     coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
+    friction_feedback: str = shared_parameter("friction_feedback")
     keep_out: float = quantity(
         0.0005,
         "minimum clearance of the needle's axis to wall and obstacles on a path; that of coil_bridge, or more",

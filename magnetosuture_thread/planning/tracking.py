@@ -21,10 +21,13 @@ MAX_INTEGRAL = 8e-4  # m; of it
 ACCELERATION = 0.008  # m/s^2
 MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther from it
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
-MAX_RATIO = 2.0  # of the allowed speed, that corrections of either kind may take
+MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and across may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
 DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
+MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
+ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
+AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
 
@@ -63,7 +66,9 @@ class PathTracker:
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, theta stays off the axes by min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p,
     and jumps to the other side when theta_p crosses. All of theta - theta_p stays within what half of the path's
-    leeway allows. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
+    leeway allows. Where d is more than the coils compensate at the needle's direction, or at one of the path's within
+    `AXIS_LOOKAHEAD`, the setpoint is slower, down to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is
+    pulled slowly. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -118,10 +123,14 @@ class PathTracker:
         bound = min(MAX_INTEGRAL, LOOKAHEAD * math.tan(min(allowed, 1.0)))
         self._integral = min(bound, max(-bound, self._integral))
         course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
-        course = min(allowed, max(-allowed, self._off_axes(direction, min(allowed, max(-allowed, course)), drift)))
+        course = min(allowed, max(-allowed, course))
+        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, drift)))
+        turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
+        course = off_axis
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
-        self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, speed, braked)
+        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle, drift))
+        self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, slower, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
         if stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
             self._speed = 0.0
@@ -132,9 +141,11 @@ class PathTracker:
         if not waits:
             self._integral += INTEGRAL_GAIN * interval * driven * across
         turn += course
-        limit, raised = MAX_RATIO * speed, 1.0 / max(slowdown, MIN_SLOWDOWN)
+        raised = 1.0 / max(slowdown, MIN_SLOWDOWN)
+        limit = MAX_ALONG_RATIO * speed
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
-        v = self.path.lever * self._speed * rate
+        v = self.path.lever * self._speed * turning
+        limit = MAX_TURN_RATIO * speed
         v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
@@ -147,6 +158,21 @@ class PathTracker:
             self._side = math.copysign(1.0, planned)
         kept = min(MAX_AXIS_ANGLE, abs(drift) / DRIFT_PER_ANGLE)
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
+
+    def _compensated_share(self, angle: float, drift: float) -> float:
+        """Return the share of a drift that coils compensate with ease, at a direction and those of the path ahead."""
+        if abs(drift) <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
+            return 1.0
+        ahead = min(
+            self._off_axis(self.path.at(min(self.path.length, self.travel + way))[1])
+            for way in np.linspace(0.0, AXIS_LOOKAHEAD, 5)
+        )
+        off = min(max(self._off_axis(angle), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
+        return min(1.0, DRIFT_PER_ANGLE * off / abs(drift))
+
+    def _off_axis(self, angle: float) -> float:
+        """Return the angle between a direction and the nearest axis [rad]."""
+        return min(abs(math.remainder(angle - axis, math.pi)) for axis in self._axes)
 
     def _rates(self, stop: float) -> tuple[float, float]:
         """Return how far the needle is driven along its chord, and turned [rad], for each metre of the tip's way."""

@@ -542,6 +542,21 @@ def test_friction_slows_the_needle():
     assert (output.slowdown, output.active) == (0.5, ("friction",))
 
 
+@pytest.mark.parametrize(
+    ("feedback", "source", "slowdown"),
+    [("all", "needle", 0.5), ("all", "operator", 0.5), ("operator", "needle", 1.0), ("operator", "operator", 0.5)],
+)
+def test_friction_slows_the_commands_that_it_is_fed_back_to(feedback: str, source: str, slowdown: float):
+    plant = Plant(CoilBridgeSettings(friction_feedback=feedback), thread=False, velocity=None).ready()
+    for _ in range(40):
+        plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
+        plant.command((0.01, 0.0), source=source)
+        output = plant.run(PERIOD)[0]
+    assert output.source == source
+    assert output.filtered.tolist() == pytest.approx([slowdown * 0.01, 0.0])
+    assert output.slowdown == slowdown
+
+
 def test_model_and_bridge_on_different_scenes_for_half_a_second_stop_the_needle():
     plant = Plant(thread=False).ready()
 

@@ -136,6 +136,17 @@ def test_forecast_equals_stepping_by_hand(attachment: Attachment, friction: floa
     assert not forecast.problem
 
 
+def test_a_command_that_friction_does_not_slow_is_forecast_so(forecaster: ThreadForecaster):
+    start = forecaster.straight(START)
+    slowed, free = (forecaster.forecast(start, UP, HORIZON, slowed=each) for each in (True, False))
+    assert all(each.friction[1:].any() for each in (slowed, free)), "nodes are under friction in both"
+    assert slowed.slowdown.min() < 1.0
+    assert free.slowdown.tolist() == [1.0] * len(free.slowdown)
+    assert np.hypot(*free.filtered[-1]) > np.hypot(*slowed.filtered[-1])
+    (batch,) = forecaster.forecasts(start, [UP], HORIZON, slowed=False)
+    assert same(batch, free)
+
+
 def test_forecast_goes_on_from_where_a_predictor_is(forecaster: ThreadForecaster):
     """With the last step's velocities and its solver's guess, one forecast is the end of a longer one."""
     start = forecaster.straight(START)

@@ -41,6 +41,11 @@ def test_a_state_in_which_all_is_known_has_no_problem():
     assert condition.vertices is not None
 
 
+def test_a_bridge_that_feeds_friction_back_to_the_operator_only_slows_no_procedure():
+    condition = known(friction_feedback="operator").condition(0.1)
+    assert (condition.friction_nodes, condition.slowdown) == (3, 1.0)
+
+
 @pytest.mark.parametrize("unmeasured", [1.01, math.inf, math.nan])
 def test_an_estimate_that_was_not_measured_is_unsure(unmeasured: float):
     state = known()

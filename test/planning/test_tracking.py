@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.tracking import DRIFT_PER_ANGLE, MAX_AXIS_ANGLE, PathTracker
+from magnetosuture_thread.planning.tracking import (
+    ALWAYS_OFF,
+    AXIS_LOOKAHEAD,
+    DRIFT_PER_ANGLE,
+    MAX_ALONG_RATIO,
+    MAX_AXIS_ANGLE,
+    MIN_SPEED_SHARE,
+    PathTracker,
+)
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 
 NEEDLE = NeedleKinematics(0.0025)
@@ -77,3 +85,50 @@ def test_friction_that_slows_the_needle_does_not_slow_its_turns_to_the_path(slow
     command = tracker.compute_command(0.0, middle, angle + 0.1, 0.002, slowdown)
     turning = command.velocity @ np.array([-math.sin(angle + 0.1), math.cos(angle + 0.1)])
     assert slowdown * turning == pytest.approx(-6.0 * 0.1 * tracker.path.lever, rel=0.02)
+
+
+@pytest.mark.parametrize("drift", [2.4e-3, -3.6e-3, 0.02])
+def test_a_needle_is_slower_before_an_axis_where_coils_cannot_hold_it_against_the_pull(drift: float):
+    """From the lookahead on, the pull that friction makes of the thread's drag has to fall."""
+    before, step = 60, 1e-4
+    bend = np.concatenate([np.full(before, 0.6), np.linspace(0.6, 0.0, 10), np.full(60, 0.0)])
+    tracker = PathTracker(path(bend, step), COIL_ANGLES)
+    middle, angle = tracker.path.at(0.0)
+    speeds: dict[float, float] = {}
+    for k in range(2000):
+        travel = tracker.travel
+        if tracker.compute_command(k / RATE, middle, angle, 0.002, 1.0, drift).done:
+            break
+        speeds[travel] = RATE * (tracker.travel - travel)
+        middle, angle = tracker.path.at(tracker.travel)
+        angle += max(0.0, MAX_AXIS_ANGLE - angle)  # kept off the axis, as commanded
+    far = [speed for travel, speed in speeds.items() if 1e-3 < travel < before * step - 1.5 * AXIS_LOOKAHEAD]
+    near = [speed for travel, speed in speeds.items() if before * step < travel < before * step + 2e-3]
+    expected = max(MIN_SPEED_SHARE, min(1.0, DRIFT_PER_ANGLE * MAX_AXIS_ANGLE / abs(drift)))
+    assert near == pytest.approx([expected * 0.002] * len(near), rel=1e-6)
+    assert near
+    assert min(far) == pytest.approx(min(1.0, max(MIN_SPEED_SHARE, DRIFT_PER_ANGLE * 0.6 / abs(drift))) * 0.002)
+
+
+def test_a_pull_that_coils_hold_at_an_axis_slows_nothing():
+    axis = path(np.full(80, 0.0))
+    drift = 0.99 * DRIFT_PER_ANGLE * ALWAYS_OFF
+    counts = [len(headings(PathTracker(axis, COIL_ANGLES), each)) for each in (0.0, drift)]
+    assert counts[0] == counts[1]
+
+
+def test_a_needle_that_is_kept_off_an_axis_does_not_turn_with_the_path():
+    bend = path(np.concatenate([np.full(20, 0.6), np.linspace(0.6, 0.02, 12), np.full(60, 0.02)]))
+    drift = 0.9 * DRIFT_PER_ANGLE * MAX_AXIS_ANGLE
+    found = headings(PathTracker(bend, COIL_ANGLES), drift)
+    assert found.min() >= 0.95 * drift / DRIFT_PER_ANGLE
+
+
+def test_a_needle_that_lags_is_not_driven_faster_than_half_beyond_the_allowed_speed():
+    straight = path(np.full(80, 0.6))
+    tracker = PathTracker(straight)
+    middle, angle = straight.at(0.0)
+    e = np.array([math.cos(angle), math.sin(angle)])
+    velocities = [tracker.compute_command(k / RATE, middle, angle, 0.002).velocity @ e for k in range(40)]
+    assert max(velocities) <= (1.0 + MAX_ALONG_RATIO) * 0.002 * (1.0 + 1e-9)
+    assert max(velocities) > 0.002
