@@ -27,6 +27,7 @@ DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
+PULL_MEMORY = 1.0  # s; in which the peak of a pull falls to 1 / e
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
@@ -64,11 +65,12 @@ class PathTracker:
     from it than `MAX_LAG` along the path or `MAX_ANGLE`.
 
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
-    the velocity d, theta stays off the axes by min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p,
-    and jumps to the other side when theta_p crosses. All of theta - theta_p stays within what half of the path's
-    leeway allows. Where d is more than the coils compensate at the needle's direction, or at one of the path's within
-    `AXIS_LOOKAHEAD`, the setpoint is slower, down to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is
-    pulled slowly. Corrections of the direction are raised by as much as the bridge slows them, within the same limits.
+    the velocity d, by its peak of the last second or so (`PULL_MEMORY`), theta stays off the axes by
+    min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
+    crosses. All of theta - theta_p stays within what half of the path's leeway allows. Where d is more than the coils
+    compensate at the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down
+    to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction are
+    raised by as much as the bridge slows them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -87,6 +89,7 @@ class PathTracker:
         self._stamp: float | None = None
         self._speed = 0.0
         self._integral = 0.0
+        self._pull = 0.0  # across the needle, as a velocity: its peak, which is forgotten slowly [m/s]
         self._side = 0.0  # of the nearest axis, on which the needle lies; 0 before the first pose
 
     @property
@@ -124,12 +127,14 @@ class PathTracker:
         self._integral = min(bound, max(-bound, self._integral))
         course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
         course = min(allowed, max(-allowed, course))
-        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, drift)))
+        # Close to an axis less of the pull is measured, so its peak is remembered for a while.
+        self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_MEMORY))
+        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
-        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle, drift))
+        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, slower, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
         if stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
@@ -149,26 +154,26 @@ class PathTracker:
         v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
-    def _off_axes(self, direction: float, course: float, drift: float) -> float:
+    def _off_axes(self, direction: float, course: float) -> float:
         """Return the course with which the needle stays off the coils' axes, on the side of the planned direction."""
         if not self._axes:
             return course
         planned = min((math.remainder(direction - axis, math.pi) for axis in self._axes), key=abs)
         if not self._side or planned * self._side <= -AXIS_CROSSED:
             self._side = math.copysign(1.0, planned)
-        kept = min(MAX_AXIS_ANGLE, abs(drift) / DRIFT_PER_ANGLE)
+        kept = min(MAX_AXIS_ANGLE, self._pull / DRIFT_PER_ANGLE)
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
 
-    def _compensated_share(self, angle: float, drift: float) -> float:
-        """Return the share of a drift that coils compensate with ease, at a direction and those of the path ahead."""
-        if abs(drift) <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
+    def _compensated_share(self, angle: float) -> float:
+        """Return the share of the pull that coils compensate with ease, at a direction and those of the path ahead."""
+        if self._pull <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
             return 1.0
         ahead = min(
             self._off_axis(self.path.at(min(self.path.length, self.travel + way))[1])
             for way in np.linspace(0.0, AXIS_LOOKAHEAD, 5)
         )
         off = min(max(self._off_axis(angle), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
-        return min(1.0, DRIFT_PER_ANGLE * off / abs(drift))
+        return min(1.0, DRIFT_PER_ANGLE * off / self._pull)
 
     def _off_axis(self, angle: float) -> float:
         """Return the angle between a direction and the nearest axis [rad]."""

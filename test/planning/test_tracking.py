@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -33,12 +34,15 @@ def path(angles: np.ndarray, step: float = 1e-4) -> BodyPath:
     return BodyPath(middles, angles, 0.5 * NEEDLE.chord, leeway, np.array([made.length]))
 
 
-def headings(tracker: PathTracker, drift: float, slowdown: float = 1.0, seconds: float = 60.0) -> np.ndarray:
-    """Return the headings of an ideal needle on a path, whose drift the coils compensate [rad]."""
+def headings(
+    tracker: PathTracker, drift: float | Callable[[float], float], slowdown: float = 1.0, seconds: float = 60.0
+) -> np.ndarray:
+    """Return the headings of an ideal needle on a path, whose drift, also by heading, the coils compensate [rad]."""
     middle, angle = tracker.path.at(0.0)
     found: list[float] = []
     for k in range(round(seconds * RATE)):
-        command = tracker.compute_command(k / RATE, middle, angle, 0.002, slowdown, drift)
+        measured = drift(angle) if callable(drift) else drift
+        command = tracker.compute_command(k / RATE, middle, angle, 0.002, slowdown, measured)
         if command.done:
             return np.array(found)
         e = np.array([math.cos(angle), math.sin(angle)])
@@ -57,6 +61,12 @@ def test_a_needle_that_is_pulled_aside_stays_off_the_axis_of_a_coil(axis: float,
     off = headings(PathTracker(path(np.full(80, axis)), COIL_ANGLES), drift)[round(0.5 * RATE) :] - axis
     assert np.abs(off).min() >= 0.95 * abs(drift) / DRIFT_PER_ANGLE
     assert np.all(off > 0.0) or np.all(off < 0.0) or not drift
+
+
+def test_it_stays_off_the_axis_also_where_less_of_the_pull_is_measured_close_to_it():
+    bend = path(np.concatenate([np.full(20, 0.3), np.linspace(0.3, 0.02, 12), np.full(4, 0.02)]))
+    found = headings(PathTracker(bend, COIL_ANGLES), lambda angle: 1.2e-3 if angle > 0.11 else 3e-4)
+    assert found.min() >= 0.7 * 1.2e-3 / DRIFT_PER_ANGLE
 
 
 def test_it_crosses_the_axis_on_a_bend_at_once():
