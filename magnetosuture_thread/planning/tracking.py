@@ -28,6 +28,7 @@ MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
 PULL_MEMORY = 1.0  # s; in which the peak of a pull falls to 1 / e
+TACK_SHARE, MAX_TACK_ERROR = 0.35, 3e-4  # of the leeway, and m; off the path, from which on the needle tacks
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
@@ -67,10 +68,11 @@ class PathTracker:
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, by its peak of the last second or so (`PULL_MEMORY`), theta stays off the axes by
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
-    crosses. All of theta - theta_p stays within what half of the path's leeway allows. Where d is more than the coils
-    compensate at the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down
-    to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction are
-    raised by as much as the bridge slows them, within the same limits.
+    crosses, or while the needle is far off its path to the wrong side, as a ship tacks. All of theta - theta_p stays
+    within what half of the path's leeway allows. Where d is more than the coils compensate at the needle's direction,
+    or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down to `MIN_SPEED_SHARE`: a thread in a
+    liquid pulls less when it is pulled slowly. Corrections of the direction are raised by as much as the bridge slows
+    them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -90,6 +92,7 @@ class PathTracker:
         self._speed = 0.0
         self._integral = 0.0
         self._pull = 0.0  # across the needle, as a velocity: its peak, which is forgotten slowly [m/s]
+        self._tack = 0.0  # error across the path for which the needle lies on the other side [m]; 0 if it does not
         self._side = 0.0  # of the nearest axis, on which the needle lies; 0 before the first pose
 
     @property
@@ -129,7 +132,7 @@ class PathTracker:
         course = min(allowed, max(-allowed, course))
         # Close to an axis less of the pull is measured, so its peak is remembered for a while.
         self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_MEMORY))
-        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course)))
+        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, across)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
         waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
@@ -154,14 +157,22 @@ class PathTracker:
         v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
-    def _off_axes(self, direction: float, course: float) -> float:
-        """Return the course with which the needle stays off the coils' axes, on the side of the planned direction."""
+    def _off_axes(self, direction: float, course: float, across: float) -> float:
+        """Return the course with which the needle stays off the coils' axes, on the side of the planned direction.
+
+        A needle that is far off its path on one side tacks: it stays on the other side of the axis until it is back.
+        """
         if not self._axes:
             return course
         planned = min((math.remainder(direction - axis, math.pi) for axis in self._axes), key=abs)
-        if not self._side or planned * self._side <= -AXIS_CROSSED:
-            self._side = math.copysign(1.0, planned)
         kept = min(MAX_AXIS_ANGLE, self._pull / DRIFT_PER_ANGLE)
+        if abs(planned) >= kept or across * self._tack <= 0.0:
+            self._tack = 0.0
+        is_off = abs(across) > min(MAX_TACK_ERROR, TACK_SHARE * self.leeway)
+        if is_off and not self._tack and abs(planned) < kept and course * self._side < 0.0:
+            self._side, self._tack = -self._side, across
+        if not self._tack and (not self._side or planned * self._side <= -AXIS_CROSSED):
+            self._side = math.copysign(1.0, planned)
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
 
     def _compensated_share(self, angle: float) -> float:
