@@ -27,6 +27,7 @@ WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the midd
 MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
 MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
+CLEAR_EVIDENCE = 10.0  # mean evidence of a line as long as the thread, that may be fainter where it comes out
 MIN_EDGE = 0.15  # share of the evidence, that a thread's fainter edge has: less, and it is the border of something else
 
 
@@ -154,7 +155,9 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
             if walk.shown < FAINT_SHARE * enough:
                 continue
             centred, section = search.centred(walk)
-            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
+            is_clear = section.mean > CLEAR_EVIDENCE and centred.shown > enough
+            begins = section.beginning > MIN_BEGINNING or is_clear
+            if not begins or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
                 continue
             # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
             total = section.mean * centred.shown

@@ -29,7 +29,8 @@ BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, 
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
 BEGINNING = 2 * WINDOW + 1  # vertices where a thread comes out
-MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends
+MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends ...
+GAP, SAME = 10, 0.5  # ... unless so few vertices on it shows this share of its usual contrast again
 SHADOW = 0.5  # of a thread's usual contrast, that its shadow may show, whose edges are no sharp ones
 EVEN = 2  # vertices to both sides, over which shifts are averaged
 ROUNDS = 2  # of measuring the colour and then the shift
@@ -88,12 +89,17 @@ class CrossSection:
     def up_to_its_end(self) -> CrossSection:
         """Return the part up to where the thread ends.
 
-        It is seen no farther than up to where floor explains a whole stretch better; of that part, the evidence up to
-        the end is the greatest (maximum likelihood). A last part as weak as a thread's shadow may be no more than that.
+        It is seen no farther than up to where floor explains a whole stretch better, and it does not show again soon
+        after, as beyond a reflection of the lamp beside it; of that part, the evidence up to the end is the greatest
+        (maximum likelihood). A last part as weak as a thread's shadow may be no more than that.
         """
         stretches = _mean(self.evidence[:, None], WINDOW)[:, 0]
-        floor = np.flatnonzero(stretches < -MIN_FLOOR)
-        searched = self.evidence[: floor[0] + 1] if len(floor) else self.evidence
+        searched = self.evidence
+        for first in np.flatnonzero(stretches < -MIN_FLOOR):
+            usual = float(np.median(stretches[: first + 1]))
+            if stretches[first : first + GAP].max() < max(MIN_FLOOR, SAME**2 * usual):
+                searched = self.evidence[: first + 1]
+                break
         count = int(np.argmax(np.cumsum(searched))) + 1
         strong = np.flatnonzero(stretches[:count] > SHADOW**2 * float(np.median(stretches[:count])))
         count = int(strong[-1]) + 1 if len(strong) else 1

@@ -219,7 +219,7 @@ class ThreadSearch:
     def is_edge(self, walk: Walk) -> bool:
         """Say whether a walk runs along something far wider than itself: its edge, its shadow, or its texture.
 
-        What is wide keeps its contrast in a shrunk image, what is thin loses it.
+        What is wide keeps its contrast in a shrunk image, what is thin loses it: in the one that was walked in, too.
         """
         contrast = None
         factor = self._picture.factor
@@ -231,7 +231,8 @@ class ThreadSearch:
             contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
         usual = middle(near[::3, ::3])
-        return self._median_along(walk.points, near, COARSE) - usual > WIDE_SHARE * walk.strength
+        share = WIDE_SHARE * math.sqrt(walk.ridge.scale)
+        return self._median_along(walk.points, near, COARSE) - usual > share * walk.strength
 
     def wide(self) -> Walk:
         """Return the walk along what is wide and differs from around in colour as it does where it begins.
