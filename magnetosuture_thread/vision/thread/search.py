@@ -50,6 +50,7 @@ COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
 WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
 WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
 WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in the shrunk image
+OVERRUN = 5.0  # price of a pixel of a wide walk beyond the thread's length, as its crossings are not judged
 OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
@@ -302,22 +303,12 @@ class ThreadSearch:
         path[0] = 0.0  # all that there is where nothing leaves the tail
         needle, dish = self._needle, self._dish(ridge)
         tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
-        count, shown = follow(
-            ridge.strength,
-            ridge.hidden,
-            ridge.factor,
-            ridge.noise,
-            ridge.faintest,
-            ridge.single,
-            ridge.stiffness,
-            np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
-            dish,
-            max_length,
-            (needle.length_px + MAX_BEYOND_PX) / scale,
-            self._at_wall,
-            path,
-            strong,
-        )
+        start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
+        image, levels = (ridge.strength, ridge.hidden, ridge.factor), (ridge.noise, ridge.faintest, ridge.single)
+        overrun = OVERRUN if ridge.scale == COARSE else 0.0
+        lengths = max_length, (needle.length_px + MAX_BEYOND_PX) / scale
+        thread = ridge.stiffness, overrun
+        count, shown = follow(*image, *levels, *thread, start, dish, *lengths, self._at_wall, path, strong)
         return self._ended(ridge, path, strong, count, shown)
 
     def _buffers(self, ridge: Ridge) -> tuple[np.ndarray, np.ndarray]:
