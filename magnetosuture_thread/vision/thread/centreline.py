@@ -23,6 +23,8 @@ from magnetosuture_thread.vision.thread.search import (
     only_tail,
 )
 
+WIDENESS = 1.2  # of a walk along the edge, the shadow or the texture of something far wider than itself
+PALE_WIDENESS = 1.0  # the same where that is as bright as the floor but for its edges
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
 MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
@@ -130,21 +132,25 @@ def walk_from(
     dark = search.dark()
     enough = ENOUGH * max_length
     best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
-    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
+    wideness = search.wideness(best) if len(best.points) >= MIN_CENTRED else 0.0
+    edge = search.between_edges(best) if wideness > PALE_WIDENESS and not best.ridge.signed else None
+    if wideness > WIDENESS:
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
             centred = search.centred(wide)[0]
             best = centred if centred.shown > SURE_SHARE * wide.shown else wide  # a rope's edges are too far apart
-        elif (
-            best is dark and dark.shown > SURE_SHARE * enough
-        ):  # Its middle is not visible; a short one may be covered.
-            best = only_tail(dark)
+        elif edge is not None:
+            best = edge
+        elif best is dark and dark.shown > SURE_SHARE * enough:
+            best = only_tail(dark)  # Its middle is not visible; a short one may be covered.
+    elif edge is not None:
+        best = edge
     if doubted:
         own = search.without_passing_line(best)
         # A faint line that passes, as the border of tissue, does not speak against a thread that is dark beyond doubt.
         instead = own.passes and best is not dark and dark.strength > FAINT
         best = search.without_passing_line(dark) if instead else own
-    return search.resolved(best)
+    return best if best is edge else search.resolved(best)  # An edge's own crossings are with other edges.
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
