@@ -258,6 +258,7 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("decoy_at_thread", 9, 91001),  # a walk has one edge only, the thread's
         ("decoy_at_thread", 3, 410001),  # what is thin looks wide beside its strength at half the size
         ("decoy_at_thread", 12, 410001),
+        ("decoy_at_thread", 56, 510001),  # a walk over bare floor reaches the thread, at a quarter of the size
         ("fold_0_4_2.5mm", 2, 410001),  # the thread lies over one side of the tip, which looks like a rod's tail
         ("rod_in_path", 57, 310001),  # a line over a rod leaves one end through its middle
         ("rod_in_path", 25, 310004),  # a line hides one end of a rod, whose length is set wrong
