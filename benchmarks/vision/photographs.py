@@ -110,29 +110,11 @@ def _step(away: Plane, radius: float, soft: float) -> Plane:
     return np.asarray(0.5 - 0.5 * np.tanh((away - radius) / soft), np.float32)
 
 
-def _dish(
-    random: np.random.Generator,
-    picture: Plane,
-    camera: _Camera,
-    at: tuple[float, float],
-    floor: str,
-    height: float,
-    lid: bool,
+def _draw_use(
+    random: np.random.Generator, picture: Plane, camera: _Camera, at: tuple[float, float], place_of: tuple[Plane, Plane]
 ) -> None:
-    """Draw a dish with its shadow, its floor, what grows on it, its wall and its lid."""
-    x, y = camera.plane(0.0)
-    x, y = x - at[0], y - at[1]
-    away, around = np.hypot(x, y), np.arctan2(y, x)
-    soft = 0.006
-    shadow = _step(np.hypot(x - 0.06, y - 0.05), 1.08, 0.05)
-    picture *= 1.0 - random.uniform(0.1, 0.4) * shadow[..., None]
-    colour, opacity = FLOORS[floor]
-    inside = _step(away, 1.0, soft)
-    if colour is None:
-        tone = picture * 0.88 + 14.0
-    else:
-        tone = np.asarray(colour, np.float32) * (1.0 + 0.06 * _texture(random, x, y, 1.0, 1.0)[..., None])
-    picture += (opacity if colour else 1.0) * inside[..., None] * (tone - picture)
+    """Draw what grows on a dish's floor, and a label or writing."""
+    x, y = place_of
     for _ in range(int(random.integers(0, 60))):  # colonies
         radius, place = random.uniform(0.01, 0.06), random.uniform(-0.7, 0.7, 2)
         blob = _step(np.hypot(x - place[0], y - place[1]), radius, 0.008)
@@ -150,6 +132,34 @@ def _dish(
         ink = np.zeros(picture.shape[:2], np.uint8)
         cv2.putText(ink, "A7 02.11.", (int(spot[0]), int(spot[1])), 3, scale, 255, max(1, int(2 * scale)), cv2.LINE_AA)
         picture += (ink / np.float32(255.0))[..., None] * (np.array((30.0, 30.0, 60.0), np.float32) - picture)
+
+
+def _dish(
+    random: np.random.Generator,
+    picture: Plane,
+    camera: _Camera,
+    at: tuple[float, float],
+    floor: str,
+    height: float,
+    lid: bool,
+    plain: bool = False,
+) -> None:
+    """Draw a dish with its shadow, its floor, what grows and is written on it unless it is plain, its wall and lid."""
+    x, y = camera.plane(0.0)
+    x, y = x - at[0], y - at[1]
+    away, around = np.hypot(x, y), np.arctan2(y, x)
+    soft = 0.006
+    shadow = _step(np.hypot(x - 0.06, y - 0.05), 1.08, 0.05)
+    picture *= 1.0 - random.uniform(0.1, 0.4) * shadow[..., None]
+    colour, opacity = FLOORS[floor]
+    inside = _step(away, 1.0, soft)
+    if colour is None:
+        tone = picture * 0.88 + 14.0
+    else:
+        tone = np.asarray(colour, np.float32) * (1.0 + 0.06 * _texture(random, x, y, 1.0, 1.0)[..., None])
+    picture += (opacity if colour else 1.0) * inside[..., None] * (tone - picture)
+    if not plain:
+        _draw_use(random, picture, camera, at, (x, y))
     bright = random.uniform(25.0, 90.0)
     sign = -1.0 if random.random() < 0.5 else 1.0
     modulation = 0.65 + 0.35 * np.cos(around - random.uniform(-np.pi, np.pi))
@@ -182,6 +192,9 @@ def photograph(
     dishes: int = 1,
     hand: bool = False,
     exposure: float = 1.0,
+    rows: int = 0,
+    radius: tuple[float, float] = (0.22, 0.46),
+    draw: Callable[[Plane, Callable[[NDArray[np.float64]], NDArray[np.float64]]], None] | None = None,
 ) -> Photograph:
     """Draw a photograph.
 
@@ -194,14 +207,18 @@ def photograph(
         dishes: how many there are.
         hand: whether fingers hold it.
         exposure: 1 is well exposed.
+        rows: of the picture; 0: drawn at random.
+        radius: least and greatest, of the dish, as shares of the picture's shorter side.
+        draw: draws into the dish, on whose floor nothing else is then, by what turns points (x, y, z) in radii of the
+            dish into pixels.
     """
     ground = ground or str(random.choice(GROUNDS))
     floor = floor or str(random.choice(list(FLOORS)))
-    rows = int(random.choice((240, 320, 480, 600, 768, 1080, 1440)))
+    rows = rows or int(random.choice((240, 320, 480, 600, 768, 1080, 1440)))
     width = int(rows * random.choice((1.0, 1.333, 1.5, 1.778)))
     size = (rows, width) if random.random() < 0.2 else (width, rows)
     distance = random.uniform(5.0, 10.0)
-    radius_px = random.uniform(0.22, 0.46) * min(size) / (1.4 if dishes > 1 else 1.0)
+    radius_px = random.uniform(*radius) * min(size) / (1.4 if dishes > 1 else 1.0)
     angle, about = math.radians(random.uniform(*tilt)), random.uniform(-np.pi, np.pi)
     turn = cv2.Rodrigues(angle * np.array([math.cos(about), math.sin(about), 0.0]))[0]
     middle = np.array(size) * 0.5
@@ -228,7 +245,9 @@ def photograph(
             height,
             lid=False,
         )
-    _dish(random, picture, camera, (0.0, 0.0), floor, height, bool(random.random() < 0.5))
+    _dish(random, picture, camera, (0.0, 0.0), floor, height, bool(random.random() < 0.5), plain=draw is not None)
+    if draw is not None:
+        draw(picture, camera.pixels)
     if hand:
         for _ in range(int(random.integers(1, 4))):
             direction = random.uniform(-np.pi, np.pi)
@@ -263,13 +282,19 @@ PHOTOGRAPHS: dict[str, Callable[[np.random.Generator], Photograph]] = {
 }
 
 
+def straightened(found: FoundDish, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points of a photograph where they are once the tilt that was found is taken out, shape (m, 2) [px]."""
+    if found.tilt is None:
+        return points
+    along = np.array([math.cos(found.tilt.direction), math.sin(found.tilt.direction)])
+    offset = points - np.array(found.view.centre_px)
+    return np.asarray(points + (1.0 / math.cos(found.tilt.angle) - 1.0) * np.outer(offset @ along, along))
+
+
 def ellipse_error(found: FoundDish, diameter: float, points: NDArray[np.float64]) -> float:
     """Return the mean distance of points from the ellipse that was found, in its radii."""
     radius = 0.5 * diameter / found.view.metres_per_pixel
-    offset = points - np.array(found.view.centre_px)
-    if found.tilt is not None:
-        along = np.array([math.cos(found.tilt.direction), math.sin(found.tilt.direction)])
-        offset = offset + (1.0 / math.cos(found.tilt.angle) - 1.0) * np.outer(offset @ along, along)
+    offset = straightened(found, points) - np.array(found.view.centre_px)
     return float(np.mean(np.abs(np.hypot(*offset.T) / radius - 1.0)))
 
 

@@ -15,7 +15,7 @@ from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.dish.ellipse import circle_through, find_ellipse
-from magnetosuture_thread.vision.dish.find import Guess, find_cut_dish, find_dish
+from magnetosuture_thread.vision.dish.find import Guess, find_cut_dish, find_dish, floor_level
 from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, measured_channel, prepare
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
@@ -32,7 +32,7 @@ from magnetosuture_thread.vision.thread.search import Walk
 UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MIN_FOLLOWED, MIN_LOOSE = 0.04, 0.5  # of the thread's length: followed from a needle that has one; lying elsewhere
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
-DARK_FLOOR = 130.0  # grey levels; with a given view, a frame whose median is below may have a dark floor
+DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
 ELLIPSE_ERROR = 0.01  # of a scale by an edge of the wall in a photograph: which one it is, and where light moves it
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
@@ -166,6 +166,8 @@ def see_dish(
         if found is None:
             continue
         view, remark = found
+        if dark_field and floor_level(gray, view, diameter) < 255.0 - DARK_FLOOR:
+            continue  # A bright rim around a bright floor, as of clear walls.
         if settings.dish_centre_px or settings.metres_per_pixel:  # measured by a calibration
             error = 0.0 if settings.metres_per_pixel and not remark else SCALE_ERROR
             return FoundDish(view, dark_field, scale_error=error, remark=remark)
@@ -214,9 +216,7 @@ def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: 
     if (given := _with_given(found, settings)) is None:
         return None
     view, remark = given
-    outline = np.round(ellipse.points(60)[0]).astype(np.int32)
-    inside = np.asarray(cv2.fillPoly(np.zeros(gray.shape, np.uint8), [outline], 1))
-    dark_field = middle(gray[::4, ::4][inside[::4, ::4] > 0]) < DARK_ELLIPSE
+    dark_field = floor_level(gray, found, diameter) < DARK_ELLIPSE
     tilt = None if settings.dish_centre_px or settings.metres_per_pixel else tilt
     return FoundDish(view, dark_field, tilt, ELLIPSE_ERROR, 0.0 if tilt is not None else unseen_tilt, remark)
 

@@ -19,6 +19,7 @@ from magnetosuture_thread.vision.images import (
 )
 from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.look import (
+    FoundDish,
     State,
     Track,
     centreline_of,
@@ -83,6 +84,11 @@ class VisionTracker:
         self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
         self._shape: tuple[int, ...] = ()
         self.reset()
+
+    @property
+    def dish(self) -> FoundDish | None:
+        """What was found of the dish over time, in pixels of shrunk frames; None if nothing was."""
+        return self._dish.found
 
     def set_scene(self, scene: Scene) -> None:
         """Take another scene. The needle is still tracked, unless the dish has another size."""

@@ -83,6 +83,7 @@ def test_nothing_else_is_followed_in_place_of_a_faint_thread(name: str):
         ("thread_white_1.5px", 2, 21),
         ("thread_undyed_0.75px", 0, 21),  # seen in part only
         ("thread_undyed_0.75px", 2, 21),
+        ("thread_undyed_1px", 52, 310001),  # up to a reflection beside it
     ],
 )
 def test_pale_threads_that_were_followed_wrong_once_are_not(name: str, index: int, seed: int):
@@ -90,6 +91,13 @@ def test_pale_threads_that_were_followed_wrong_once_are_not(name: str, index: in
     assert result.pieces.covered > 0.95 * result.visible
     assert result.wrong < 0.005 * result.line
     assert result.pieces.wrong < 0.005 * result.pieces.length
+
+
+@pytest.mark.parametrize("index", [19, 35])
+def test_a_line_as_long_as_the_thread_may_be_faintest_where_it_comes_out(index: int):
+    result = measure(*frame_of("thread_undyed_0.75px", index, 310001))
+    assert result.pieces.covered > 0.9 * result.visible
+    assert result.pieces.wrong < 0.1 * result.pieces.length
 
 
 @pytest.mark.parametrize("name", ["thread_undyed_2px", "thread_white_1px", "thread_white_4px"])
@@ -248,6 +256,10 @@ def test_a_scale_that_no_camera_has_is_refused():
         ("decoy_needle", 32, 91001),  # a faint reflection of the lamp leaves the tail
         ("decoy_at_thread", 59, 91001),  # the thread passes beyond the tail, and touches nothing
         ("decoy_at_thread", 9, 91001),  # a walk has one edge only, the thread's
+        ("decoy_at_thread", 3, 410001),  # what is thin looks wide beside its strength at half the size
+        ("decoy_at_thread", 12, 410001),
+        ("decoy_at_thread", 56, 510001),  # a walk over bare floor reaches the thread, at a quarter of the size
+        ("fold_0_4_2.5mm", 2, 410001),  # the thread lies over one side of the tip, which looks like a rod's tail
         ("rod_in_path", 57, 310001),  # a line over a rod leaves one end through its middle
         ("rod_in_path", 25, 310004),  # a line hides one end of a rod, whose length is set wrong
         ("rod_in_path", 89, 310004),

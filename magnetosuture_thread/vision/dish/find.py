@@ -20,6 +20,7 @@ MAX_EDGE_SHARE = 0.3  # of the pixels; where more are edges all is texture, in w
 MIN_CONTRAST = 12.0  # grey levels
 CONTRAST = 0.15  # of the floor's brightness, at least, between floor and rim
 SATURATED, SATURATED_SHARE = 253, 0.15  # grey level, and share of a ring on the floor
+INNER_SIDE = 0.7  # of the diameter: of a square within the dish
 BAND = 0.02  # of the radius: beyond the inner edge, the rim is darkest within
 REACH = 0.04  # of the radius, in which the rim is looked for once it is known
 RIM_RAYS = 72  # of the quick check
@@ -180,6 +181,14 @@ def rim_points(gray: np.ndarray, centre: tuple[float, float], radius: float) -> 
     """
     edges, darkest = _edge_points(gray, *centre, radius, REACH * radius, 0.5, RAYS)
     return darkest if len(darkest) > len(edges) // 2 else edges
+
+
+def floor_level(gray: np.ndarray, view: DishView, diameter: float) -> float:
+    """Return how bright a dish's floor is, as the median of a square within it."""
+    half = 0.5 * INNER_SIDE * diameter / view.metres_per_pixel
+    left, top = (max(0, round(centre - half)) for centre in view.centre_px)
+    right, bottom = (max(4, round(centre + half)) for centre in view.centre_px)
+    return middle(gray[top:bottom:4, left:right:4])
 
 
 def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:

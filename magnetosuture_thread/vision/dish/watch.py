@@ -13,7 +13,8 @@ from magnetosuture_thread.vision.look import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 AGREEING = 3  # frames in a row that must agree on a new view
-AGREEMENT_PX, AGREEMENT = 1.0, 0.005  # of centres, and of scales
+AGREEMENT_PX, AGREEMENT = 1.0, 0.005  # of centres, and of scales ...
+DEVIATIONS = 2.0  # ... or so many standard deviations of both, as of a dish by its ellipse, if that is more
 LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
 
 
@@ -74,7 +75,10 @@ class DishWatch:
         if found is None:
             self._anew = []
             return "too little of the dish is seen", prepared
-        if self._anew and not _agree(found.view, self._anew[-1].view):
+        if self._agree(found, self.found):  # A rim that is not dark is seen by its ellipse only.
+            self._anew = []
+            return "", prepared
+        if self._anew and not self._agree(found, self._anew[-1]):
             self._anew = []
         self._anew.append(found)
         if len(self._anew) < AGREEING:
@@ -89,7 +93,10 @@ class DishWatch:
         self._searched = 0 if found is not None else self._searched + 1
         return found
 
-
-def _agree(one: DishView, other: DishView) -> bool:
-    apart = math.dist(one.centre_px, other.centre_px)
-    return apart < AGREEMENT_PX and abs(one.metres_per_pixel / other.metres_per_pixel - 1.0) < AGREEMENT
+    def _agree(self, one: FoundDish, other: FoundDish) -> bool:
+        """Say whether two dishes that were found are where one is, as far as is known of each."""
+        slack = DEVIATIONS * max(one.scale_error, other.scale_error)
+        scale = one.view.metres_per_pixel
+        apart = math.dist(one.view.centre_px, other.view.centre_px)
+        near = apart < max(AGREEMENT_PX, slack * 0.5 * self._diameter / scale)
+        return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(AGREEMENT, slack)

@@ -21,7 +21,8 @@ RING, RING_PX, VISIBLE = (
     0.1,
 )  # places around a tail, off its corners; darkness of a line there
 OVER_PX = np.arange(2.0, 12.0)  # inside of an end, where a line that lies over it is another colour than steel ...
-ACROSS_PX, OVER = np.array([-0.75, 0.0, 0.75]), 0.12  # ... at these places across, by this share of steel's darkness
+ASIDE, MIDDLE_PX = 0.35, 0.75  # ... at one side, at this share of the width, or in the middle, but not so far beside
+OVER = 0.12  # ... by this share of steel's darkness
 
 
 def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
@@ -52,8 +53,9 @@ def leaves_sideways(steel: SteelMap, fit: TemplateFit) -> bool:
 
 def leaves_tail(steel: SteelMap, fit: TemplateFit) -> bool:
     """Say whether one line goes away from a tail: not what lies over the needle there, or passes on two sides."""
-    left, centre, right = np.median(_darkness(steel.dark, fit.arc, OVER_PX, ACROSS_PX), axis=0)
-    if max(abs(left - right), 0.5 * (left + right) - centre) > OVER * steel.depth:
+    across = np.array([-ASIDE * fit.width, -MIDDLE_PX, 0.0, MIDDLE_PX, ASIDE * fit.width])
+    left, beside, centre, other, right = np.median(_darkness(steel.dark, fit.arc, OVER_PX, across), axis=0)
+    if max(abs(left - right), abs(beside - other), 0.5 * (beside + other) - centre) > OVER * steel.depth:
         return False
     arms = []
     for radius in 0.5 * fit.width + RING_PX:

@@ -317,11 +317,13 @@ def _settled(
 
     A thread leaves a rod's tail through its middle, and does not lie over the rod there. One that passes beside one end
     of a pointed needle hides the shape of that end; the other is the tail if it is blunt and no thread goes on there.
-    Where no thread is seen at either end of what is no rod, None: the length may be another's.
+    Where no thread is seen at either end of what is no rod, and does not look more like one, None: the length may be
+    another's.
     """
     offsets = thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None):
-        return None
+        is_blunt = CLEARLY * rod.cost < fit.cost or (rod.cost < fit.cost and _is_rod(steel, rod))
+        return (rod, False) if is_blunt else None
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
     bound = PASSES * rod.width + PASSES_PX

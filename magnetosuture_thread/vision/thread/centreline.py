@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,14 @@ from magnetosuture_thread.vision.thread.search import (
     only_tail,
 )
 
+WIDENESS = 1.2  # of a walk along the edge, the shadow or the texture of something far wider than itself
+PALE_WIDENESS = 1.0  # the same where that is as bright as the floor but for its edges
+LEAVES = 0.3  # of the mean evidence, that a wide thread has where it comes out; less, and bare floor lies before it
 WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
 MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
 FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
 MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
+CLEAR_EVIDENCE = 10.0  # mean evidence of a line as long as the thread, that may be fainter where it comes out
 MIN_EDGE = 0.15  # share of the evidence, that a thread's fainter edge has: less, and it is the border of something else
 
 
@@ -129,21 +133,27 @@ def walk_from(
     dark = search.dark()
     enough = ENOUGH * max_length
     best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
-    if len(best.points) >= MIN_CENTRED and search.is_edge(best):
+    wideness = search.wideness(best) if len(best.points) >= MIN_CENTRED else 0.0
+    edge = search.between_edges(best) if wideness > PALE_WIDENESS and not best.ridge.signed else None
+    passes = False
+    if wideness > WIDENESS:
         wide = search.wide()
         if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            centred = search.centred(wide)[0]
-            best = centred if centred.shown > SURE_SHARE * wide.shown else wide  # a rope's edges are too far apart
-        elif (
-            best is dark and dark.shown > SURE_SHARE * enough
-        ):  # Its middle is not visible; a short one may be covered.
-            best = only_tail(dark)
+            centred, section = search.centred(wide)
+            has_edges = centred.shown > SURE_SHARE * wide.shown  # else they are too far apart, as a rope's
+            best, passes = centred if has_edges else wide, has_edges and section.beginning < LEAVES * section.mean
+        elif edge is not None:
+            best = edge
+        elif best is dark and dark.shown > SURE_SHARE * enough:
+            best = only_tail(dark)  # Its middle is not visible; a short one may be covered.
+    elif edge is not None:
+        best = edge
     if doubted:
-        own = search.without_passing_line(best)
+        own = replace(only_tail(best), passes=True) if passes else search.without_passing_line(best)
         # A faint line that passes, as the border of tissue, does not speak against a thread that is dark beyond doubt.
         instead = own.passes and best is not dark and dark.strength > FAINT
         best = search.without_passing_line(dark) if instead else own
-    return search.resolved(best)
+    return best if best is edge else search.resolved(best)  # An edge's own crossings are with other edges.
 
 
 def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
@@ -154,7 +164,9 @@ def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
             if walk.shown < FAINT_SHARE * enough:
                 continue
             centred, section = search.centred(walk)
-            if section.beginning < MIN_BEGINNING or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
+            is_clear = section.mean > CLEAR_EVIDENCE and centred.shown > enough
+            begins = section.beginning > MIN_BEGINNING or is_clear
+            if not begins or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
                 continue
             # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
             total = section.mean * centred.shown

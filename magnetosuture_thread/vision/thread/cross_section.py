@@ -14,8 +14,8 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
-from magnetosuture_thread.vision.thread.appearance import across, respaced, sampled_colours, tangents_of
-from magnetosuture_thread.vision.thread.ridge import DEVIATION
+from magnetosuture_thread.vision.thread.appearance import across, respaced, sampled, sampled_colours, tangents_of
+from magnetosuture_thread.vision.thread.ridge import DEVIATION, Ridge
 
 SPACING_PX = 2.0  # of the vertices
 STEP_PX = 0.5  # of samples across, and of shifts
@@ -29,12 +29,15 @@ BEND_PRICE = 1.0  # of a change of the shift by one step from vertex to vertex, 
 MAX_CHANGE = 3  # steps, by which the shift may change from vertex to vertex
 WINDOW = 4  # vertices to both sides of a stretch, in which floor has to be the better explanation for a thread to end
 BEGINNING = 2 * WINDOW + 1  # vertices where a thread comes out
-MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends
+MIN_FLOOR = 1.0  # mean evidence against a thread in a stretch, where it ends ...
+GAP, SAME = 10, 0.5  # ... unless so few vertices on it shows this share of its usual contrast again
 SHADOW = 0.5  # of a thread's usual contrast, that its shadow may show, whose edges are no sharp ones
 EVEN = 2  # vertices to both sides, over which shifts are averaged
 ROUNDS = 2  # of measuring the colour and then the shift
 OUTLIER = 4.0  # deviations, beyond which a difference on the floor is none of noise
 MIN_NOISE = 0.1  # grey levels of a derivative, by rounding
+MIN_WIDTH_PX, MAX_WIDTH_PX = 7.0, 26.0  # between the two dark edges of something as bright as the floor
+EDGE_SHOWN, EDGE_SHARE = 0.5, 0.7  # of one's strength, that the other has; share of the way over which it has it
 NEEDLE_PX = 3.0  # beside the needle and beyond its ends, where its own edges are
 
 Values = NDArray[np.float64]
@@ -88,12 +91,17 @@ class CrossSection:
     def up_to_its_end(self) -> CrossSection:
         """Return the part up to where the thread ends.
 
-        It is seen no farther than up to where floor explains a whole stretch better; of that part, the evidence up to
-        the end is the greatest (maximum likelihood). A last part as weak as a thread's shadow may be no more than that.
+        It is seen no farther than up to where floor explains a whole stretch better, and it does not show again soon
+        after, as beyond a reflection of the lamp beside it; of that part, the evidence up to the end is the greatest
+        (maximum likelihood). A last part as weak as a thread's shadow may be no more than that.
         """
         stretches = _mean(self.evidence[:, None], WINDOW)[:, 0]
-        floor = np.flatnonzero(stretches < -MIN_FLOOR)
-        searched = self.evidence[: floor[0] + 1] if len(floor) else self.evidence
+        searched = self.evidence
+        for first in np.flatnonzero(stretches < -MIN_FLOOR):
+            usual = float(np.median(stretches[: first + 1]))
+            if stretches[first : first + GAP].max() < max(MIN_FLOOR, SAME**2 * usual):
+                searched = self.evidence[: first + 1]
+                break
         count = int(np.argmax(np.cumsum(searched))) + 1
         strong = np.flatnonzero(stretches[:count] > SHADOW**2 * float(np.median(stretches[:count])))
         count = int(strong[-1]) + 1 if len(strong) else 1
@@ -159,6 +167,31 @@ def centred_between_edges(
     along = tangents_of(points)
     points = points + shift.reshape(-1, 1) * np.column_stack([-along[:, 1], along[:, 0]])
     return CrossSection(points, half_width, evidence, visible, each)
+
+
+def between_dark_edges(
+    walk: Points, ridge: Ridge, origin: tuple[int, int], strength: float
+) -> tuple[Points, float] | None:
+    """Shift a walk along one edge of something wide, as bright as the floor between its edges, to its middle.
+
+    Args:
+        walk: vertices, shape (m, 2) [px].
+        ridge: that was followed.
+        origin: of the ridge in the picture [px].
+        strength: of the ridge along the walk.
+
+    Returns:
+        Vertices, shape (m, 2) [px], and half of the width [px]; None if no other edge runs beside the walk all along.
+    """
+    aside = np.arange(-MAX_WIDTH_PX, MAX_WIDTH_PX + 1.0)
+    at = (across(walk, aside) - origin - 0.5 * (ridge.scale - 1)) / ridge.scale
+    strong = sampled(ridge.strength, at) - ridge.noise > EDGE_SHOWN * strength
+    share = strong.mean(axis=0)
+    apart = int(np.argmax(np.where(np.abs(aside) < MIN_WIDTH_PX, 0.0, share)))
+    inside = np.abs(2.0 * aside - aside[apart]) < abs(aside[apart])
+    if share[apart] < EDGE_SHARE or share[inside].min() > 1.0 - EDGE_SHARE:
+        return None
+    return across(walk, 0.5 * aside[apart : apart + 1])[:, 0], 0.5 * abs(float(aside[apart]))
 
 
 def _white_edges(

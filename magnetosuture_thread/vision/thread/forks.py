@@ -16,6 +16,7 @@ MIN_GAIN_PX = 8.0  # that another way must show more of the thread
 SUFFICIENT_SHARE = 0.9  # of the longest walk: so much thread seen needs no other way
 TWICE_PX, TWICE_STEPS = 1.6, 6  # a vertex this near to one that lies so many steps back sees the same thread
 UNSTEADY = 12.0  # px for each 1 / px of change in curvature
+WHOLE_SHARE = 0.975  # of the greatest length, beyond which a walk is longer than the thread
 
 
 @compiled
@@ -38,8 +39,28 @@ def worth(path, strong, count):
 
 
 @compiled
+def worth_of_whole(path, strong, count, max_length, overrun):
+    """Return `worth`, less a price for each pixel that a path is longer than the thread."""
+    return worth(path, strong, count) - overrun * max(0.0, path[count - 1, 5] - WHOLE_SHARE * max_length)
+
+
+@compiled
 def follow(
-    ridge, hidden, factor, noise, faintest, single, stiffness, start, dish, max_length, max_hidden, simple, path, strong
+    ridge,
+    hidden,
+    factor,
+    noise,
+    faintest,
+    single,
+    stiffness,
+    overrun,
+    start,
+    dish,
+    max_length,
+    max_hidden,
+    simple,
+    path,
+    strong,
 ):
     """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
@@ -51,6 +72,7 @@ def follow(
         faintest: a strength above noise that is no noise.
         single: see `ways_out`.
         stiffness: see `walk_on`.
+        overrun: price of a pixel beyond the thread's length; see `worth_of_whole`.
         start: the tail (u, v) and the needle's direction there [px, px, rad].
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
@@ -70,7 +92,19 @@ def follow(
     for index in range(found):
         count = begin_path(ridge, noise, start, ways[index], faintest, other, other_strong)
         count, value = _follow(
-            ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, other, other_strong, count, enough
+            ridge,
+            hidden,
+            factor,
+            noise,
+            faintest,
+            stiffness,
+            overrun,
+            dish,
+            max_length,
+            other,
+            other_strong,
+            count,
+            enough,
         )
         if value > WAY_GAIN * best_value + (MIN_GAIN_PX if index > 0 else 0.0):
             best, best_value = count, value
@@ -81,8 +115,8 @@ def follow(
 
 
 @compiled
-def _follow(ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, begun, enough):
-    """Walk on from a path's last vertex; where much less of the thread is seen than there is, try forks.
+def _follow(ridge, hidden, factor, noise, faintest, stiffness, overrun, dish, max_length, path, strong, begun, enough):
+    """Walk on from a path's last vertex; where much less of the thread is seen than there is, or more, try forks.
 
     Returns:
         The number of vertices, and their worth.
@@ -91,7 +125,7 @@ def _follow(ridge, hidden, factor, noise, faintest, stiffness, dish, max_length,
     count, fork_count = walk_on(
         ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, begun, 9.0, forks
     )
-    value = worth(path, strong, count)
+    value = worth_of_whole(path, strong, count, max_length, overrun)
     if value > enough or fork_count == 0:
         return count, value
     other, other_strong, other_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
@@ -125,7 +159,7 @@ def _follow(ridge, hidden, factor, noise, faintest, stiffness, dish, max_length,
                 forks[index, 1],
                 other_forks,
             )
-            tried = worth(other, other_strong, reached)
+            tried = worth_of_whole(other, other_strong, reached, max_length, overrun)
             if tried > best_value:
                 best_value, best_count, best_fork_count = tried, reached, found
                 best[:reached], best_strong[:reached] = other[:reached], other_strong[:reached]

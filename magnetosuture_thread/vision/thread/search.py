@@ -13,7 +13,7 @@ from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, gla
 from magnetosuture_thread.vision.needle.erase import smooth_without_needle, without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
-from magnetosuture_thread.vision.thread.cross_section import CrossSection, centred_between_edges
+from magnetosuture_thread.vision.thread.cross_section import CrossSection, between_dark_edges, centred_between_edges
 from magnetosuture_thread.vision.thread.crossings import Crossing, resolve_crossings
 from magnetosuture_thread.vision.thread.forks import follow, worth
 from magnetosuture_thread.vision.thread.hiding import cover_needle
@@ -47,9 +47,9 @@ RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scal
 FAINT_HALF = 3  # vertices to both sides, over which a faint walk is centred
 COARSE, COARSE_MEDIAN = 4, 25  # how much smaller an image shows what is wide, and the window of its surroundings [px]
 COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
-WIDE_SHARE = 1.2  # of a walk's contrast, that what is wide has beside it in the shrunk image
 WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
 WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in the shrunk image
+OVERRUN = 5.0  # price of a pixel of a wide walk beyond the thread's length, as its crossings are not judged
 OTHER_COLOUR = 0.5  # weight of what a pixel has of another colour, against it
 BEGINNING = 14  # vertices of a wide walk, whose colour it keeps to
 MIN_CENTRED = 4  # vertices
@@ -216,10 +216,10 @@ class ThreadSearch:
         around = cv2.medianBlur(small, COARSE_MEDIAN)
         return cv2.subtract(around, small, dtype=cv2.CV_32F).reshape(*small.shape[:2], -1)
 
-    def is_edge(self, walk: Walk) -> bool:
-        """Say whether a walk runs along something far wider than itself: its edge, its shadow, or its texture.
+    def wideness(self, walk: Walk) -> float:
+        """Return how much of a walk's contrast what it runs along keeps in a shrunk image.
 
-        What is wide keeps its contrast in a shrunk image, what is thin loses it.
+        What is wide keeps its contrast in a shrunk image, what is thin loses it: in the one that was walked in, too.
         """
         contrast = None
         factor = self._picture.factor
@@ -231,7 +231,13 @@ class ThreadSearch:
             contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
         usual = middle(near[::3, ::3])
-        return self._median_along(walk.points, near, COARSE) - usual > WIDE_SHARE * walk.strength
+        contrast = self._median_along(walk.points, near, COARSE) - usual
+        return contrast / max(1e-6, walk.strength * math.sqrt(walk.ridge.scale))
+
+    def between_edges(self, walk: Walk) -> Walk | None:
+        """Return a walk along one edge of something wide moved to its middle; None if no other edge runs beside it."""
+        found = between_dark_edges(walk.points, walk.ridge, self._origin, walk.strength)
+        return None if found is None else replace(walk, points=found[0], half_width=found[1])
 
     def wide(self) -> Walk:
         """Return the walk along what is wide and differs from around in colour as it does where it begins.
@@ -301,22 +307,12 @@ class ThreadSearch:
         path[0] = 0.0  # all that there is where nothing leaves the tail
         needle, dish = self._needle, self._dish(ridge)
         tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
-        count, shown = follow(
-            ridge.strength,
-            ridge.hidden,
-            ridge.factor,
-            ridge.noise,
-            ridge.faintest,
-            ridge.single,
-            ridge.stiffness,
-            np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])]),
-            dish,
-            max_length,
-            (needle.length_px + MAX_BEYOND_PX) / scale,
-            self._at_wall,
-            path,
-            strong,
-        )
+        start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
+        image, levels = (ridge.strength, ridge.hidden, ridge.factor), (ridge.noise, ridge.faintest, ridge.single)
+        overrun = OVERRUN if ridge.scale == COARSE else 0.0
+        lengths = max_length, (needle.length_px + MAX_BEYOND_PX) / scale
+        thread = ridge.stiffness, overrun
+        count, shown = follow(*image, *levels, *thread, start, dish, *lengths, self._at_wall, path, strong)
         return self._ended(ridge, path, strong, count, shown)
 
     def _buffers(self, ridge: Ridge) -> tuple[np.ndarray, np.ndarray]:

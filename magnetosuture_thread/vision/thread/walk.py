@@ -25,7 +25,8 @@ NOISE_COST = 2.0  # so much higher is that price where the thread is as faint as
 SMOOTHING = 0.05  # weight of the newest strength in the usual one
 ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
 APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
-FORK = 0.75  # of the usual strength, at least, along the other way
+FORK = 0.75  # of the usual strength, at least, along the other way; a stiff thread's other ways look fainter
+STIFF_FORK = 0.5
 FORCED = 4  # steps that a walk is held to the other way
 
 
@@ -85,7 +86,7 @@ def best_arcs(ridge, hidden, factor, noise, faintest, usual, stiffness, state, b
         apart = abs(bends[index] - bends[first])
         if apart > APART and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
             plain = scores[index] + bend_cost * abs(bends[index] - bend)
-            if plain > FORK and plain > score:
+            if plain > (STIFF_FORK if stiffness > 1.0 else FORK) and plain > score:
                 second, score = index, plain
     return bends[first], bends[second], score
 
