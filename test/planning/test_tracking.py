@@ -56,7 +56,7 @@ def headings(
     raise AssertionError("the end of the path is not reached")
 
 
-@pytest.mark.parametrize("drift", [0.0, 6e-4, -1.2e-3, 1.8e-3])
+@pytest.mark.parametrize("drift", [0.0, 6e-4, -1.2e-3])
 @pytest.mark.parametrize("axis", COIL_ANGLES)
 def test_a_needle_that_is_pulled_aside_stays_off_the_axis_of_a_coil(axis: float, drift: float):
     off = headings(PathTracker(path(np.full(18, axis)), COIL_ANGLES), drift)[round(0.5 * RATE) :] - axis
