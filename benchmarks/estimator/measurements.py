@@ -19,7 +19,7 @@ from magnetosuture_thread.evaluation.reference import read_reference
 from magnetosuture_thread.evaluation.reference_scores import reference_thread
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import Thread
@@ -87,7 +87,8 @@ def targets(run: Run, segments: int) -> NDArray[np.float64]:
 def estimator_of(thread: Thread, run: Run, case: Case | None = None) -> ThreadEstimator:
     """Return an estimator that knows of a run what the case lets it."""
     posts = () if case is not None and case.post == "unknown" else run.posts
-    estimator = ThreadEstimator(ThreadPredictor(thread, Workspace(posts, 5e-3, wall_radius=run.wall_radius)))
+    options = EstimatorOptions(slow_parameters=case.learned if case is not None else ())
+    estimator = ThreadEstimator(ThreadPredictor(thread, Workspace(posts, 5e-3, wall_radius=run.wall_radius)), options)
     estimator.warm_up()
     return estimator
 
@@ -145,7 +146,7 @@ def _scaled(pose: NeedlePose, camera: CameraModel) -> NeedlePose:
 def predict(run: Run, estimator: ThreadEstimator, first: Points) -> NDArray[np.float64]:
     """Return the nodes of the model alone at each pose but the first, from the true first shape."""
     predictor = estimator.predictor
-    predictor.reset()
+    estimator.reset()  # what it learned of the thread too
     predictor.start_at(run.poses[0], first)
     return np.array([predictor.step(pose).positions for pose in run.poses[1:]])
 

@@ -172,7 +172,7 @@ def find_chord_contacts(
     data: WorkspaceData,
     segment: float,
     radius: float,
-    near: NDArray[np.bool_],
+    clearance: NDArray[np.float64],
     count: int,
     to: ChordContacts,
 ) -> int:
@@ -192,7 +192,8 @@ def find_chord_contacts(
         data: `Workspace.data`.
         segment: D [m].
         radius: rho [m].
-        near: of each node, whether an obstacle is within reach, shape (n + 1,).
+        clearance: of each node, its distance from the nearest obstacle or less, shape (n + 1,) [m]. No point of a chord
+            is closer to it than half of what both ends are, less the chord's length: far chords cost nothing.
         count: contacts that are in the arrays already.
         to: written from there on.
 
@@ -201,13 +202,13 @@ def find_chord_contacts(
     """
     reach = REACH * data.reach
     for i in range(len(points) - 1):
-        if not (near[i] or near[i + 1]):
+        if clearance[i] >= data.reach and clearance[i + 1] >= data.reach:
             continue
         start = points[i, 0], points[i, 1], points[i, 2] if points.shape[1] == 3 else 0.0
         x, y = points[i + 1, 0] - start[0], points[i + 1, 1] - start[1]
         z = points[i + 1, 2] - start[2] if points.shape[1] == 3 else 0.0
         length = math.sqrt(x * x + y * y + z * z)
-        if not 0.0 < length < MAX_ELONGATION * segment:
+        if not 0.0 < length < MAX_ELONGATION * segment or clearance[i] + clearance[i + 1] - length > 2.0 * reach:
             continue
         chord = Chord(start, (x / length, y / length, z / length), length)
         middle = start[0] + 0.5 * x, start[1] + 0.5 * y, start[2] + 0.5 * z

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
+from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
@@ -32,7 +34,7 @@ def contact_rows(
     """Write the rows  n' u(s) >= (-h(y) - n' (x - y)(s)) / dt  of the contacts near y, with h = sd(y(s)) - rho.
 
     A contact is at a node, s = 0, or at a place s between node i and the next, where u(s) = (1 - s) u_i + s u_{i+1},
-    and so x and y. In the end their nodes and obstacles, `WALL` among them, are the first of the buffers's.
+    and so x and y. In the end their nodes and obstacles, the wall among them, are the first of the buffers's.
 
     Args:
         buffers: written, from a row on.
@@ -54,20 +56,22 @@ def contact_rows(
     found = find_contacts(
         points, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.nearest
     )
+    buffers.clearance[:] = workspace.reach
+    for c in range(found):
+        buffers.place[c] = 0.0
+        buffers.clearance[buffers.node[c]] = min(buffers.clearance[buffers.node[c]], buffers.distance[c])
     if found > 0 and chords:
-        near = np.zeros(nodes, dtype=np.bool_)
-        for c in range(found):
-            buffers.place[c] = 0.0
-            near[buffers.node[c]] = near[buffers.node[c]] or buffers.obstacle[c] != WALL
         to = ChordContacts(buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.place)
-        found = find_chord_contacts(points, workspace, unit, radius, near, found, to)
+        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, to)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
-    kept, depth = 0, 0.0
+    kept, depth, minimum = 0, 0.0, np.full((2, nodes), np.inf)
     for c in range(found):
         i, s = buffers.node[c], buffers.place[c]
         if known[i] and (s == 0.0 or known[i + 1]):
             continue
+        kind = 0 if s == 0.0 else 1
+        minimum[kind, i] = min(minimum[kind, i], buffers.distance[c] - radius)
         clearance = buffers.distance[c] - radius
         depth = max(depth, -clearance)
         bound = -clearance / unit
@@ -85,11 +89,62 @@ def contact_rows(
         # both sides of a shape: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
         buffers.limit[here] = np.inf
-        buffers.multipliers[here] = buffers.push[0 if s == 0.0 else 1, i]
         buffers.node[kept], buffers.obstacle[kept], buffers.place[kept] = i, buffers.obstacle[c], s
         buffers.normal[kept] = buffers.normal[c]
         kept += 1
+    # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
+    for c in range(kept):
+        kind, i = 0 if buffers.place[c] == 0.0 else 1, buffers.node[c]
+        pushes = buffers.value[row + c] * unit <= max(minimum[kind, i], DEPTH_TOLERANCE)
+        buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
     return kept, depth
+
+
+@compiled
+def stays_clear(
+    buffers: StepBuffers,
+    workspace: WorkspaceData,
+    before: Points,
+    about: Points,
+    known: NDArray[np.bool_],
+    unit: float,
+    radius: float,
+) -> bool:
+    """Return whether no contact is deeper than `DEPTH_TOLERANCE`, once nodes have moved since rows were written.
+
+    A distance changes by no more than a node moves. So it is computed again only of nodes and chords that may have got
+    too close by that; a solve that ends a step moves them by micrometres.
+
+    Args:
+        buffers: its clearances are of `before`, and become those of `about` or less; contacts are overwritten.
+        workspace: obstacles and wall [m].
+        before: where rows were written, shape (n + 1, d) [D].
+        about: where the nodes are, shape (n + 1, d) [D].
+        known: nodes that have no rows, shape (n + 1,).
+        unit: D [m].
+        radius: rho [m].
+    """
+    points, clearance, minimum = about * unit, buffers.clearance, radius - DEPTH_TOLERANCE
+    to = ChordContacts(buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.place)
+    for i in range(len(about)):
+        square = 0.0
+        for a in range(about.shape[1]):
+            square += (about[i, a] - before[i, a]) ** 2
+        clearance[i] -= unit * math.sqrt(square)
+        if not (clearance[i] >= minimum or known[i]):
+            found = find_contacts(
+                points[i : i + 1], workspace, to.node, to.obstacle, to.distance, to.normal, buffers.nearest
+            )
+            clearance[i] = workspace.reach
+            for c in range(found):
+                clearance[i] = min(clearance[i], to.distance[c])
+            if found < 0 or not clearance[i] >= minimum:
+                return False
+    found = find_chord_contacts(points, workspace, unit, radius, clearance, 0, to)
+    for c in range(found):
+        if to.distance[c] < minimum and not (known[to.node[c]] and known[to.node[c] + 1]):
+            return False
+    return found >= 0
 
 
 @compiled

@@ -12,7 +12,12 @@ from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
-from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
+from magnetosuture_thread.model.formulations.contact_rows import (
+    DEPTH_TOLERANCE,
+    contact_rows,
+    keep_multipliers,
+    stays_clear,
+)
 from magnetosuture_thread.model.formulations.friction_rows import friction_rows, keep_grips, knows_friction
 from magnetosuture_thread.model.formulations.internal_forces import keep_internal_forces
 from magnetosuture_thread.model.formulations.step import move_prescribed
@@ -102,8 +107,13 @@ def assemble_step(
     motion: MotionBuffers,
     given: StepInput,
     elsewhere: float,
+    last_about: Points,
+    last_contacts: int,
 ) -> tuple[int, float, bool]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
+
+    Where the program in the buffers was written about, and how many contacts it has, -1 if that is not known, make it
+    cheap to find that out.
 
     Returns the number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers the
     point is: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or less if it is
@@ -113,15 +123,19 @@ def assemble_step(
     segments = len(about) - 1
     mechanics.chord_lengths(about, given.heading, rod.clamped, buffers.chords)
     strain = segment_rows(buffers, about, start, known, interval)
+    rough, off = knows_friction(workspace), max(strain / STRAIN_TOLERANCE, elsewhere)
+    cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
+    if cheap and stays_clear(buffers, workspace, last_about, about, known, rod.unit, rod.radius):
+        return last_contacts, off, False
     contacts, depth = contact_rows(
         buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
     )
     rubs = False
-    if contacts > 0 and knows_friction(workspace):
+    if contacts > 0 and rough:
         rubbing, change = friction_rows(buffers, segments, contacts, workspace, motion.before, start, known, interval)
         contacts = contacts + rubbing if rubbing >= 0 else -1
         rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
-    off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE, elsewhere)
+    off = max(off, depth / DEPTH_TOLERANCE)
     if contacts >= 0 and (solves == 0 or off > 1.0 or rubs):
         _objective(rod, buffers, motion, given)
     return contacts, off if solves > 0 else np.inf, rubs
@@ -311,13 +325,15 @@ def solve_step(
     if solves == 0:
         init_step(motion, given, rod.unit)
     worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
-    last_off, last_about = np.inf, motion.about.copy()
+    last_off, last_about, contacts = np.inf, motion.about.copy(), -1
     while True:
-        contacts, off, rubs = assemble_step(solves, rod, buffers, workspace, motion, given, elsewhere)
+        contacts, off, rubs = assemble_step(
+            solves, rod, buffers, workspace, motion, given, elsewhere, last_about, contacts
+        )
         if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < max_solves:
             # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
             motion.about[:] = 0.5 * (motion.about + last_about)
-            contacts, _, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere)
+            contacts, _, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere, last_about, -1)
         last_off = off
         last_about[:] = motion.about
         if contacts < 0:

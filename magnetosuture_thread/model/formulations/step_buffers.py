@@ -37,6 +37,7 @@ class StepBuffers(NamedTuple):
         distance: shape (c,).
         normal: shape (c, d).
         nearest: shape (c,).
+        clearance: distance of each node from the nearest of all that is solid, at most the reach, shape (n + 1,) [m].
         place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
         push: what contacts last pushed each node and each segment with, shape (2, n + 1).
         contact_force: the same as vectors, with friction, of all contacts of a node, shape (n + 1, d).
@@ -64,6 +65,7 @@ class StepBuffers(NamedTuple):
     distance: Vector
     normal: Points
     nearest: NDArray[np.bool_]
+    clearance: Vector
     place: Vector
     push: NDArray[np.float64]
     contact_force: Points
@@ -97,6 +99,7 @@ class StepBuffers(NamedTuple):
             np.zeros(contacts),
             np.zeros((contacts, dimension)),
             np.zeros(contacts, dtype=np.bool_),
+            np.zeros(nodes),
             np.zeros(contacts),
             np.zeros((2, nodes)),
             np.zeros((nodes, dimension)),

@@ -36,10 +36,10 @@ def contacts_of(obstacle: Obstacle, points: np.ndarray) -> list[tuple[float, flo
         np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room), np.zeros((room, dimension)), np.zeros(room)
     )
     data = Workspace((obstacle,), REACH, dimension).data
-    near = np.ones(len(points), dtype=np.bool_)
-    found = find_chord_contacts(points, data, SEGMENT, 0.0, near, 0, to)
+    clearance = np.full(len(points), -np.inf)
+    assert find_chord_contacts(points, data, SEGMENT, 0.0, -clearance, 0, to) == 0
+    found = find_chord_contacts(points, data, SEGMENT, 0.0, clearance, 0, to)
     assert found >= 0
-    assert find_chord_contacts(points, data, SEGMENT, 0.0, ~near, 0, to) == 0
     return sorted(((to.distance[c], to.place[c], to.normal[c].copy()) for c in range(found)), key=lambda c: c[0])
 
 
