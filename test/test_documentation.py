@@ -39,7 +39,7 @@ WITH_COMMANDS = [*PAGES, ROOT / "CONTRIBUTING.md"]
 ALL = [*WITH_COMMANDS, ROOT / "CHANGELOG.md"]
 
 # Programs of others, of whose options nothing is known here.
-FOREIGN = {".", "apt", "cd", "chrt", "colcon", "git", "kill", "pip", "rosdep"}
+FOREIGN = {".", "apt", "cd", "chrt", "colcon", "dask", "git", "kill", "pip", "rosdep"}
 FOREIGN_OPTIONS = {"--help", "--qos-durability"}
 FOREIGN_WORDS = {"set_parameters_atomically", "corner_radus"}  # of rclcpp; a slip that is shown as such
 SCRIPTS = set(re.findall(r'^(\w+) = "magnetosuture_thread\.', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))

@@ -86,6 +86,12 @@ def output_file(text: str) -> Path:
     return path
 
 
+def add_scheduler(parser: argparse._ActionsContainer) -> None:
+    """Add the option --scheduler."""
+    text = "a Dask scheduler, whose workers do it instead, for example tcp://127.0.0.1:8786 (extra `cluster`)"
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help=text)
+
+
 OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
 
 

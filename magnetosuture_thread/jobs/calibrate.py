@@ -49,6 +49,7 @@ def calibrate_bags(
     against: str = "seen",
     parameters: Sequence[str] = (),
     workers: int = 1,
+    scheduler: str = "",
     picture: Path | None = None,
     json_file: Path | None = None,
     log: Log = lambda line: None,
@@ -68,6 +69,7 @@ def calibrate_bags(
         against: what predictions are compared with, `seen` (measured) or `truth`.
         parameters: names of settings to fit; all that the formulation has if empty.
         workers: processes.
+        scheduler: address of a Dask scheduler, whose workers replay the bags in place of those.
         picture: of fit and residuals, to draw (.png); beside the output if None.
         json_file: to write all figures to, if any.
         log: called with a line for a person at the end of each stage.
@@ -109,7 +111,7 @@ def calibrate_bags(
     assert settings is not None
     best = BestSettings()
     try:
-        with pool(passages, min(workers, os.cpu_count() or 1)) as run:
+        with pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:
             calibration, fits = fit(
                 passages,
                 settings,

@@ -19,7 +19,7 @@ from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
 from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.texts import one_line
-from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
+from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -35,7 +35,6 @@ class Task:
     Attributes:
         path: of the bag.
         name: of its report.
-        page: the file to write.
         against: what predictions are compared with.
         formulation: of the model.
         selection: what of the bag is read.
@@ -43,7 +42,6 @@ class Task:
 
     path: Path
     name: str
-    page: Path
     against: str
     formulation: str
     selection: BagSelection
@@ -56,6 +54,7 @@ def evaluate_bags(
     against: str = "auto",
     formulation: str = "",
     workers: int = 1,
+    scheduler: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
     **selection: Unpack[BagSelection],
@@ -72,6 +71,7 @@ def evaluate_bags(
         against: `truth` or `seen` (measured); `auto`: both where present.
         formulation: of the model; the setup's if empty.
         workers: processes.
+        scheduler: address of a Dask scheduler, whose workers evaluate the bags in place of those.
         log: called with a line for a person.
         progress: called with the share done, 0 to 1.
         selection: what of the bags is read.
@@ -89,17 +89,15 @@ def evaluate_bags(
     names = numbered([_name(bag) for bag in bags], "{}-{}")
     rows: dict[int, Row] = {}
     with whole_folder(output) as folder:
-        tasks = [
-            Task(bag, name, folder / f"{name}.html", against, formulation, selection)
-            for bag, name in zip(bags, names, strict=True)
-        ]
-        with WorkerPool(evaluate_one, workers) as pool:
-            for index, result in pool.run(tasks, log, progress):
+        tasks = [Task(bag, name, against, formulation, selection) for bag, name in zip(bags, names, strict=True)]
+        with make_runner(evaluate_one, workers, scheduler) as runner:
+            for index, result in runner.run(tasks, log, progress):
                 task = tasks[index]
-                row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
+                row, page = (_failed(task, str(result)), "") if isinstance(result, WorkerDiedError) else result
                 if row["problem"]:
-                    task.page.unlink(missing_ok=True)
                     log(f"{task.name}: {row['problem']}")
+                else:
+                    (folder / f"{task.name}.html").write_text(page, encoding="utf-8")
                 rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
@@ -107,14 +105,14 @@ def evaluate_bags(
     return ordered
 
 
-def evaluate_one(task: Task, log: Log, progress: Progress) -> Row:
-    """Return the row of a bag, with the problem in it if there is one: nothing stops the others."""
+def evaluate_one(task: Task, log: Log, progress: Progress) -> tuple[Row, str]:
+    """Return the row of a bag and its page; with a problem in the row, there is no page: nothing stops the others."""
     try:
         return evaluate_bag(**vars(task), log=lambda text: log(f"{task.name}: {text}"), progress=progress)
     except MagnetosutureError as error:
-        return _failed(task, str(error))
+        return _failed(task, str(error)), ""
     except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
-        return _failed(task, f"{type(error).__name__}: {error}")
+        return _failed(task, f"{type(error).__name__}: {error}"), ""
 
 
 def _failed(task: Task, problem: str) -> Row:

@@ -46,21 +46,19 @@ MAX_WAITING = 600  # recorded predictions that may wait for their frame
 def evaluate_bag(
     path: Path,
     name: str,
-    page: Path,
     against: str,
     formulation: str,
     selection: BagSelection,
     log: Log,
     progress: Progress,
-) -> Row:
-    """Evaluate a bag, write its page and return its row of the table.
+) -> tuple[Row, str]:
+    """Evaluate a bag; return its row of the table, and its page.
 
     Of each frame some numbers are kept, and of a few frames the threads: memory grows by 210 bytes a frame.
 
     Args:
         path: of the bag.
         name: of the report.
-        page: the file to write.
         against: `truth` or `seen` (measured); `auto`: both where present.
         formulation: of the model; the setup's if empty.
         selection: what of the bag is read.
@@ -87,9 +85,9 @@ def evaluate_bag(
             why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
             raise BagError(path, f"gave no prediction: {figures.tracked} of {figures.frames} had a needle; {why}")
         pictures = _pictures(given, model, metrics)
-    page.write_text(write_page(about, metrics, figures, pictures), encoding="utf-8")
+    page = write_page(about, metrics, figures, pictures)
     progress(1.0)
-    return row_of(about, figures)
+    return row_of(about, figures), page
 
 
 class _MeteredReader(ObservationReader):

@@ -18,6 +18,7 @@ from magnetosuture_thread.cli.arguments import (
     DONE,
     Subparsers,
     add_frames,
+    add_scheduler,
     add_source,
     bag_selection,
     command,
@@ -60,6 +61,7 @@ def add(subparsers: Subparsers) -> None:
     cores = len(os.sched_getaffinity(0))
     workers = "processes (default: one for each processor, %(default)s); the result does not depend on it"
     option("--workers", type=whole_number, default=cores, metavar="N", help=workers)
+    add_scheduler(parser)
     add_source(parser, "the bags")
 
     parser = command(subparsers, "calibrate-camera", run_calibrate_camera)
@@ -105,7 +107,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
 
     console = make_console()
     log = make_log(console)
-    names = ("material", "formulation", "against", "parameters", "workers", "picture")
+    names = ("material", "formulation", "against", "parameters", "workers", "scheduler", "picture")
     given = {name: getattr(options, name) for name in names}
     with progress(console, "calibrate") as advance:
         found = calibrate_bags(

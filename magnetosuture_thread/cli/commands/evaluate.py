@@ -17,6 +17,7 @@ from magnetosuture_thread.cli.arguments import (
     FAILED,
     Subparsers,
     add_frames,
+    add_scheduler,
     add_source,
     bag_selection,
     command,
@@ -27,7 +28,7 @@ from magnetosuture_thread.cli.arguments import (
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
 
 MAX_ROWS = 20  # of frames; beyond, only the summary is shown
-BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers")
+BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
 REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
 
 
@@ -50,6 +51,7 @@ def add(subparsers: Subparsers) -> None:
     option("--duration", type=number_argument(0.0, 1e9), metavar="S", help="seconds (default: to each bag's end)")
     workers = count_argument("processes", 1, 256)
     option("--workers", type=workers, default=1, metavar="N", help="processes (default: 1)")
+    add_scheduler(bags)
     option = parser.add_argument_group("reference trajectories").add_argument
     option("--solver", choices=("banded", "osqp"), help="what solves a step (default: banded)")
     segments = "number of segments (default: the paper's, as each file says)"
@@ -124,6 +126,7 @@ def _evaluate_bags(options: argparse.Namespace) -> int:
             against=options.against,
             formulation=options.formulation or "",
             workers=options.workers,
+            scheduler=options.scheduler,
             log=log,
             progress=advance,
             **bag_selection(options),
