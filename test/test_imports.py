@@ -112,6 +112,7 @@ ALLOWED = {
     "cli": {
         *(
             "errors",
+            "files",
             "texts",
             "outputs",
             "geometry",
@@ -142,6 +143,7 @@ OWNERS = {
     "osqp": {"model"},
     "dask": {"workers"},
     "distributed": {"workers"},
+    "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},
     "matplotlib": {"evaluation", "calibration", "reproduce"},

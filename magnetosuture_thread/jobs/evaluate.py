@@ -12,6 +12,7 @@ from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.bag_folder import find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.files import is_url
 from magnetosuture_thread.interface import STORAGE_SUFFIXES
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag
 from magnetosuture_thread.jobs.output import whole_folder
@@ -120,7 +121,7 @@ def _failed(task: Task, problem: str) -> Row:
 
 
 def _name(bag: Path) -> str:
-    path = Path(os.path.abspath(bag))
+    path = bag if is_url(bag) else Path(os.path.abspath(bag))
     name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
     return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
@@ -154,7 +155,9 @@ def _bags(path: Path, depth: int) -> list[Path]:
         if path.is_file():
             return [path]
         inside = sorted(path.iterdir())
-    except (OSError, ValueError) as error:
+    except BagError:
+        raise
+    except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {error}") from None
     files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     if (path / "metadata.yaml").is_file() or len(files) == 1 or (files and _is_one(path)):
@@ -187,6 +190,8 @@ def kind_of(paths: Sequence[Path]) -> str:
 
 def _is_reference(path: Path) -> bool:
     """Return whether a path is a reference trajectory, or a folder of them, and no bag."""
+    if is_url(path):
+        return False
     try:
         return path.suffix == ".npz" if path.is_file() else any(path.glob("*.npz"))
     except OSError:

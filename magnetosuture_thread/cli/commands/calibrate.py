@@ -20,6 +20,7 @@ from magnetosuture_thread.cli.arguments import (
     add_frames,
     add_scheduler,
     add_source,
+    bag_location,
     bag_selection,
     command,
     number_argument,
@@ -43,7 +44,7 @@ def add(subparsers: Subparsers) -> None:
     """Add the commands."""
     parser = command(subparsers, "calibrate", run_calibrate)
     option = parser.add_argument
-    option("bags", type=Path, nargs="+", metavar="BAG", help="an mcap file, or the folder of a bag")
+    option("bags", type=bag_location, nargs="+", metavar="BAG", help="an mcap file, or the folder of a bag, or its URL")
     option("--output", type=output_file, required=True, metavar="FILE", help="parameters to write (YAML)")
     option("--material", default="", metavar="NAME", help="where to start: silk, polyamide (default: the setup's)")
     option("--picture", type=output_file, metavar="FILE", help="picture to draw (.png; default: beside the output)")

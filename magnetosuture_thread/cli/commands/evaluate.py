@@ -19,6 +19,7 @@ from magnetosuture_thread.cli.arguments import (
     add_frames,
     add_scheduler,
     add_source,
+    bag_location,
     bag_selection,
     command,
     count_argument,
@@ -36,7 +37,7 @@ def add(subparsers: Subparsers) -> None:
     """Add the commands."""
     parser = command(subparsers, "evaluate", run_evaluate)
     parser.set_defaults(default_of=parser.get_default)
-    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
+    parser.add_argument("paths", type=bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
     # The model's own names, written out: importing the model for them would be slow.
     formulation = "how a step is written (default: a bag's setup's; rod)"
     parser.add_argument("--formulation", choices=("rod", "paper"), help=formulation)
@@ -83,7 +84,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
     the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a
-    bag, or a folder of bags, which may be up to two folders below. DIR, which must not exist, gets
+    bag, or a folder of bags, which may be up to two folders below; or the URL of one, such as s3://BUCKET/RUNS. DIR,
+    which must not exist, gets
       NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
       table.csv    a row for each bag, SI units and %
       table.json   the same, with mean and worst, and prediction and estimate side by side
