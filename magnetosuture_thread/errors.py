@@ -7,7 +7,7 @@ from magnetosuture_thread.texts import shortened
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
 
 
-OF_CLUSTER = ("dask", "distributed", "duckdb", "fsspec", "pyarrow", "s3fs", "upath")  # modules of the extra
+OF_CLUSTER = ("dask", "distributed", "duckdb", "fsspec", "s3fs", "upath")  # modules of the extra
 
 
 def missing_module(error: ModuleNotFoundError) -> str:

@@ -63,6 +63,7 @@ ALLOWED = {
         "scene",
         "thread_observation",
     },
+    "catalog": {"barrier", "errors", "evaluation"},
     "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation", "texts"},
     "nodes": {
         *BASE,
@@ -85,6 +86,7 @@ ALLOWED = {
             "workers",
             "interface",
             "campaign",
+            "catalog",
             "planning",
             "geometry",
             "scene",
@@ -125,7 +127,7 @@ ALLOWED = {
             "jobs",
             "reproduce",
         ),
-        *("evaluation", "calibration"),
+        *("evaluation", "calibration", "catalog"),
     },
 }
 
@@ -143,6 +145,7 @@ OWNERS = {
     "osqp": {"model"},
     "dask": {"workers"},
     "distributed": {"workers"},
+    "duckdb": {"catalog"},
     "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.bags.bag_folder import find_bag_files
+from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
 from magnetosuture_thread.files import is_url
@@ -25,7 +25,7 @@ from magnetosuture_thread.workers import WorkerDiedError, make_runner
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-DEPTH = 2  # folders below the one that is given, in which bags are looked for
+DEPTH = 2  # folders below the one that is given
 MAX_NAME_BYTES = 200  # bytes
 
 
@@ -87,7 +87,7 @@ def evaluate_bags(
     if setup_name := selection.get("setup_name"):
         read_setup(setup_name)  # refuses what is wrong for all before anything is done
     bags = find_bags(paths)
-    names = numbered([_name(bag) for bag in bags], "{}-{}")
+    names = numbered([name_of(bag) for bag in bags], "{}-{}")
     rows: dict[int, Row] = {}
     with whole_folder(output) as folder:
         tasks = [Task(bag, name, against, formulation, selection) for bag, name in zip(bags, names, strict=True)]
@@ -120,24 +120,26 @@ def _failed(task: Task, problem: str) -> Row:
     return failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
 
 
-def _name(bag: Path) -> str:
+def name_of(bag: Path) -> str:
+    """Return the name of a bag's report: that of its folder or file."""
     path = bag if is_url(bag) else Path(os.path.abspath(bag))
     name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
     return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 
-def find_bags(paths: Sequence[Path]) -> list[Path]:
+def find_bags(paths: Sequence[Path], depth: int = DEPTH) -> list[Path]:
     """Return the bags at paths, in their order, each once; within a folder by name.
 
     Args:
-        paths: bags, or folders that hold some, in themselves or up to two folders below.
+        paths: bags, or folders that hold some.
+        depth: folders below a path in which bags are looked for.
 
     Raises:
         BagError: a path holds none.
     """
     found: dict[Path, Path] = {}
     for path in paths:
-        bags = _bags(path, DEPTH)
+        bags = _bags(path, depth)
         if not bags:
             endings = " or ".join(STORAGE_SUFFIXES)
             raise BagError(
@@ -160,10 +162,13 @@ def _bags(path: Path, depth: int) -> list[Path]:
     except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {error}") from None
     files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
-    if (path / "metadata.yaml").is_file() or len(files) == 1 or (files and _is_one(path)):
+    if any(file.name == METADATA_FILE for file in inside):
         return [path]
     folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
-    return files + [bag for folder in folders for bag in _bags(folder, depth - 1)]
+    below = [bag for folder in folders for bag in _bags(folder, depth - 1)]
+    if not below and (len(files) == 1 or (files and _is_one(path))):
+        return [path]
+    return files + below
 
 
 def _is_one(path: Path) -> bool:
