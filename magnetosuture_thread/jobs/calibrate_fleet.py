@@ -7,13 +7,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread import ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.fleet import FleetResult, calibrate_fleet
 from magnetosuture_thread.calibration.output import fleet_yaml
 from magnetosuture_thread.calibration.parameters import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
-from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.calibrate import read_runs, write_figures
 from magnetosuture_thread.jobs.output import whole_file
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
