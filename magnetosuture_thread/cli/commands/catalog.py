@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,10 @@ def add(subparsers: Subparsers) -> None:
     workers = count_argument("processes", 1, 256)
     option("--workers", type=workers, default=1, metavar="N", help="processes (default: 1)")
     add_scheduler(parser)
-    option("--query", default="", metavar="SQL", help="ask the catalog as it is, in the SQL of DuckDB")
+    instead = parser.add_mutually_exclusive_group().add_argument
+    instead("--query", default="", metavar="SQL", help="ask the catalog as it is, in the SQL of DuckDB")
+    port = count_argument("a port", 1, 65535)
+    instead("--page", type=port, metavar="PORT", help="show the catalog as it is on http://127.0.0.1:PORT")
 
 
 def run_catalog(options: argparse.Namespace) -> int:
@@ -45,6 +49,9 @@ def run_catalog(options: argparse.Namespace) -> int:
     in it; the exit code is 1 then.
 
       magnetosuture catalog ROOT --query "SELECT setup, avg(error_truth_mean_percent) FROM bags GROUP BY setup"
+
+    With --page a page on this machine lists, filters and plots the bags, and makes and opens the report of each, until
+    Ctrl-C.
     """
     console = make_console()
     log = make_log(console)
@@ -56,6 +63,13 @@ def run_catalog(options: argparse.Namespace) -> int:
         for row in rows:
             table.add_row(*(Text(_shown(value)) for value in row))
         console.print(table)
+        return DONE
+    if options.page:
+        from magnetosuture_thread.jobs.catalog_page import ADDRESS, make_page_server
+
+        with make_page_server(options.output, options.page, log) as server, suppress(KeyboardInterrupt):
+            log(f"the page: http://{ADDRESS}:{options.page}")
+            server.serve_forever()
         return DONE
     from magnetosuture_thread.jobs.catalog import update_catalog
 
