@@ -7,6 +7,7 @@ import json
 import os
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from unittest import mock
@@ -49,10 +50,9 @@ goals:
 """
 
 
-@pytest.fixture(scope="module")
-def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Return the address of a cluster of two processes, which find the module `work_of_tests`."""
-    folder = tmp_path_factory.mktemp("work")
+@contextmanager
+def cluster_of_two(folder: Path) -> Iterator[str]:
+    """Give the address of a cluster of two processes, which find the module `work_of_tests`."""
     (folder / "work_of_tests.py").write_text(SOURCE)
     once = dask.config.set({"distributed.scheduler.allowed-failures": 1})
     # Dask leaves the environment of its workers in this process.
@@ -63,12 +63,26 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
             yield local.scheduler_address
 
 
-def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(scheduler: str, tmp_path: Path):
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Return the address of a cluster whose workers nothing ends."""
+    with cluster_of_two(tmp_path_factory.mktemp("work")) as address:
+        yield address
+
+
+@pytest.fixture
+def mortal(tmp_path: Path) -> Iterator[str]:
+    """Return the address of a cluster whose workers tasks end; Dask may start no others after several of them."""
+    with cluster_of_two(tmp_path) as address:
+        yield address
+
+
+def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(mortal: str, tmp_path: Path):
     work = importlib.import_module("work_of_tests").work
     lines: list[str] = []
     shares: list[float] = []
     tasks = [1, 2, tmp_path / "begun", 4]
-    with make_runner(work, 1, scheduler) as runner:
+    with make_runner(work, 1, mortal) as runner:
         results = dict(runner.run(tasks, lines.append, shares.append))
         assert [results[index][0] for index in range(4)] == [str(task) for task in tasks]
         assert os.getpid() not in {process for _, process in results.values()}
