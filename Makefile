@@ -11,7 +11,7 @@
 
 PYTHON ?= python3
 VENV := .venv
-EXTRAS := ros dev docs colcon
+EXTRAS := ros dev docs colcon cluster
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo

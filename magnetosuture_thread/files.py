@@ -6,6 +6,57 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+RANGE_BYTES = 1 << 20  # read at once, at least, of a file that a URL names
+
+
+def parse_location(text: str) -> Path:
+    """Return a path, or for a URL what has the methods of one, such as `open` and `iterdir`; needs the extra `cluster`.
+
+    Args:
+        text: a path, or a URL of a file system that fsspec knows, for example `s3://bucket/runs`.
+
+    Raises:
+        ValueError: the file system of the URL is not known.
+    """
+    if "://" not in text:
+        return Path(text)
+    from upath import UPath
+
+    return cast(Path, UPath(text))
+
+
+def is_url(path: object) -> bool:
+    """Return whether a path was parsed from a URL, so that it is no path of this machine."""
+    return not isinstance(path, Path)
+
+
+def open_ranges(path: Path) -> BinaryIO:
+    """Open a file that is read in parts; of a URL only ranges are fetched, of `RANGE_BYTES` beyond what is asked for.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    if not is_url(path):
+        return path.open("rb")
+    opened: BinaryIO = cast(Any, path).open("rb", block_size=RANGE_BYTES, cache_type="readahead")
+    return opened
+
+
+def version_of(path: Path) -> tuple[int, str]:
+    """Return the size of a file [bytes], and what changes with its content: its time of change, of a URL the ETag.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    if not is_url(path):
+        status = path.stat()
+        return status.st_size, str(status.st_mtime_ns)
+    place = cast(Any, path)
+    about = place.fs.info(place.path)
+    named = (about.get(name) for name in ("ETag", "etag", "LastModified", "mtime", "created"))
+    return int(about["size"]), str(next((value for value in named if value), ""))
 
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
@@ -20,6 +71,12 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     Raises:
         OSError: it cannot be read, is a folder, pipe or device, or is larger; `strerror` says which.
     """
+    if is_url(path):
+        with open_ranges(path) as stream:
+            content = stream.read(max_bytes + 1)
+        if len(content) > max_bytes:
+            raise OSError(errno.EFBIG, "a larger file", str(path))
+        return content
     _require_regular(os.stat(path), path)  # before it is opened, which may do something to a device
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:

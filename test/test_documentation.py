@@ -39,9 +39,13 @@ WITH_COMMANDS = [*PAGES, ROOT / "CONTRIBUTING.md"]
 ALL = [*WITH_COMMANDS, ROOT / "CHANGELOG.md"]
 
 # Programs of others, of whose options nothing is known here.
-FOREIGN = {".", "apt", "cd", "chrt", "colcon", "git", "kill", "pip", "rosdep"}
+FOREIGN = {".", "apt", "cd", "chrt", "colcon", "dask", "git", "kill", "pip", "rosdep"}
 FOREIGN_OPTIONS = {"--help", "--qos-durability"}
-FOREIGN_WORDS = {"set_parameters_atomically", "corner_radus"}  # of rclcpp; a slip that is shown as such
+FOREIGN_WORDS = {
+    "set_parameters_atomically",
+    "corner_radus",
+    "AWS_ENDPOINT_URL",
+}  # of rclcpp; a slip that is shown as such
 SCRIPTS = set(re.findall(r'^(\w+) = "magnetosuture_thread\.', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 LAUNCH_ARGUMENTS = set(re.findall(r'argument\("(\w+)"', (ROOT / "launch/magnetosuture.launch.py").read_text()))

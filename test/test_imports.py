@@ -27,7 +27,7 @@ ALLOWED = {
     "outputs": {"interface"},
     "untrusted": set(),
     "compiled": set(),
-    "workers": set(),
+    "workers": {"errors"},
     "barrier": {"errors", "geometry", "texts"},
     "geometry": {"errors", "compiled"},
     "scene": {*BASE, "geometry", "interface", "shared_parameters"},
@@ -63,6 +63,7 @@ ALLOWED = {
         "scene",
         "thread_observation",
     },
+    "catalog": {"barrier", "errors", "evaluation"},
     "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation", "texts"},
     "nodes": {
         *BASE,
@@ -85,6 +86,7 @@ ALLOWED = {
             "workers",
             "interface",
             "campaign",
+            "catalog",
             "planning",
             "geometry",
             "scene",
@@ -112,6 +114,7 @@ ALLOWED = {
     "cli": {
         *(
             "errors",
+            "files",
             "texts",
             "outputs",
             "geometry",
@@ -124,7 +127,7 @@ ALLOWED = {
             "jobs",
             "reproduce",
         ),
-        *("evaluation", "calibration"),
+        *("evaluation", "calibration", "catalog"),
     },
 }
 
@@ -140,6 +143,10 @@ OWNERS = {
     "numba": {"compiled"},
     "playwright": set(),
     "osqp": {"model"},
+    "dask": {"workers"},
+    "distributed": {"workers"},
+    "duckdb": {"catalog"},
+    "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},
     "matplotlib": {"evaluation", "calibration", "reproduce"},

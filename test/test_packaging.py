@@ -131,7 +131,7 @@ def test_every_direct_dependency_is_pinned():
     pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
     asked = {
         entry
-        for name in ("requires", "dependencies", "ros", "peers", "dev", "docs", "colcon")
+        for name in ("requires", "dependencies", "ros", "cluster", "peers", "dev", "docs", "colcon")
         for entry in listed(name)
     }
     names = {re.split(r"[<>=\[]", entry)[0].lower().replace("_", "-") for entry in asked}

@@ -80,7 +80,7 @@ def find_bag_files(path: Path) -> BagFiles:
         files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     except FileNotFoundError:
         raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from None
-    except (OSError, ValueError) as error:
+    except Exception as error:  # The file system of a URL raises whatever its library does.
         problem = getattr(error, "strerror", None) or error
         raise BagError(path, f"cannot be read: {problem}") from None
     if path.is_file():

@@ -80,10 +80,11 @@ class Bag:
     """A recorded bag: mcap or sqlite3, one file or several, whole or damaged.
 
     All checksums are verified as it is opened, so that damage is known before any message is used. Intact data is read;
-    data that may be wrong never is (see `bags/mcap/salvage.py` for the rule).
+    data that may be wrong never is (see `bags/mcap/salvage.py` for the rule). Of a bag by URL, only what is read is
+    fetched and verified, and reading ends with an error where it is damaged.
 
     Args:
-        path: a file, or the folder of a bag.
+        path: a file, or the folder of a bag, of this machine or as `files.parse_location` gives it for a URL.
         remap: new name of a topic by its recorded name.
         progress: called with the verified fraction, 0 to 1.
 

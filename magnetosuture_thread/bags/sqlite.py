@@ -28,6 +28,7 @@ from magnetosuture_thread.bags.storage import (
     pluralize,
 )
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import is_url
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
@@ -71,6 +72,8 @@ class SqliteFile:
 
     def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
         self.path = path
+        if is_url(path):
+            raise BagError(path, "is a database, which is read on its own machine only; copy it to this machine")
         try:
             size = path.stat().st_size
             with path.open("rb") as stream:

@@ -10,25 +10,26 @@ from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.calibration.residuals import RunTasks, Task, replay_with_parameters
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
+from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 
 @contextmanager
-def pool(passages: Sequence[RecordedRun], workers: int) -> Iterator[RunTasks]:
-    """Give a function that runs tasks, here or in processes of their own; see `WorkerPool`.
+def pool(passages: Sequence[RecordedRun], workers: int, scheduler: str = "") -> Iterator[RunTasks]:
+    """Give a function that runs tasks, here or in processes of their own; see `make_runner`.
 
     Args:
         passages: that tasks name by their index.
         workers: number of processes; with one, no other process is started.
+        scheduler: address of a Dask scheduler, whose workers replay in place of those; empty for none.
 
     Raises:
         GraphError: a process died.
     """
-    with WorkerPool(partial(_replay, tuple(passages)), workers) as processes:
+    with make_runner(partial(_replay, tuple(passages)), workers, scheduler) as runner:
 
         def run(tasks: Sequence[Task]) -> list[Points]:
             results = dict[int, Points]()
-            for index, result in processes.run(tasks):
+            for index, result in runner.run(tasks):
                 if isinstance(result, WorkerDiedError):
                     raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
                 results[index] = result

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.files import parse_location
 from magnetosuture_thread.outputs import input_problem, output_problem
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -84,6 +85,20 @@ def output_file(text: str) -> Path:
     if not path.parent.is_dir() or path.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
     return path
+
+
+def bag_location(text: str) -> Path:
+    """Return the place of a bag, a path or a URL: an argument type."""
+    try:
+        return parse_location(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no path and no URL of a known file system: {error}") from None
+
+
+def add_scheduler(parser: argparse._ActionsContainer) -> None:
+    """Add the option --scheduler."""
+    text = "a Dask scheduler, whose workers do it instead, for example tcp://127.0.0.1:8786 (extra `cluster`)"
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help=text)
 
 
 OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.output import to_yaml
@@ -49,6 +49,7 @@ def calibrate_bags(
     against: str = "seen",
     parameters: Sequence[str] = (),
     workers: int = 1,
+    scheduler: str = "",
     picture: Path | None = None,
     json_file: Path | None = None,
     log: Log = lambda line: None,
@@ -68,6 +69,7 @@ def calibrate_bags(
         against: what predictions are compared with, `seen` (measured) or `truth`.
         parameters: names of settings to fit; all that the formulation has if empty.
         workers: processes.
+        scheduler: address of a Dask scheduler, whose workers replay the bags in place of those.
         picture: of fit and residuals, to draw (.png); beside the output if None.
         json_file: to write all figures to, if any.
         log: called with a line for a person at the end of each stage.
@@ -79,13 +81,75 @@ def calibrate_bags(
         ConfigurationError: the setup, the material or a parameter cannot be used.
         InvalidInputError: the bags are of different threads.
     """
+    passages, settings = read_runs(
+        bags, material, formulation, against, parameters, log, lambda share: progress(READING_SHARE * share), selection
+    )
+    best = BestSettings()
+    try:
+        with pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:
+            calibration, fits = fit(
+                passages,
+                settings,
+                parameters,
+                run_tasks=run,
+                best=best,
+                progress=lambda share: progress(READING_SHARE + (1.0 - READING_SHARE) * share),
+                log=log,
+            )
+    except KeyboardInterrupt:
+        if best.settings is None:
+            raise
+        log("interrupted; writing the best so far")
+        calibration, fits = unfinished_result(passages, settings, best)
+    with whole_file(output) as partial:
+        partial.write_text(to_yaml(calibration), encoding="utf-8")
+    if json_file is not None:
+        write_figures(json_file, calibration.to_json())
+    with whole_file(picture or output.with_suffix(".png")) as partial:
+        draw_calibration(partial, calibration, fits)
+    return calibration
+
+
+def write_figures(file: Path, figures: dict[str, Any]) -> None:
+    """Write figures as JSON, whole or not at all."""
+    with whole_file(file) as partial:
+        partial.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_runs(
+    bags: Sequence[Path],
+    material: str,
+    formulation: str,
+    against: str,
+    parameters: Sequence[str],
+    log: Log,
+    progress: Progress,
+    selection: BagSelection,
+) -> tuple[list[RecordedRun], ThreadModelSettings]:
+    """Return recorded runs of one thread, and the settings of the thread that a fit starts from.
+
+    Args:
+        bags: that hold the runs.
+        material: a name of `MATERIALS`, or the beginning of one; the setup's if empty.
+        formulation: rod or paper; the setup's if empty.
+        against: what predictions are compared with, `seen` (measured) or `truth`.
+        parameters: names of settings to fit; all that the formulation has if empty.
+        log: called with a line for a person.
+        progress: called with the share done, 0 to 1.
+        selection: what of the bags is read.
+
+    Raises:
+        BagError: a bag cannot be used.
+        ConfigurationError: the setup, the material or a parameter cannot be used.
+        InvalidInputError: the bags are of different threads.
+    """
     passages: list[RecordedRun] = []
     own: list[Setup] = []
     settings: ThreadModelSettings | None = None
     for index, path in enumerate(bags):
 
         def advance(share: float, index: int = index) -> None:
-            progress(READING_SHARE * (index + share) / len(bags))
+            progress((index + share) / len(bags))
 
         with open_bag(path, log, **selection) as given:
             its = settings_of(given.setup, material, formulation)
@@ -107,31 +171,7 @@ def calibrate_bags(
                 raise
         advance(1.0)
     assert settings is not None
-    best = BestSettings()
-    try:
-        with pool(passages, min(workers, os.cpu_count() or 1)) as run:
-            calibration, fits = fit(
-                passages,
-                settings,
-                parameters,
-                run_tasks=run,
-                best=best,
-                progress=lambda share: progress(READING_SHARE + (1.0 - READING_SHARE) * share),
-                log=log,
-            )
-    except KeyboardInterrupt:
-        if best.settings is None:
-            raise
-        log("interrupted; writing the best so far")
-        calibration, fits = unfinished_result(passages, settings, best)
-    with whole_file(output) as partial:
-        partial.write_text(to_yaml(calibration), encoding="utf-8")
-    if json_file is not None:
-        with whole_file(json_file) as partial:
-            partial.write_text(json.dumps(calibration.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with whole_file(picture or output.with_suffix(".png")) as partial:
-        draw_calibration(partial, calibration, fits)
-    return calibration
+    return passages, settings
 
 
 def settings_of(setup: Setup, material: str, formulation: str) -> ThreadModelSettings:

@@ -17,11 +17,12 @@ from magnetosuture_thread.campaign.loop import START
 from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
 from magnetosuture_thread.campaign.run import RunResult, run_procedure
 from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.setups import Setup, read_procedure_setup
-from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
+from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 FILE, PAGE = "campaign.json", "campaign.html"
 BAGS = "bags"  # folder of the bags in the output
@@ -92,6 +93,7 @@ def simulate_campaign(
     follower: bool = False,
     bags: Collection[int] = (),
     workers: int = 1,
+    scheduler: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
 ) -> CampaignResult:
@@ -108,6 +110,8 @@ def simulate_campaign(
         follower: whether the setup's path follower runs in place of the procedure, for comparison.
         bags: seeds whose runs are recorded as bags.
         workers: processes.
+        scheduler: address of a Dask scheduler, whose workers make the runs in place of those; for bags they must have
+            the output's folder too.
         log: called with a line for a person at each run's end.
         progress: called with the share done, 0 to 1.
 
@@ -122,9 +126,10 @@ def simulate_campaign(
     runs: dict[int, RunResult] = {}
     died: dict[int, str] = {}
     folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
-    with whole_folder(output) as folder, WorkerPool(partial(_run, procedure, used, camera, follower), workers) as pool:
+    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera, follower)
+    with whole_folder(output) as folder, make_runner(work, workers, scheduler) as runner:
         tasks = [_Task(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
-        for index, found in pool.run(tasks, log, progress):
+        for index, found in runner.run(tasks, log, progress):
             seed = seeds[index]
             if isinstance(found, WorkerDiedError):
                 died[seed] = str(found)
@@ -143,12 +148,21 @@ def simulate_campaign(
 
 
 def _run(
-    procedure: Procedure, setup: Setup, camera: bool, follower: bool, task: _Task, log: Log, progress: Progress
+    procedure: Procedure,
+    setup: Setup,
+    text: str,
+    camera: bool,
+    follower: bool,
+    task: _Task,
+    log: Log,
+    progress: Progress,
 ) -> tuple[RunResult, float]:
     """Run one seed; return what came of it, and the processor time that it took [s]."""
     began = process_time()
+    if task.bag is not None and not task.bag.parents[1].is_dir():
+        raise BagError(task.bag, "cannot be recorded: this worker does not have the output's folder")
     what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {task.seed}"
-    notes = {"setup": setup.name, SETUP_NOTE: setup.path.read_text(encoding="utf-8"), "simulated": what}
+    notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with nullcontext() if task.bag is None else RunBag(task.bag, setup, notes, START, camera=camera) as bag:
         variation = vary(setup, task.seed)
         found = run_procedure(procedure, setup, variation, camera=camera, follower=follower, recorder=bag)

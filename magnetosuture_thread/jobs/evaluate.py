@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.bags.bag_folder import find_bag_files
+from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.files import is_url
 from magnetosuture_thread.interface import STORAGE_SUFFIXES
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag
 from magnetosuture_thread.jobs.output import whole_folder
@@ -19,12 +20,12 @@ from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
 from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.texts import one_line
-from magnetosuture_thread.workers import WorkerDiedError, WorkerPool
+from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-DEPTH = 2  # folders below the one that is given, in which bags are looked for
+DEPTH = 2  # folders below the one that is given
 MAX_NAME_BYTES = 200  # bytes
 
 
@@ -35,7 +36,6 @@ class Task:
     Attributes:
         path: of the bag.
         name: of its report.
-        page: the file to write.
         against: what predictions are compared with.
         formulation: of the model.
         selection: what of the bag is read.
@@ -43,7 +43,6 @@ class Task:
 
     path: Path
     name: str
-    page: Path
     against: str
     formulation: str
     selection: BagSelection
@@ -56,6 +55,7 @@ def evaluate_bags(
     against: str = "auto",
     formulation: str = "",
     workers: int = 1,
+    scheduler: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
     **selection: Unpack[BagSelection],
@@ -72,6 +72,7 @@ def evaluate_bags(
         against: `truth` or `seen` (measured); `auto`: both where present.
         formulation: of the model; the setup's if empty.
         workers: processes.
+        scheduler: address of a Dask scheduler, whose workers evaluate the bags in place of those.
         log: called with a line for a person.
         progress: called with the share done, 0 to 1.
         selection: what of the bags is read.
@@ -86,20 +87,18 @@ def evaluate_bags(
     if setup_name := selection.get("setup_name"):
         read_setup(setup_name)  # refuses what is wrong for all before anything is done
     bags = find_bags(paths)
-    names = numbered([_name(bag) for bag in bags], "{}-{}")
+    names = numbered([name_of(bag) for bag in bags], "{}-{}")
     rows: dict[int, Row] = {}
     with whole_folder(output) as folder:
-        tasks = [
-            Task(bag, name, folder / f"{name}.html", against, formulation, selection)
-            for bag, name in zip(bags, names, strict=True)
-        ]
-        with WorkerPool(evaluate_one, workers) as pool:
-            for index, result in pool.run(tasks, log, progress):
+        tasks = [Task(bag, name, against, formulation, selection) for bag, name in zip(bags, names, strict=True)]
+        with make_runner(evaluate_one, workers, scheduler) as runner:
+            for index, result in runner.run(tasks, log, progress):
                 task = tasks[index]
-                row = _failed(task, str(result)) if isinstance(result, WorkerDiedError) else result
+                row, page = (_failed(task, str(result)), "") if isinstance(result, WorkerDiedError) else result
                 if row["problem"]:
-                    task.page.unlink(missing_ok=True)
                     log(f"{task.name}: {row['problem']}")
+                else:
+                    (folder / f"{task.name}.html").write_text(page, encoding="utf-8")
                 rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
@@ -107,38 +106,40 @@ def evaluate_bags(
     return ordered
 
 
-def evaluate_one(task: Task, log: Log, progress: Progress) -> Row:
-    """Return the row of a bag, with the problem in it if there is one: nothing stops the others."""
+def evaluate_one(task: Task, log: Log, progress: Progress) -> tuple[Row, str]:
+    """Return the row of a bag and its page; with a problem in the row, there is no page: nothing stops the others."""
     try:
         return evaluate_bag(**vars(task), log=lambda text: log(f"{task.name}: {text}"), progress=progress)
     except MagnetosutureError as error:
-        return _failed(task, str(error))
+        return _failed(task, str(error)), ""
     except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
-        return _failed(task, f"{type(error).__name__}: {error}")
+        return _failed(task, f"{type(error).__name__}: {error}"), ""
 
 
 def _failed(task: Task, problem: str) -> Row:
     return failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
 
 
-def _name(bag: Path) -> str:
-    path = Path(os.path.abspath(bag))
+def name_of(bag: Path) -> str:
+    """Return the name of a bag's report: that of its folder or file."""
+    path = bag if is_url(bag) else Path(os.path.abspath(bag))
     name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
     return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
 
 
-def find_bags(paths: Sequence[Path]) -> list[Path]:
+def find_bags(paths: Sequence[Path], depth: int = DEPTH) -> list[Path]:
     """Return the bags at paths, in their order, each once; within a folder by name.
 
     Args:
-        paths: bags, or folders that hold some, in themselves or up to two folders below.
+        paths: bags, or folders that hold some.
+        depth: folders below a path in which bags are looked for.
 
     Raises:
         BagError: a path holds none.
     """
     found: dict[Path, Path] = {}
     for path in paths:
-        bags = _bags(path, DEPTH)
+        bags = _bags(path, depth)
         if not bags:
             endings = " or ".join(STORAGE_SUFFIXES)
             raise BagError(
@@ -156,13 +157,18 @@ def _bags(path: Path, depth: int) -> list[Path]:
         if path.is_file():
             return [path]
         inside = sorted(path.iterdir())
-    except (OSError, ValueError) as error:
+    except BagError:
+        raise
+    except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {error}") from None
     files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
-    if (path / "metadata.yaml").is_file() or len(files) == 1 or (files and _is_one(path)):
+    if any(file.name == METADATA_FILE for file in inside):
         return [path]
     folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
-    return files + [bag for folder in folders for bag in _bags(folder, depth - 1)]
+    below = [bag for folder in folders for bag in _bags(folder, depth - 1)]
+    if not below and (len(files) == 1 or (files and _is_one(path))):
+        return [path]
+    return files + below
 
 
 def _is_one(path: Path) -> bool:
@@ -189,6 +195,8 @@ def kind_of(paths: Sequence[Path]) -> str:
 
 def _is_reference(path: Path) -> bool:
     """Return whether a path is a reference trajectory, or a folder of them, and no bag."""
+    if is_url(path):
+        return False
     try:
         return path.suffix == ".npz" if path.is_file() else any(path.glob("*.npz"))
     except OSError:

@@ -6,7 +6,7 @@ import platform
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -46,21 +46,19 @@ MAX_WAITING = 600  # recorded predictions that may wait for their frame
 def evaluate_bag(
     path: Path,
     name: str,
-    page: Path,
     against: str,
     formulation: str,
     selection: BagSelection,
     log: Log,
     progress: Progress,
-) -> Row:
-    """Evaluate a bag, write its page and return its row of the table.
+) -> tuple[Row, str]:
+    """Evaluate a bag; return its row of the table, and its page.
 
     Of each frame some numbers are kept, and of a few frames the threads: memory grows by 210 bytes a frame.
 
     Args:
         path: of the bag.
         name: of the report.
-        page: the file to write.
         against: `truth` or `seen` (measured); `auto`: both where present.
         formulation: of the model; the setup's if empty.
         selection: what of the bag is read.
@@ -72,24 +70,57 @@ def evaluate_bag(
         ConfigurationError: the setup cannot be used.
     """
     with open_bag(path, log, **selection) as given:
-        model = given.setup.model
-        model = replace(model, formulation=formulation or model.formulation)
-        recorded = bool(given.recording.counts.get(PREDICTED_THREAD.recorded))
-        targets = _targets(given, against)
-        metrics = RunMetrics(model.thread_length, given.recording.start, targets, recorded=recorded)
-        seen = _MeteredReader(given, metrics, lambda share: progress(0.95 * share))
-        refused = _predict(given, model, metrics, seen)
-        live = live_figures(given.recording, given.start, given.duration)
-        figures = BagFigures.of(metrics, live, (given.start, given.start + given.duration))
-        about = _about(given, name, model, refused, seen.thread_problem())
-        if not figures.predicted:
-            counts = Counter(metrics.reasons) + refused
-            why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
-            raise BagError(path, f"gave no prediction: {figures.tracked} of {figures.frames} had a needle; {why}")
-        pictures = _pictures(given, model, metrics)
-    page.write_text(write_page(about, metrics, figures, pictures), encoding="utf-8")
+        measured = measure_bag(given, name, against, formulation, lambda share: progress(0.95 * share))
+        pictures = _pictures(given, measured.model, measured.metrics)
+    page = write_page(measured.about, measured.metrics, measured.figures, pictures)
     progress(1.0)
-    return row_of(about, figures)
+    return row_of(measured.about, measured.figures), page
+
+
+@dataclass(frozen=True)
+class MeasuredBag:
+    """What came of predicting a bag.
+
+    Attributes:
+        about: facts about the bag.
+        model: settings of the model.
+        metrics: of all frames.
+        figures: of the whole bag.
+    """
+
+    about: BagDetails
+    model: ThreadModelSettings
+    metrics: RunMetrics
+    figures: BagFigures
+
+
+def measure_bag(given: BagInput, name: str, against: str, formulation: str, progress: Progress) -> MeasuredBag:
+    """Predict and estimate the thread of a bag, frame by frame, and compare it with what it holds.
+
+    Args:
+        given: the bag.
+        name: of its report.
+        against: `truth` or `seen` (measured); `auto`: both where present.
+        formulation: of the model; the setup's if empty.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: what is compared with is not in it, or nothing in it was predicted.
+    """
+    model = replace(given.setup.model, formulation=formulation or given.setup.model.formulation)
+    recorded = bool(given.recording.counts.get(PREDICTED_THREAD.recorded))
+    targets = _targets(given, against)
+    metrics = RunMetrics(model.thread_length, given.recording.start, targets, recorded=recorded)
+    seen = _MeteredReader(given, metrics, progress)
+    refused = _predict(given, model, metrics, seen)
+    live = live_figures(given.recording, given.start, given.duration)
+    figures = BagFigures.of(metrics, live, (given.start, given.start + given.duration))
+    if not figures.predicted:
+        counts = Counter(metrics.reasons) + refused
+        why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
+        problem = f"gave no prediction: {figures.tracked} of {figures.frames} had a needle; {why}"
+        raise BagError(given.recording.path, problem)
+    return MeasuredBag(_about(given, name, model, refused, seen.thread_problem()), model, metrics, figures)
 
 
 class _MeteredReader(ObservationReader):

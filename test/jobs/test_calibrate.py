@@ -40,9 +40,9 @@ SETUP = """\
 ONE = ("--parameters", "elastic_modulus")
 
 
-def trajectory(phase: float = 0.0) -> ReferenceTrajectory:
-    """Return a run of the rig's rod as a reference trajectory."""
-    sights = rig_run(TRUE, phase=phase)
+def trajectory(phase: float = 0.0, ratio: float = TRUE) -> ReferenceTrajectory:
+    """Return a run of the rig's rod, of a stiffness over drag, as a reference trajectory."""
+    sights = rig_run(ratio, phase=phase)
     headings = np.unwrap([math.atan2(sight.heading[1], sight.heading[0]) for sight in sights])
     times = np.array([(sight.stamp - sights[0].stamp) * 1e-9 for sight in sights])
     tails, threads = (np.array([getattr(sight, name) for sight in sights]) for name in ("tail", "ground_truth"))
@@ -194,3 +194,52 @@ def test_another_material_comes_with_its_own_numbers():
     assert settings_of(own, "polyamide", "") == own.model
     silk = settings_of(own, "silk", "paper")
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")
+
+
+def fleet_bags(folder: Path, factors: tuple[float, ...]) -> list[str]:
+    """Render bags of one thread in liquids of different viscosity, over the mean; return their paths."""
+    (folder / "lab.yaml").write_text(SETUP)
+    paths = []
+    for index, factor in enumerate(factors):
+        paths.append(str(folder / f"bag_{index}"))
+        run_of = trajectory(0.4 * index, TRUE / factor)
+        setup = read_setup(str(folder / "lab.yaml"))
+        render_bag(run_of, setup, Path(paths[-1]), rate=15.0, poses=True, noise=2e-5, seed=index)
+    return paths
+
+
+def test_a_fleet_shares_its_stiffness_and_tells_the_viscosity_of_each_bag(tmp_path: Path):
+    factors = (0.8, 1.0, 1.25, 0.9)
+    bags = fleet_bags(tmp_path, factors)
+    texts = []
+    for workers in ("1", "2"):
+        output, figures = tmp_path / f"{workers}.yaml", tmp_path / f"{workers}.json"
+        options = ("--fleet", *ONE, "--workers", workers, "--output", str(output), "--json", str(figures))
+        assert run(tmp_path, *bags, *options) == 0
+        texts.append((output.read_bytes(), figures.read_bytes()))
+    assert texts[0] == texts[1]
+    found = json.loads(texts[0][1])
+    mean = TRUE / math.exp(float(np.mean(np.log(factors))))
+    shared = found["stiffness_over_drag"]
+    assert shared["low"] < mean < shared["high"]
+    assert shared["value"] == pytest.approx(mean, rel=0.05)
+    relative = [factor * mean / TRUE for factor in factors]
+    for bag, true in zip(found["bags"], relative, strict=True):
+        value, low, high = bag["viscosity"]
+        assert low < true < high
+        assert value == pytest.approx(true, rel=0.06)
+    text = texts[0][0].decode()
+    assert "viscosities scatter by" in text.lower()
+    both = read_setup(str(tmp_path / "lab.yaml")).model
+    modulus = float(text.split("elastic_modulus: ")[1].split()[0])
+    assert stiffness_over_drag(replace(both, elastic_modulus=modulus)) == pytest.approx(shared["value"], rel=1e-4)
+
+
+def test_a_fleet_of_too_few_bags_or_without_what_they_share_is_refused(folder: Path, tmp_path: Path, capsys):
+    bags = [str(folder / name) for name in ("one", "two")]
+    output = ("--fleet", "--output", str(tmp_path / "x.yaml"))
+    assert run(folder, *bags, *ONE, *output) == 1
+    assert "2 that tell the stiffness over drag, expected at least 3" in capsys.readouterr().err
+    assert run(folder, *bags, *output, "--parameters", "drag_anisotropy") == 2
+    assert "elastic_modulus among them" in capsys.readouterr().err
+    assert not (tmp_path / "x.yaml").exists()

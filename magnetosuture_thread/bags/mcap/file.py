@@ -1,4 +1,4 @@
-"""Scans an mcap file as it is opened, and reads the messages of its intact blocks."""
+"""Scans an mcap file as it is opened, or takes its index, and reads the messages of its intact blocks."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
 from magnetosuture_thread.bags.bag_folder import NOTES
+from magnetosuture_thread.bags.mcap.index import read_index
 from magnetosuture_thread.bags.mcap.records import (
     MAGIC,
     MESSAGE_HEADER,
@@ -26,6 +27,7 @@ from magnetosuture_thread.bags.mcap.scan import Block, Scanner
 from magnetosuture_thread.bags.mcap.summary import read_summary
 from magnetosuture_thread.bags.storage import StoredMessage, merge_by_time, pluralize
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import is_url, open_ranges
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, BudgetError, UnpackBudget
 
 ROSBAG2 = "rosbag2"  # the metadata record in which rosbag2 keeps a copy of metadata.yaml
@@ -33,6 +35,9 @@ ROSBAG2 = "rosbag2"  # the metadata record in which rosbag2 keeps a copy of meta
 
 class McapFile:
     """An mcap file, open for reading; implements `BagStorage`, where the attributes are described.
+
+    A file of this machine is verified as it is opened. Of one that a URL names, its index is taken where that has a
+    correct checksum (see `mcap/index.py`), and each chunk is verified as it is read.
 
     Args:
         path: the file.
@@ -46,16 +51,20 @@ class McapFile:
     def __init__(self, path: Path, budget: UnpackBudget, progress: Callable[[int], None] = lambda count: None) -> None:
         self.path = path
         try:
-            with path.open("rb") as stream:
+            with open_ranges(path) as stream:
                 size = stream.seek(0, 2)
                 if not size:
                     raise BagError(path, "is empty, expected an mcap file")
                 summary = read_summary(stream, size, budget)
-                scan = Scanner(path, stream, size, summary, budget, progress).scan()
-                stream.seek(0)
-                if stream.read(len(MAGIC)) != MAGIC and not scan.blocks and summary is None:
-                    raise BagError(path, "is no mcap file")
-                salvaged = salvage(path.name, size, scan, summary, partial(_count_messages, stream))
+                indexed = read_index(stream, summary, budget) if is_url(path) else None
+                if indexed is not None:
+                    scan, salvaged = indexed
+                else:
+                    scan = Scanner(path, stream, size, summary, budget, progress).scan()
+                    stream.seek(0)
+                    if stream.read(len(MAGIC)) != MAGIC and not scan.blocks and summary is None:
+                        raise BagError(path, "is no mcap file")
+                    salvaged = salvage(path.name, size, scan, summary, partial(_count_messages, stream))
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from None
         except BudgetError as error:
@@ -76,6 +85,7 @@ class McapFile:
         checked = sum(block.has_checksum for block in self._blocks)
         chunks = sum(block.is_chunk for block in self._blocks)
         data = "; of all data too" if scan.data_crc_matches else ""
+        data = ", verified as they are read" if indexed is not None else data
         self.facts = {
             "format": "mcap",
             "bytes": str(size),
@@ -92,7 +102,7 @@ class McapFile:
         """
         wanted = frozenset(connections) & set(self.counts)
         try:
-            with self.path.open("rb") as stream:
+            with open_ranges(self.path) as stream:
                 yield from merge_by_time(
                     (block.start, partial(self._read_block, stream, block, wanted, start, end))
                     for block in self._blocks
@@ -104,16 +114,19 @@ class McapFile:
     def _read_block(
         self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
     ) -> Iterator[StoredMessage]:
+        found = []
         try:
             data = _load(stream, block)
-        except CorruptRecordError:
-            raise BagError(self.path, "has changed while it was read") from None
-        found = []
-        for opcode, first, last in iterate_records(data):
-            if opcode == Opcode.MESSAGE:
-                channel, sequence, time, publish_time = MESSAGE_HEADER.unpack_from(data, first)
-                if channel in wanted and start <= time <= end:
-                    found.append((time, first + MESSAGE_HEADER.size, last, channel, sequence, publish_time))
+            for opcode, first, last in iterate_records(data):
+                if opcode == Opcode.MESSAGE:
+                    channel, sequence, time, publish_time = MESSAGE_HEADER.unpack_from(data, first)
+                    if channel in wanted and start <= time <= end:
+                        found.append((time, first + MESSAGE_HEADER.size, last, channel, sequence, publish_time))
+        except CorruptRecordError as error:
+            if block.crc is not None:
+                raise BagError(self.path, "has changed while it was read") from None
+            problem = f"has {error} at byte {block.offset}; copy it to this machine to read what is intact"
+            raise BagError(self.path, problem) from None
         found.sort()
         for time, first, last, channel, sequence, publish_time in found:
             yield StoredMessage(time, self.connections[channel], data[first:last], publish_time, sequence)
@@ -134,7 +147,7 @@ class McapFile:
         if self._scan.private_records:
             dropped["record of a private kind"] += self._scan.private_records
         try:
-            with self.path.open("rb") as stream:
+            with open_ranges(self.path) as stream:
                 for start, length in self._scan.attachments:
                     stream.seek(start)
                     attachment, checked = None, False
@@ -154,7 +167,8 @@ def _load(stream: BinaryIO, block: Block) -> bytes:
     """Return the records of a block.
 
     Raises:
-        CorruptRecordError: they have changed since the file was scanned.
+        CorruptRecordError: they have changed since the file was scanned; of a block that was not read yet, they are
+            corrupt or have no checksum.
     """
     stream.seek(block.offset)
     data = stream.read(block.length)
@@ -162,7 +176,9 @@ def _load(stream: BinaryIO, block: Block) -> bytes:
     if block.is_chunk:
         content = decompress_chunk(data)
         data, crc = content.data, content.crc
-    if crc != block.crc:
+        if block.crc is None and not content.has_checksum:
+            raise CorruptRecordError("a chunk without a checksum")
+    if block.crc is not None and crc != block.crc:
         raise CorruptRecordError("other bytes than before")
     return data
 

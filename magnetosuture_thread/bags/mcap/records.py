@@ -185,6 +185,13 @@ def decompress_chunk(body: bytes, budget: UnpackBudget | None = None) -> ChunkCo
     return ChunkContent(data, found, bool(crc), compression.decode())
 
 
+def has_chunk_checksum(stream: BinaryIO, position: int) -> bool:
+    """Return whether a chunk with a checksum begins at a position; the checksum is not verified."""
+    stream.seek(position + RECORD_HEADER.size)
+    head = stream.read(_CHUNK_HEADER.size)
+    return len(head) == _CHUNK_HEADER.size and bool(_CHUNK_HEADER.unpack(head)[3])
+
+
 def _decompress(compression: bytes, compressed: bytes, size: int) -> bytes:
     """Return the data, but at most a byte more than the size that the chunk claims."""
     if not compression:

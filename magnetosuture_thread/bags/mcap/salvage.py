@@ -151,7 +151,7 @@ def _match_index(scan: ScanResult, trusted: McapSummary | None) -> _IndexMatch:
         return _match_chunks(scan.blocks, trusted)
     if scan.data_crc_matches:
         return _IndexMatch(scan.blocks, [], "", [], has_index=False, in_place=False)
-    seen: set[tuple[int, int, int, int]] = set()
+    seen: set[tuple[int | None, int, int, int]] = set()
     unique, copies = list[Block](), list[Block]()
     for block in scan.blocks:
         key = (block.crc, block.size, block.start, block.end)
@@ -163,14 +163,14 @@ def _match_index(scan: ScanResult, trusted: McapSummary | None) -> _IndexMatch:
 def _match_chunks(blocks: list[Block], trusted: McapSummary) -> _IndexMatch:
     """Match by offset first, then, for chunks that were moved, by lengths and times."""
     offsets = {} if trusted.shifted else {chunk.offset: chunk for chunk in trusted.chunks}
-    expected = Counter(chunk[1:] for chunk in trusted.chunks)
+    expected = Counter(chunk.content for chunk in trusted.chunks)
     indexed: set[int] = set()
     for number, block in enumerate(blocks):
         chunk = offsets.get(block.offset - RECORD_HEADER.size)
         if not block.is_chunk:
             indexed.add(number)
         elif chunk is not None and chunk.length == block.length + RECORD_HEADER.size:
-            expected[chunk[1:]] -= 1
+            expected[chunk.content] -= 1
             indexed.add(number)
     for number, block in enumerate(blocks):
         key = (block.length + RECORD_HEADER.size, block.size, block.start, block.end)
@@ -179,8 +179,8 @@ def _match_chunks(blocks: list[Block], trusted: McapSummary) -> _IndexMatch:
             indexed.add(number)
     missing = []
     for chunk in trusted.chunks:
-        if expected[chunk[1:]] > 0:
-            expected[chunk[1:]] -= 1
+        if expected[chunk.content] > 0:
+            expected[chunk.content] -= 1
             missing.append(chunk)
     return _IndexMatch(
         [block for number, block in enumerate(blocks) if number in indexed],

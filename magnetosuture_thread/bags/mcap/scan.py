@@ -50,7 +50,7 @@ class Block(NamedTuple):
         length: number of bytes.
         is_chunk: whether it is a chunk.
         has_checksum: whether it has a checksum of its own.
-        crc: checksum of its records, computed.
+        crc: checksum of its records, computed; None where it is not read yet.
         size: bytes of its records.
         start: time of its first message [ns].
         end: time of its last message [ns].
@@ -61,7 +61,7 @@ class Block(NamedTuple):
     length: int
     is_chunk: bool
     has_checksum: bool
-    crc: int
+    crc: int | None
     size: int
     start: int
     end: int

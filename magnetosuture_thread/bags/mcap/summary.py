@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple
@@ -84,6 +85,8 @@ class IndexedChunk(NamedTuple):
         size: bytes of the records in it.
         start: time of its first message [ns].
         end: time of its last message [ns].
+        channels: with messages in it, 2 bytes each.
+        index_length: bytes of the message indexes after it.
     """
 
     offset: int
@@ -91,6 +94,13 @@ class IndexedChunk(NamedTuple):
     size: int
     start: int
     end: int
+    channels: bytes
+    index_length: int
+
+    @property
+    def content(self) -> tuple[int, int, int, int]:
+        """Return what identifies the chunk wherever it is: length, size and times."""
+        return self.length, self.size, self.start, self.end
 
 
 @dataclass
@@ -106,6 +116,7 @@ class McapSummary:
         channels: channels and their schemas.
         chunks: the chunk index.
         metadata: index of the metadata records.
+        attachments: offset and length of the attachment records.
         statistics: counts and times of all messages, if present.
     """
 
@@ -117,6 +128,7 @@ class McapSummary:
     channels: ChannelTable = field(default_factory=ChannelTable)
     chunks: list[IndexedChunk] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
+    attachments: list[tuple[int, int]] = field(default_factory=list)
     statistics: Statistics | None = None
 
 
@@ -172,6 +184,7 @@ def _parse_summary(data: bytes, start: int, budget: UnpackBudget, *, shifted: bo
     if crc and zlib.crc32(data[:-4]) != crc:
         return None
     summary = McapSummary(start, start + len(data) - RECORD_HEADER.size - _FOOTER.size, bool(crc), shifted)
+    channel_sets: dict[bytes, bytes] = {}
     try:
         for opcode, first, last in iterate_records(data):
             budget.spend(0, 1)
@@ -180,6 +193,7 @@ def _parse_summary(data: bytes, start: int, budget: UnpackBudget, *, shifted: bo
                 budget.keep(last - first, len(getattr(record, "metadata", ())))
                 summary.channels.add(record)
             elif opcode == Opcode.CHUNK_INDEX:
+                channels = array("H", sorted(record.message_index_offsets)).tobytes()
                 summary.chunks.append(
                     IndexedChunk(
                         record.chunk_start_offset,
@@ -187,8 +201,12 @@ def _parse_summary(data: bytes, start: int, budget: UnpackBudget, *, shifted: bo
                         record.uncompressed_size,
                         record.message_start_time,
                         record.message_end_time,
+                        channel_sets.setdefault(channels, channels),
+                        record.message_index_length,
                     )
                 )
+            elif opcode == Opcode.ATTACHMENT_INDEX:
+                summary.attachments.append((record.offset, record.length))
             elif opcode == Opcode.METADATA_INDEX:
                 summary.metadata.append(record)
             elif opcode == Opcode.STATISTICS:

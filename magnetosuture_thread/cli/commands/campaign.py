@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from magnetosuture_thread.cli.arguments import DONE, FAILED, Subparsers, command, count_argument
+from magnetosuture_thread.cli.arguments import DONE, FAILED, Subparsers, add_scheduler, command, count_argument
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress
 
 
@@ -26,6 +26,7 @@ def add(subparsers: Subparsers) -> None:
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
     workers = count_argument("processes", 1, 256)
     option("--workers", type=workers, default=1, metavar="W", help="processes (default: 1)")
+    add_scheduler(parser)
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
 
 
@@ -38,6 +39,7 @@ def run_campaign(options: argparse.Namespace) -> int:
       campaign.json   how many runs succeeded, and the figures of each
       campaign.html   the same as a page, with pictures of the last seconds of each run that failed
       bags/seed_N     for each seed of --bags: what all nodes would publish, with the ground truth; `replay` takes it
+    With --scheduler and --bags, DIR must be a folder that all workers have.
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
     """
     from magnetosuture_thread.jobs import campaign as job
@@ -54,6 +56,7 @@ def run_campaign(options: argparse.Namespace) -> int:
             follower=options.follower,
             bags=options.bags,
             workers=options.workers,
+            scheduler=options.scheduler,
             log=make_log(console),
             progress=advance,
         )

@@ -17,7 +17,9 @@ from magnetosuture_thread.cli.arguments import (
     FAILED,
     Subparsers,
     add_frames,
+    add_scheduler,
     add_source,
+    bag_location,
     bag_selection,
     command,
     count_argument,
@@ -27,7 +29,7 @@ from magnetosuture_thread.cli.arguments import (
 from magnetosuture_thread.cli.terminal import make_console, make_log, progress, write_json
 
 MAX_ROWS = 20  # of frames; beyond, only the summary is shown
-BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers")
+BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
 REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
 
 
@@ -35,7 +37,7 @@ def add(subparsers: Subparsers) -> None:
     """Add the commands."""
     parser = command(subparsers, "evaluate", run_evaluate)
     parser.set_defaults(default_of=parser.get_default)
-    parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
+    parser.add_argument("paths", type=bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
     # The model's own names, written out: importing the model for them would be slow.
     formulation = "how a step is written (default: a bag's setup's; rod)"
     parser.add_argument("--formulation", choices=("rod", "paper"), help=formulation)
@@ -50,6 +52,7 @@ def add(subparsers: Subparsers) -> None:
     option("--duration", type=number_argument(0.0, 1e9), metavar="S", help="seconds (default: to each bag's end)")
     workers = count_argument("processes", 1, 256)
     option("--workers", type=workers, default=1, metavar="N", help="processes (default: 1)")
+    add_scheduler(bags)
     option = parser.add_argument_group("reference trajectories").add_argument
     option("--solver", choices=("banded", "osqp"), help="what solves a step (default: banded)")
     segments = "number of segments (default: the paper's, as each file says)"
@@ -81,7 +84,8 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
     the measured centreline and, where the bag holds it, ground truth. PATH is an mcap or db3 file, the folder of a
-    bag, or a folder of bags, which may be up to two folders below. DIR, which must not exist, gets
+    bag, or a folder of bags, which may be up to two folders below; or the URL of one, such as s3://BUCKET/RUNS. DIR,
+    which must not exist, gets
       NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
       table.csv    a row for each bag, SI units and %
       table.json   the same, with mean and worst, and prediction and estimate side by side
@@ -124,6 +128,7 @@ def _evaluate_bags(options: argparse.Namespace) -> int:
             against=options.against,
             formulation=options.formulation or "",
             workers=options.workers,
+            scheduler=options.scheduler,
             log=log,
             progress=advance,
             **bag_selection(options),

@@ -11,6 +11,7 @@ from magnetosuture_thread.cli.arguments import (
     DONE,
     Subparsers,
     add_source,
+    bag_location,
     bag_selection,
     command,
     number_argument,
@@ -27,7 +28,7 @@ def add(subparsers: Subparsers) -> None:
     """Add the commands."""
     parser = command(subparsers, "replay", run_replay)
     option = parser.add_argument
-    option("bag", type=Path, metavar="BAG", help="an mcap file, or the folder of a bag")
+    option("bag", type=bag_location, metavar="BAG", help="an mcap file, or the folder of a bag, or its URL")
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
     option("--offline", action="store_true", help="without a graph, as fast as the machine can")
     option("--rate", type=number_argument(0.05, 20.0), help="how much faster than recorded (default: 1)")

@@ -7,12 +7,14 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
+
+from magnetosuture_thread.workers.runner import Log, Progress, Work, WorkerDiedError
 
 # A worker is one of as many as there are processors for: what it uses must not start a thread for each of them.
 ONE_THREAD = (
@@ -24,17 +26,9 @@ ONE_THREAD = (
 )
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
 
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
-Work = Callable[[Any, Log, Progress], Any]
-
-
-class WorkerDiedError(Exception):
-    """A worker's process ended in the middle of a task, as when memory runs out."""
-
 
 class WorkerPool:
-    """Processes that run tasks, each by one call of the same function; used as a context.
+    """Processes of this machine that run tasks, each by one call of the same function; implements `TaskRunner`.
 
     With one worker or one task everything runs in this process. Else processes are started afresh (`spawn`): a fork
     would take along threads and locks of numba and OpenCV. Whatever ends the context, as Ctrl-C, ends the processes at

@@ -1,0 +1,144 @@
+"""Tasks on the workers of a Dask cluster; needs the extra `cluster`."""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+import threading
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import dask
+from distributed import Client, KilledWorker, as_completed
+
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.workers.runner import Log, Progress, Work, WorkerDiedError
+
+CONNECT_TIMEOUT = 20.0  # s
+# A result has the same bits only where these are the same. OpenCV comes by pip or as Ubuntu's package.
+SOFTWARE = ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp")
+MAX_WORK_BYTES = "1 GB"  # of the work, sent once; Dask warns beyond 10 MB, which a few recorded runs have
+_ONE_AT_A_TIME = threading.Lock()  # in a worker of several threads: matplotlib is not made for them
+
+
+class ClusterRunner:
+    """Workers of a Dask cluster that run tasks; implements `TaskRunner`.
+
+    A worker that is lost takes nothing with it: Dask repeats its tasks on others. Dask gives up a task that was on
+    four lost workers, whichever task ended them: each such task is repeated alone, and gives a `WorkerDiedError` only
+    where it ends workers then too. Log lines of a task come when it ends. Whatever ends the context cancels what has
+    not begun; what a worker has begun it still ends, for nobody.
+
+    Args:
+        work: called with task, log and progress; can be pickled.
+        address: of the scheduler.
+
+    Raises:
+        ConfigurationError: on entering: there is no scheduler or no worker, or a worker has other software than this
+            process, so that its results may differ.
+    """
+
+    def __init__(self, work: Work, address: str) -> None:
+        self._work = pickle.dumps(work)
+        self._address = address
+
+    def __enter__(self) -> ClusterRunner:
+        """Connect to the scheduler."""
+        try:
+            self._client = Client(self._address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+        except (OSError, ValueError, asyncio.TimeoutError) as error:
+            raise self._refused("the address of a running Dask scheduler", error) from None
+        try:
+            self._check_workers()
+            with dask.config.set({"distributed.admin.large-graph-warning-threshold": MAX_WORK_BYTES}):
+                # A task of its own and not scattered data, which would be lost with the workers that hold it.
+                self._loaded = self._client.submit(pickle.loads, self._work, pure=False)
+        except BaseException:
+            self._client.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Disconnect, which cancels what has not begun."""
+        self._client.close()
+
+    def run(
+        self, tasks: Sequence[Any], log: Log = lambda text: None, progress: Progress = lambda share: None
+    ) -> Iterator[tuple[int, Any]]:
+        """Run tasks; see `TaskRunner`.
+
+        Raises:
+            ConfigurationError: the scheduler is gone.
+        """
+        done, suspects = 0, list[int]()
+        for index, result in self._run_at_once(tasks, range(len(tasks)), log):
+            if isinstance(result, WorkerDiedError):
+                suspects.append(index)
+                continue
+            done += 1
+            progress(done / len(tasks))
+            yield index, result
+        for suspect in suspects:
+            for index, result in self._run_at_once(tasks, [suspect], log):
+                done += 1
+                progress(done / len(tasks))
+                yield index, result
+
+    def _run_at_once(self, tasks: Sequence[Any], indices: Sequence[int], log: Log) -> Iterator[tuple[int, Any]]:
+        futures = {self._client.submit(_run_task, self._loaded, tasks[index], pure=False): index for index in indices}
+        try:
+            for future in as_completed(list(futures), loop=self._client.loop):
+                yield futures.pop(future), self._result_of(future, log)  # what nobody names the cluster forgets
+        finally:
+            self._client.cancel(list(futures))
+
+    def _result_of(self, future: Any, log: Log) -> Any:
+        try:
+            result, lines = future.result()
+        except KilledWorker as error:
+            return WorkerDiedError(" ".join(str(error).split()))
+        except (asyncio.CancelledError, OSError) as error:
+            if future.status == "error":
+                raise
+            raise self._refused("a scheduler that stays", error) from None
+        for line in lines:
+            log(line)
+        return result
+
+    def _check_workers(self) -> None:
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
+        except TimeoutError as error:
+            raise self._refused("a scheduler with workers", error) from None
+        try:
+            found = self._client.run(_software)
+        except ModuleNotFoundError as error:
+            raise self._refused("workers with the same packages as here", error) from None
+        ours = _software()
+        for worker, theirs in found.items():
+            for name, own in ours.items():
+                if theirs[name] != own:
+                    problem = f"worker {worker} has {theirs[name] or 'none'}"
+                    raise self._refused(f"workers with {name} {own}, as here", problem)
+
+    def _refused(self, expectation: str, problem: object) -> ConfigurationError:
+        words = " ".join(str(problem).split())
+        return ConfigurationError("scheduler", self._address, f"{expectation} ({words})" if words else expectation)
+
+
+def _run_task(work: Work, task: Any) -> tuple[Any, list[str]]:
+    """Run a task on a worker; return its result and the lines that it logged."""
+    lines: list[str] = []
+    with _ONE_AT_A_TIME:
+        return work(task, lines.append, lambda share: None), lines
+
+
+def _software() -> dict[str, str]:
+    found = {}
+    for name in SOFTWARE:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = ""
+    return found
