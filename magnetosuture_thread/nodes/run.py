@@ -131,6 +131,10 @@ class _Ending(Future):
         self._nodes: tuple[Node, ...] = ()
         for which in end_signals():
             signal.signal(which, self._on_signal)
+        # A KeyboardInterrupt in a function that a C library calls, as to load compiled code, is lost with a traceback
+        # on standard error; the signal is remembered here.
+        report = sys.unraisablehook
+        sys.unraisablehook = lambda lost: None if lost.exc_type is KeyboardInterrupt else report(lost)
 
     def done(self) -> bool:
         """Return whether the process is to end: it was asked to, or its nodes were shut down by their lifecycle."""

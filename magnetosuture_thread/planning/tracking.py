@@ -27,7 +27,7 @@ DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
-PULL_MEMORY = 1.0  # s; in which the peak of a pull falls to 1 / e
+PULL_DECAY = 1.0  # s; in which the peak of a pull falls to 1 / e
 TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, from which on the needle tacks
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
@@ -66,7 +66,7 @@ class PathTracker:
     from it than `MAX_LAG` along the path or `MAX_ANGLE`.
 
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
-    the velocity d, by its peak of the last second or so (`PULL_MEMORY`), theta stays off the axes by
+    the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off the axes by
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
     crosses, or while the needle is far off its path to the wrong side, as a ship tacks. All of theta - theta_p stays
     within what half of the path's leeway allows. Where d is more than the coils compensate at the needle's direction,
@@ -131,7 +131,7 @@ class PathTracker:
         course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
         course = min(allowed, max(-allowed, course))
         # Close to an axis less of the pull is measured, so its peak is remembered for a while.
-        self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_MEMORY))
+        self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_DECAY))
         off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, across)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis

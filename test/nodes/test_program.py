@@ -74,3 +74,22 @@ def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
     )
     assert ended.returncode == 1
     assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", ended.stderr)
+
+
+def test_an_interruption_while_a_library_calls_python_is_not_lost(environment: dict[str, str]):
+    """As while compiled code is loaded: an exception goes no further there, and Python writes its traceback."""
+    script = """
+import ctypes, os, signal, sys
+import rclpy
+from magnetosuture_thread.nodes.run import run
+
+def make():
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()
+    return rclpy.create_node("interrupted")
+
+sys.exit(run(make, []))
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
