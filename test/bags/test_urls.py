@@ -152,7 +152,7 @@ def test_a_bag_on_s3_is_found_evaluated_and_replayed_as_one_of_this_machine(
     assert [record.data for record in far_bag.records()] == [record.data for record in here_bag.records()]
 
 
-def test_what_is_not_there_is_told_in_one_line(s3: CountingServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_an_absent_url_gives_one_line(s3: CountingServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for url, problem in (
         ("s3://lab/nothing", "does not exist"),
         ("s3://none/nothing", "does not exist"),
@@ -187,7 +187,7 @@ def test_a_damaged_chunk_is_an_error_where_it_is_read_and_not_before(tmp_path: P
 
 
 @pytest.mark.parametrize("kind", ["truncated", "no checksums", "no chunks", "whole"])
-def test_a_file_whose_index_does_not_tell_is_scanned_as_one_of_this_machine(tmp_path: Path, kind: str):
+def test_a_file_by_url_is_read_as_a_local_one(tmp_path: Path, kind: str):
     path = tmp_path / "x.mcap"
     writers: dict[str, dict[str, Any]] = {"no checksums": {"enable_crcs": False}, "no chunks": {"use_chunking": False}}
     write_mcap(path, texts(200), {"/text": STRING}, **writers.get(kind, {}))

@@ -208,7 +208,7 @@ def fleet_bags(folder: Path, factors: tuple[float, ...]) -> list[str]:
     return paths
 
 
-def test_a_fleet_shares_its_stiffness_and_tells_the_viscosity_of_each_bag(tmp_path: Path):
+def test_a_fleet_shares_its_stiffness_and_each_bag_has_its_viscosity(tmp_path: Path):
     factors = (0.8, 1.0, 1.25, 0.9)
     bags = fleet_bags(tmp_path, factors)
     texts = []

@@ -65,7 +65,7 @@ def test_it_serves_bags_and_reports_to_a_browser_of_this_machine_alone(port: int
 def test_a_browser_lists_and_plots_the_bags(port: int, tmp_path: Path):
     browser = shutil.which("chromium")
     if browser is None:
-        pytest.skip("no chromium")
+        pytest.skip("no chromium is installed; CI installs one")
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
     command = [browser, *options, "--virtual-time-budget=20000", "--dump-dom", f"http://127.0.0.1:{port}/"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout

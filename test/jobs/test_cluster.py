@@ -151,7 +151,7 @@ def test_workers_with_other_software_are_refused(scheduler: str, monkeypatch: py
         make_runner(print, 1, scheduler).__enter__()
 
 
-def test_no_scheduler_is_told_in_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path, short_bag: Path):
+def test_an_absent_scheduler_gives_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path, short_bag: Path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"

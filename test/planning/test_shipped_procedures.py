@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magnetosuture_thread.campaign.loop import LATENCY
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
 from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, read_procedure
@@ -54,6 +55,14 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
         clearance, time = min(clearance, safety.clearance(tail, heading)), time + PERIOD
     assert (executor.state, executor.reason) == (ProcedureState.DONE, "")
     assert clearance >= keep_out - 1e-9
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_lost_frame_does_not_stop_its_needle_and_friction_does_not_slow_it(name: str):
+    setup = read_procedure_setup(read_procedure(name))
+    assert setup.coils.command_timeout > 2.0 / setup.rig.frame_rate + LATENCY
+    feedback = {setup.coils.friction_feedback, setup.planner.friction_feedback, setup.model.friction_feedback}
+    assert feedback == {"operator"}, "bridge, planner and forecast agree"
 
 
 def test_a_procedure_brings_its_own_scene_to_any_setup():
