@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,13 +14,21 @@ from magnetosuture_thread.campaign.limits import RunFigures, RunLimits
 from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.campaign.variation import Variation
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.executor import (
+    PendingPath,
+    ProcedureExecutor,
+    ProcedureState,
+    ThreadCondition,
+    plan_now,
+)
+from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s; of a run
+PLANNING_TIME = 0.5  # s; in which a path is planned, as in the graph
 
 
 @dataclass(frozen=True)
@@ -79,12 +88,13 @@ def run_procedure(
     kinematics, keep_out = setup.coils.needle().kinematics, setup.coils.keep_out
     planner = NeedlePlanner(setup.scene, kinematics, keep_out, setup.model.thread_length, setup.coils.coil_angles)
     planner.check(procedure)
-    executor = ProcedureExecutor(procedure, planner)
+    pilot = _Pilot(procedure, planner)
+    executor = pilot.executor
     rig = Rig(variation.setup.rig, setup.scene)
     loop = ClosedLoop(
         setup,
         rig,
-        _follow(setup) if follower else _execute(executor),
+        _follow(setup) if follower else pilot.compute_command,
         variation.seed,
         camera=camera,
         losses=variation.losses,
@@ -148,13 +158,37 @@ def _planned_length(executor: ProcedureExecutor, frame: LoopFrame) -> float:
         return 0.0
 
 
-def _execute(executor: ProcedureExecutor) -> Controller:
-    def control(stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
-        if executor.state is ProcedureState.READY and not thread.problem:
-            executor.start()
-        return executor.update(stamp, tail, heading, thread).velocity
+@dataclass(frozen=True)
+class _PlannedPath:
+    """A path that is known after the time that planning takes."""
 
-    return control
+    path: PendingPath
+    is_due: Callable[[], bool]
+
+    def done(self) -> bool:
+        return self.is_due()
+
+    def result(self) -> BodyPath:
+        return self.path.result()
+
+
+class _Pilot:
+    """Executes a procedure as the needle planner does: paths are ready `PLANNING_TIME` after they are asked for."""
+
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
+        self.executor = ProcedureExecutor(procedure, planner, self._submit)
+        self._now = 0.0
+
+    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
+        """Return the velocity of the tip, and begin as soon as the thread is known."""
+        self._now = stamp
+        if self.executor.state is ProcedureState.READY and not thread.problem:
+            self.executor.start()
+        return self.executor.update(stamp, tail, heading, thread).velocity
+
+    def _submit(self, task: Callable[[], BodyPath]) -> PendingPath:
+        due = self._now + PLANNING_TIME
+        return _PlannedPath(plan_now(task), lambda: self._now >= due - 1e-9)
 
 
 def _follow(setup: Setup) -> Controller:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -38,14 +39,16 @@ from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 class NeedlePlannerNode(PackageNode):
     """Commands the needle along planned paths, at every pose; without poses the coil bridge times out.
 
-    The operator is above it: any message on `operator/servo_cv` pauses the procedure until `procedure/resume`.
+    A thread of its own plans, for up to some seconds, while the needle is kept in place. The operator is above it:
+    any message on `operator/servo_cv` pauses the procedure until `procedure/resume`.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(PLANNER, **node_options(PLANNER, options))
         settings = declare(self, NeedlePlannerSettings)
         scene = initial_scene(settings.scene)
-        self._audience, self._session = settings.audience, ProcedureSession(settings, scene)
+        self._audience, self._planning = settings.audience, ThreadPoolExecutor(1)
+        self._session = ProcedureSession(settings, scene, self._planning.submit)
         with self.health.busy("loading the planner's kernels; the first start on a machine compiles them"):
             compile_planning()
         self._moving = False  # whether the last command was not zero
@@ -87,8 +90,8 @@ class NeedlePlannerNode(PackageNode):
     def on_plan(self, request: Any, answer: Any) -> Any:
         """Plan a procedure; the plan is published, and nothing moves."""
         paths = self._plan(request)
-        answer.success, answer.length = True, sum(path.length for path in paths)
-        answer.duration = self._session.planned_duration
+        length = sum(path.length for path in paths)
+        answer.success, answer.length, answer.duration = True, length, self._session.planned_duration
         self._publish()
         return answer
 
@@ -104,10 +107,8 @@ class NeedlePlannerNode(PackageNode):
         try:
             pose = reading.needle_pose(message)
         except InvalidInputError as error:
-            self.refuse(error)
-            return
-        with self._deaf():
-            velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())
+            return self.refuse(error)
+        velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())
         if velocity is not None:
             self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), velocity))
             self._moving = bool(velocity.any())
@@ -138,6 +139,7 @@ class NeedlePlannerNode(PackageNode):
     def destroy_node(self) -> None:
         """Leave the graph."""
         self._action.destroy()
+        self._planning.shutdown(wait=False, cancel_futures=True)
         super().destroy_node()
 
     def _offer(self, name: str, execute: Callable[[], bool]) -> None:
@@ -162,18 +164,16 @@ class NeedlePlannerNode(PackageNode):
 
     def _graph_problem(self) -> str:
         """Return why commands would not be followed, or not those of one planner alone."""
-        subscribers = self._commands.get_subscription_count()
-        if subscribers < self._audience:
+        if (subscribers := self._commands.get_subscription_count()) < self._audience:
             return f"{subscribers} of {self._audience} subscribers to velocity commands"
-        publishers = self.count_publishers(self._commands.topic_name)
-        return f"{publishers} nodes publish {topics.NEEDLE_COMMAND.name}" if publishers > 1 else ""
+        count = self.count_publishers(self._commands.topic_name)
+        return f"{count} nodes publish {topics.NEEDLE_COMMAND.name}" if count > 1 else ""
 
     def _publish(self) -> None:
         """Publish what has changed; bring the needle to rest where the procedure does not command it."""
-        if not self._session.is_running:
+        if not self._session.is_commanding:
             self._rest()
-        message = self._outputs.publish()
-        if message is not None:
+        if (message := self._outputs.publish()) is not None:
             self._action.update(message)
         self._action.finish()
 

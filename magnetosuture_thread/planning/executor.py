@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +22,20 @@ from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tight
 from magnetosuture_thread.planning.tracking import PathTracker
 
 Vector = NDArray[np.float64]
+
+
+class PendingPath(Protocol):
+    """A path that is being planned, as `concurrent.futures.Future` is one."""
+
+    def done(self) -> bool:
+        """Return whether planning has ended."""
+
+    def result(self) -> BodyPath:
+        """Return the path, or raise what planning raised."""
+
+
+PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
+"""Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
 
 REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
 REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
@@ -51,6 +69,7 @@ class ThreadCondition:
         problem: why it is not known well enough to go on; empty if it is.
         drift: velocity of the needle across its chord, to the left, by what pulls it, which the bridge measures and
             compensates [m/s]; 0 if unknown.
+        may_hold: whether the needle may be kept in place by commands while there is a problem; else it is left alone.
     """
 
     vertices: Points | None = None
@@ -59,6 +78,7 @@ class ThreadCondition:
     slowdown: float = 1.0
     problem: str = ""
     drift: float = 0.0
+    may_hold: bool = True
 
 
 @dataclass(frozen=True)
@@ -100,25 +120,39 @@ class _Rest:
         return all(math.dist(first[1:], each[1:]) < REST_WAY for each in self.poses)
 
 
+def plan_now(task: Callable[[], BodyPath]) -> PendingPath:
+    """Plan a path here and now."""
+    pending: Future[BodyPath] = Future()
+    try:
+        pending.set_result(task())
+    except PlanningError as error:
+        pending.set_exception(error)
+    return pending
+
+
 class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
-    A goal's path is planned when its turn comes, from where the needle is then. A needle that rests for `REST_TIME`
-    while it is commanded backs off, and its goal is planned anew; one that is off its path by more than `OFF_PATH` too.
-    After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest.
+    A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
+    known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
+    that rests for `REST_TIME` while it is commanded backs off, and its goal is planned anew; one that is off its path
+    by more than `OFF_PATH` too. After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest.
 
     Pure: time comes in with the poses.
 
     Args:
         procedure: what to do.
         planner: of paths in the scene.
+        submit: begins to plan a path; by default that is done at once, while the caller waits.
     """
 
-    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
-        self.procedure, self.planner = procedure, planner
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner, submit: PathSubmitter = plan_now) -> None:
+        self.procedure, self.planner, self._submit = procedure, planner, submit
         self.state, self.reason, self.goal = ProcedureState.READY, "", 0
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
+        self._pending: PendingPath | None = None
+        self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._begin: Vector | None = None
         self._rest = _Rest()
         self._replans = 0
@@ -130,6 +164,11 @@ class ProcedureExecutor:
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
         self._unsure = False  # paused by itself, which goes on by itself once the thread is known again
+
+    @property
+    def is_commanding(self) -> bool:
+        """Whether its output is to be followed: it runs, or is paused by itself and keeps the needle in place."""
+        return self.state is ProcedureState.RUNNING or (self._unsure and self._holder is not None)
 
     @property
     def travel(self) -> float:
@@ -150,8 +189,8 @@ class ProcedureExecutor:
         """Begin, or go on after a pause; the goal's path is planned anew with the next pose."""
         self._unsure = False
         if self.state in (ProcedureState.READY, ProcedureState.PAUSED):
-            self.state, self.reason, self._tracker = ProcedureState.RUNNING, "", None
-            self._rest = _Rest()
+            self.state, self.reason = ProcedureState.RUNNING, ""
+            self._drop_path()
 
     def pause(self, reason: str) -> None:
         """Rest until `start` is called again."""
@@ -167,7 +206,8 @@ class ProcedureExecutor:
 
     def set_planner(self, planner: NeedlePlanner) -> None:
         """Plan in another scene from now on; a procedure that does not fit it fails."""
-        self.planner, self._tracker = planner, None
+        self.planner = planner
+        self._drop_path()
         try:
             planner.check(self.procedure)
         except MagnetosutureError as error:
@@ -189,14 +229,20 @@ class ProcedureExecutor:
             self.pause(thread.problem)
             self._unsure = True
         elif self._unsure and not thread.problem:
-            self.start()
+            self.state, self.reason, self._unsure = ProcedureState.RUNNING, "", False  # on the path of before
         if self.state is not ProcedureState.RUNNING:
             self._rest = _Rest()
-            return self._output(np.zeros(2))
+            if not (self._unsure and thread.may_hold):
+                self._holder = None
+                return self._output(np.zeros(2))
+            return self._hold(stamp, middle, angle, thread)
         self._sweep(middle)
         if stamp < self._back_off_until:
             return self._output(self._back_off)
         try:
+            if self._tracker is None and not self._plan(middle, angle):
+                return self._hold(stamp, middle, angle, thread)
+            self._holder = None
             return self._pursue(stamp, middle, angle, thread)
         except PlanningError as error:
             self.abort(str(error))
@@ -206,8 +252,6 @@ class ProcedureExecutor:
         goal = self.procedure.goals[self.goal]
         if isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED:
             return self._next_goal()
-        if self._tracker is None:
-            self._plan(middle, angle)
         assert self._tracker is not None
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
             return self._next_goal()
@@ -237,12 +281,37 @@ class ProcedureExecutor:
                 return self._replan(stamp, np.zeros(2))
         return self._next_goal()
 
-    def _plan(self, middle: Vector, angle: float) -> None:
-        goals = chain(self.procedure, self.goal)
-        assert self._begin is not None
-        left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
-        self.path = self.planner.plan(goals, self.procedure.limits[self.goal], middle, angle, self._begin, left)
+    def _plan(self, middle: Vector, angle: float) -> bool:
+        """Plan from a pose, or go on with that; return whether there is a path to track."""
+        if self._pending is None:
+            goals = chain(self.procedure, self.goal)
+            assert self._begin is not None
+            left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
+            limits = self.procedure.limits[self.goal]
+            self._pending = self._submit(
+                partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
+            )
+        if not self._pending.done():
+            return False
+        pending, self._pending = self._pending, None
+        self.path = pending.result()
         self._tracker, self._reached = PathTracker(self.path, self.planner.coil_angles), 0
+        return True
+
+    def _drop_path(self) -> None:
+        """Forget the path that is tracked or planned; the next pose is where a new one begins."""
+        self._tracker, self._pending, self._rest = None, None, _Rest()
+
+    def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
+        """Keep the needle where it was when this began, against what pulls it."""
+        limits = self.procedure.limits[self.goal]
+        if self._holder is None:
+            path = self.planner.standing_path(middle, angle, limits)
+            self._holder = PathTracker(path, self.planner.coil_angles)
+        command = self._holder.compute_command(
+            stamp, middle, angle, limits.speed, thread.slowdown, thread.drift, hold=True
+        )
+        return self._output(command.velocity)
 
     def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
@@ -250,14 +319,14 @@ class ProcedureExecutor:
         if self._replans > MAX_REPLANS:
             self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
             return self._output(np.zeros(2))
-        self._tracker, self._rest = None, _Rest()
+        self._drop_path()
         if stopped.any():
             self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
         return self._output(np.zeros(2))
 
     def _next_goal(self) -> ProcedureOutput:
         """Rest, and plan from here in the next step; or be done."""
-        self._tracker, self._rest = None, _Rest()
+        self._drop_path()
         if self.goal + 1 == len(self.procedure.goals):
             self.state = ProcedureState.DONE
             return ProcedureOutput(np.zeros(2), self.state, self.goal, 1.0)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_without_gil
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clearance
 
@@ -72,7 +72,7 @@ def _way_to(
     return path
 
 
-@compiled
+@compiled_without_gil
 def search_lattice(
     start: NDArray[np.int64],
     body: Points,

@@ -116,8 +116,13 @@ class LoopState:
         return now - self._pose <= self._settings.pose_timeout
 
     def condition(self, now: float) -> ThreadCondition:
-        """Return what is known, with the reason why a procedure cannot go on; that of before until it has settled."""
-        problem = self._problem(now)
+        """Return what is known, with the reason why a procedure cannot go on; that of before until it has settled.
+
+        Where the thread alone is the reason, or all is known and has to settle, the needle may be kept in place.
+        """
+        needle, page = self._needle_problem(now), self._page_problem(now)
+        may_hold = not (needle or page)
+        problem = needle or self._thread_problem(now) or page
         if problem:
             self._last_problem, self._last_problem_time = problem, now
         elif now - self._last_problem_time < self._settings.settle:
@@ -130,19 +135,20 @@ class LoopState:
             1.0 if margins is None or self._settings.friction_feedback != "all" else margins.slowdown,
             problem,
             self._drift,
+            may_hold,
         )
 
-    def _problem(self, now: float) -> str:
-        """Return the first reason why a procedure cannot go on; empty for none."""
+    def _page_problem(self, now: float) -> str:
+        held = now - self._held <= self._settings.hold_timeout
+        return NOT_HELD if self.hold_to_run and not held else ""
+
+    def _needle_problem(self, now: float) -> str:
+        """Return the first reason why the needle cannot be commanded; empty for none."""
         if not self.has_pose(now):
             if not math.isfinite(self._pose):
                 return NO_POSE
             return self._tracker or f"no needle pose for more than {self._settings.pose_timeout:g} s"
-        reason = self._outside or self._tracker or self._graph_problem or self._thread_problem(now)
-        if reason:
-            return reason
-        held = now - self._held <= self._settings.hold_timeout
-        return NOT_HELD if self.hold_to_run and not held else ""
+        return self._outside or self._graph_problem  # in a frame or two it may be missed
 
     def _thread_problem(self, now: float) -> str:
         margins = self._margins

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_without_gil
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clearance
 
@@ -132,7 +132,7 @@ def _filtered(poses: Points, body: Points, required: float, near: ClearanceMap) 
     return np.asarray(smooth)
 
 
-@compiled
+@compiled_without_gil
 def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap) -> None:
     """Move each pose to the middle of its neighbours, and turn it along the way, where the clearance allows.
 

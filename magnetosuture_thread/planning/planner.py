@@ -171,6 +171,13 @@ class NeedlePlanner:
         where = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm"
         raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}")
 
+    def standing_path(self, middle: Vector, angle: float, limits: ProcedureLimits) -> BodyPath:
+        """Return a path of one pose, in which the needle stays, with the leeway that it has there."""
+        near = body_clearance(float(middle[0]), float(middle[1]), angle, self.body, self.near)
+        leeway = max(0.0, near - max(self._keep_out, limits.clearance))
+        twice = np.tile(middle, (2, 1)), np.full(2, angle)
+        return BodyPath(*twice, self.lever, np.full(2, leeway), np.zeros(1))
+
     def plan_all(self, procedure: Procedure, middle: Vector, angle: float) -> tuple[BodyPath, ...]:
         """Return the paths that a procedure will take, each through the goals of one `chain`.
 

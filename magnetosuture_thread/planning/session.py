@@ -11,7 +11,7 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.clearance_map import body_clearance
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, Vector
+from magnetosuture_thread.planning.executor import PathSubmitter, ProcedureExecutor, ProcedureState, Vector, plan_now
 from magnetosuture_thread.planning.loop_state import LoopState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, chain
@@ -62,6 +62,7 @@ class ProcedureSession:
     Args:
         settings: of the planner.
         scene: dish and shapes; None until one is known.
+        submit: begins to plan a path while the needle is moved; see `ProcedureExecutor`.
 
     Attributes:
         known: what the loop's nodes report.
@@ -69,8 +70,8 @@ class ProcedureSession:
         planned_duration: of what was planned last, at the allowed speed, without friction [s].
     """
 
-    def __init__(self, settings: NeedlePlannerSettings, scene: Scene | None) -> None:
-        self._settings = settings
+    def __init__(self, settings: NeedlePlannerSettings, scene: Scene | None, submit: PathSubmitter = plan_now) -> None:
+        self._settings, self._submit = settings, submit
         self.known = LoopState(settings)
         self.status = ProcedureStatus()
         self.planned_duration = 0.0
@@ -86,8 +87,13 @@ class ProcedureSession:
 
     @property
     def is_running(self) -> bool:
-        """Whether the procedure commands the needle."""
+        """Whether the procedure goes on."""
         return self._executor is not None and self._executor.state is ProcedureState.RUNNING
+
+    @property
+    def is_commanding(self) -> bool:
+        """Whether the procedure commands the needle: it goes on, or keeps the needle in place."""
+        return self._executor is not None and self._executor.is_commanding
 
     @property
     def is_active(self) -> bool:
@@ -129,7 +135,7 @@ class ProcedureSession:
             raise InvalidInputError("procedure", procedure.name, "a scene first, as a parameter or on its topic")
         if self._pose is None or not self.known.has_pose(now):
             raise InvalidInputError("procedure", procedure.name, "a needle that is tracked")
-        executor = ProcedureExecutor(procedure, self._planner)
+        executor = ProcedureExecutor(procedure, self._planner, self._submit)
         paths = executor.plan(*self._pose[1:])
         self._planned, self.planned_duration, index = [], 0.0, 0
         for path in paths:
@@ -199,7 +205,9 @@ class ProcedureSession:
             self.pause("the coil bridge is not armed")
 
     def on_pose(self, stamp: float, tail: Vector, heading: Vector, now: float) -> Vector | None:
-        """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s]; None while nothing runs.
+        """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s]; None where nothing is commanded.
+
+        A procedure that is paused by itself, for the thread, keeps the needle in place.
 
         Args:
             stamp: of the pose [s].
@@ -220,7 +228,7 @@ class ProcedureSession:
             near = body_clearance(float(middle[0]), float(middle[1]), angle, planner.body, planner.near)
             self._clearance = min(self._clearance, near)
         self._update_status()
-        return output.velocity if self.is_running else None
+        return output.velocity if executor.is_commanding else None
 
     @property
     def setpoint(self) -> tuple[Vector, float] | None:
@@ -233,7 +241,7 @@ class ProcedureSession:
 
     def check(self, now: float) -> None:
         """Pause a procedure that cannot go on, also where no pose comes any more."""
-        if self._executor is None or self._pose is None or not self.is_running:
+        if self._executor is None or self._pose is None or not self.is_commanding:
             return
         condition = self.known.condition(now)
         if condition.problem:

@@ -101,7 +101,15 @@ class PathTracker:
         return self.path.leeway_at(self.travel)
 
     def compute_command(
-        self, stamp: float, middle: Vector, angle: float, speed: float, slowdown: float = 1.0, drift: float = 0.0
+        self,
+        stamp: float,
+        middle: Vector,
+        angle: float,
+        speed: float,
+        slowdown: float = 1.0,
+        drift: float = 0.0,
+        *,
+        hold: bool = False,
     ) -> TrackingCommand:
         """Compute the command for a pose.
 
@@ -112,9 +120,11 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
+            hold: the setpoint stands still, and is never done.
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
-        interval = interval if 0.0 < interval <= MAX_INTERVAL else 0.0
+        if not 0.0 < interval <= MAX_INTERVAL:
+            interval, self._speed = 0.0, 0.0
         self._stamp = stamp
         e = np.array([math.cos(angle), math.sin(angle)])
         stop, sense = self._stops[0]
@@ -135,12 +145,12 @@ class PathTracker:
         off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, across)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
-        waits = abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
+        waits = hold or abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
         slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, slower, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
-        if stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
+        if not hold and stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
             self._speed = 0.0
             if len(self._stops) == 1:
                 return TrackingCommand(np.zeros(2), self.path.length, size, True)

@@ -281,11 +281,6 @@ def test_a_person_plans_begins_pauses_and_gives_up_by_services(graph, make_bench
     assert "1 to 100 goals" in refused.message
 
 
-def lost(bench: Bench, tracked: bool) -> None:
-    state = TrackerState.STATE_TRACKED if tracked else TrackerState.STATE_LOST
-    bench.graph.publish(topics.TRACKER_STATE, TrackerState(state=state, reason="" if tracked else "two needles"))
-
-
 def disturbed(bench: Bench, calm: bool) -> None:
     found = [] if calm else [ThreadDisturbance(arc_length=0.01, force=2e-4, direction=Vector3(x=1.0))]
     bench.graph.publish(
@@ -305,7 +300,6 @@ def invalid(bench: Bench, valid: bool) -> None:
 @pytest.mark.parametrize(
     ("report", "reason"),
     [
-        (lost, "the needle is not tracked: two needles"),
         (disturbed, "an unmodelled contact: the thread is held at 10 mm of the thread: 0.2 mN to the right"),
         (unmeasured, "the thread has not been measured for 1.5 s"),
         (invalid, "the thread is not known: the residual is too large"),
@@ -322,10 +316,15 @@ def test_what_is_not_known_pauses_and_it_goes_on_by_itself_once_it_is(graph, mak
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
-def test_without_poses_it_pauses(graph, make_bench):
+@pytest.mark.parametrize("tracker", ["", "two needles"])
+def test_without_poses_it_pauses(graph, make_bench, tracker: str):
     bench = make_bench(pose_timeout=0.2)
     goal = bench.run()
-    graph.wait(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "no needle pose for more than 0.2 s"), "the pause")
+    if tracker:
+        graph.publish(topics.TRACKER_STATE, TrackerState(state=TrackerState.STATE_LOST, reason=tracker))
+    reason = f"the needle is not tracked: {tracker}" if tracker else "no needle pose for more than 0.2 s"
+    graph.wait(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
+    assert not bench.commands[-1].twist.linear.x
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 

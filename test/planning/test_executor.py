@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
+from magnetosuture_thread.planning.executor import (
+    PathSubmitter,
+    PendingPath,
+    ProcedureExecutor,
+    ProcedureState,
+    ThreadCondition,
+    plan_now,
+)
+from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner
 from magnetosuture_thread.planning.procedure import parse_procedure
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
@@ -23,10 +31,10 @@ POST = SceneShape("post", "instrument", Disc((0.003, 0.0), 0.002))
 KNOWN = ThreadCondition()
 
 
-def executor(*goals: dict[str, Any], **limits: Any) -> ProcedureExecutor:
+def executor(*goals: dict[str, Any], submit: PathSubmitter = plan_now, **limits: Any) -> ProcedureExecutor:
     """Return a procedure of some goals beside a post."""
     procedure = parse_procedure({"goals": list(goals), "limits": limits}, "test")
-    return ProcedureExecutor(procedure, NeedlePlanner(Scene(Dish(), (POST,)), NEEDLE, 2.5e-4, 0.05))
+    return ProcedureExecutor(procedure, NeedlePlanner(Scene(Dish(), (POST,)), NEEDLE, 2.5e-4, 0.05), submit)
 
 
 class Needle:
@@ -35,6 +43,7 @@ class Needle:
     def __init__(self, x: float = -0.006, y: float = 0.0, angle: float = 0.0) -> None:
         self.tail, self.heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
         self.share, self.drift, self.time, self.way = 1.0, np.zeros(2), 1.0, 0.0
+        self.pull = np.zeros(2)  # whatever is commanded
 
     def run(
         self,
@@ -50,7 +59,7 @@ class Needle:
             self.way += math.hypot(*velocity) / RATE
             moved = NEEDLE.body_velocity(self.heading, self.share * velocity)
             self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *moved, 1.0 / RATE)
-            self.tail = self.tail + self.drift * bool(velocity.any()) / RATE
+            self.tail = self.tail + (self.drift * bool(velocity.any()) + self.pull) / RATE
             self.time += 1.0 / RATE
 
     @property
@@ -100,6 +109,57 @@ def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
     assert "not been measured" in run.reason
     needle.run(run, 60.0)
     assert run.state is ProcedureState.DONE
+
+
+@pytest.mark.parametrize("along", [4e-4, -4e-4])
+def test_a_needle_that_is_pulled_is_kept_in_place_while_the_thread_is_not_known(along: float):
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    needle.pull = along * needle.heading
+    at = needle.tail
+    needle.run(run, 4.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
+    assert (run.state, run.is_commanding) == (ProcedureState.PAUSED, True)
+    assert math.dist(needle.tail, at) < 1e-4  # pulled by 1.6 mm
+    needle.run(run, 1.0, lambda: replace(KNOWN, problem="nobody holds the page", may_hold=False))
+    assert (run.state, run.is_commanding) == (ProcedureState.PAUSED, False)
+    assert math.dist(needle.tail, at) > 3e-4
+
+
+class Planning:
+    """Plans when it is let: paths that are asked for are ready from then on."""
+
+    def __init__(self) -> None:
+        self.tasks: list[Callable[[], BodyPath]] = []
+        self.is_ready = False
+
+    def submit(self, task: Callable[[], BodyPath]) -> PendingPath:
+        """Take a task."""
+        self.tasks.append(task)
+        return self
+
+    def done(self) -> bool:
+        """Return whether it may plan."""
+        return self.is_ready
+
+    def result(self) -> BodyPath:
+        """Plan the last task."""
+        return self.tasks[-1]()
+
+
+def test_a_needle_is_kept_in_place_while_its_path_is_planned():
+    planning = Planning()
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, submit=planning.submit), Needle()
+    run.start()
+    needle.pull, at = 4e-4 * needle.heading, needle.tail
+    needle.run(run, 3.0)
+    assert (run.state, run.path, len(planning.tasks)) == (ProcedureState.RUNNING, None, 1)
+    assert math.dist(needle.tail, at) < 1e-4
+    run.pause("by the operator")
+    run.start()  # from where the needle is now
+    planning.is_ready = True
+    needle.run(run, 60.0)
+    assert (run.state, len(planning.tasks)) == (ProcedureState.DONE, 2)
 
 
 def test_a_pause_by_a_person_outlasts_a_thread_that_is_known_again():

@@ -78,12 +78,29 @@ def test_what_is_known_is_not_known_for_long_and_a_time_without_hearing_does_not
 def test_all_has_to_be_known_again_for_a_while():
     state = known()
     state.on_tracker("two needles")
-    assert "two needles" in state.condition(0.1).problem
+    assert not state.condition(0.5).problem  # one frame or two without a needle are none
+    lost = state.condition(0.51)
+    assert "two needles" in lost.problem
+    assert not lost.may_hold
     state.on_tracker("")
-    state.on_pose(0.4, 0.006, 0.0175)
-    state.on_margins(0.4, "", 0, 1.0, "1")
-    assert "two needles" in state.condition(0.4).problem
-    assert not state.condition(0.61).problem
+    state.on_pose(0.7, 0.006, 0.0175)
+    state.on_margins(0.7, "", 0, 1.0, "1")
+    settling = state.condition(0.7)
+    assert "two needles" in settling.problem
+    assert settling.may_hold
+    assert not state.condition(1.02).problem
+
+
+def test_the_needle_may_be_held_while_the_thread_alone_is_not_known():
+    state = known(settle=0.0)
+    state.on_margins(0.0, "the residual is too large", 0, 1.0, "1")
+    assert state.condition(0.1).may_hold
+    state.hold_to_run = True
+    assert not state.condition(0.1).may_hold  # whoever lets go of the page wants no more commands
+    state.on_hold(0.1)
+    assert state.condition(0.1).may_hold
+    state.on_graph("2 nodes publish needle/servo_cv")
+    assert not state.condition(0.1).may_hold
 
 
 def test_a_force_that_is_new_is_a_problem_and_one_that_a_person_goes_on_with_is_none():
@@ -145,12 +162,12 @@ def test_who_paused_decides_whether_it_goes_on_by_itself():
     run.plan(far(), 0.0)
     run.resume()
     run.known.on_tracker("lost")
-    run.check(0.1)
+    run.check(0.6)
     assert (run.status.state, run.status.resumes) == (ProcedureState.PAUSED, True)
     assert run.pause("an operator commands the needle")
     run.known.on_tracker("")
     for k in range(20):
-        now = 0.1 + 0.1 * k
+        now = 0.6 + 0.1 * k
         run.known.on_margins(now, "", 0, 1.0, SCENE.version)
         assert run.on_pose(now, TAIL, EAST, now) is None
     assert (run.status.state, run.status.resumes) == (ProcedureState.PAUSED, False)
