@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc
+from magnetosuture_thread.rig.mechanics.contact_grid import Bins, bin_boxes, cells_around
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
@@ -36,6 +37,10 @@ class Shapes(NamedTuple):
         grid: least x and y of the cells of `clearances`, and their side, shape (3,) [m].
         clearances: at the least, of all points of a cell, rows along y, shape (h, w) [m].
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
+        free: distance of each corner from the edges of its polygon that do not end there, shape (c,) [m].
+        owners: polygon of each corner, and of the edge that ends there, shape (c,).
+        edges: of each cell the edges that may pass through it, cells by row.
+        sharp: of each cell the corners in it that stick out of the solid.
         wall: radius of the dish's wall around the origin, infinite if there is none [m].
         stiffness: k of every contact [N/m].
         friction: mu, of the thread on everything; the needle has none.
@@ -51,6 +56,10 @@ class Shapes(NamedTuple):
     grid: NDArray[np.float64]
     clearances: NDArray[np.float64]
     convex: NDArray[np.float64]
+    free: NDArray[np.float64]
+    owners: NDArray[np.int64]
+    edges: Bins
+    sharp: Bins
     wall: float
     stiffness: float
     friction: float
@@ -114,10 +123,13 @@ class Surface:
             low, high = np.min(reached, axis=0)[:2], np.max(reached, axis=0)[2:]
             grid = np.array([*low, float(max(high - low)) / GRID])
             cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
+        befores = np.concatenate([np.zeros((0, 2)), *(np.roll(ring, 1, axis=0) for ring in rings)])
+        owners = np.repeat(np.arange(len(rings)), np.diff(starts))
+        edge_bins = bin_boxes(np.minimum(corners, befores), np.maximum(corners, befores), grid, cells.shape)
+        sharp_bins = bin_boxes(*(np.where(convex[:, None] > 0.0, corners, np.nan),) * 2, grid, cells.shape)
+        polygons = corners, starts, boxes, edges, first_runs, grid, cells, convex, _free(rings), owners
         numbers = float(wall), float(self.stiffness), float(self.friction)
-        shapes = Shapes(
-            discs, corners, starts, boxes, edges, first_runs, grid, cells, convex, *numbers, bool(self.self_contact)
-        )
+        shapes = Shapes(discs, *polygons, edge_bins, sharp_bins, *numbers, bool(self.self_contact))
         _find_clearances(shapes)
         return shapes
 
@@ -144,7 +156,22 @@ def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
 
 
-@compiled
+def _free(rings: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return how far each corner is from the edges that do not end there [m]."""
+    found = [np.zeros(0)]
+    for ring in rings:
+        count = len(ring)
+        begin, along = np.roll(ring, 1, axis=0), ring - np.roll(ring, 1, axis=0)
+        off = ring[:, None, :] - begin
+        part = np.clip(np.sum(off * along, axis=2) / np.sum(along * along, axis=1), 0.0, 1.0)
+        distance = np.linalg.norm(off - part[..., None] * along, axis=2)
+        corner = np.arange(count)
+        distance[corner, corner] = distance[corner, (corner + 1) % count] = np.inf
+        found.append(distance.min(axis=1))
+    return np.concatenate(found)
+
+
+@compiled_inline
 def inside(x: float, y: float, shapes: Shapes, p: int) -> bool:
     """Return whether a point is in polygon p: a ray from it crosses the outline an odd number of times."""
     corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
@@ -163,42 +190,55 @@ def inside(x: float, y: float, shapes: Shapes, p: int) -> bool:
     return within
 
 
-@compiled
+@compiled_inline
 def polygon_gap(x: float, y: float, shapes: Shapes, p: int, reach: float) -> tuple[float, float, float, float]:
     """Return signed distance from polygon p, its gradient (n_x, n_y), and its curvature [m, 1, 1, 1/m].
 
     The distance of a point that is farther outside than `reach` is infinite.
     """
     corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
-    within = inside(x, y, shapes, p)
-    least, px, py, corner = np.inf if within else reach * reach, np.inf, np.inf, False
-    nx, ny = 1.0, 0.0
-    for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
-        first = start + RUN * (run - shapes.first_runs[p])
-        ox = max(shapes.runs[run, 0] - x, x - shapes.runs[run, 2], 0.0)
-        oy = max(shapes.runs[run, 1] - y, y - shapes.runs[run, 3], 0.0)
-        if ox * ox + oy * oy >= least:
-            continue
-        j = first - 1 if first > start else end - 1
-        for i in range(first, min(first + RUN, end)):
-            ex, ey = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1]
-            dx, dy = x - corners[j, 0], y - corners[j, 1]
-            s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
-            t = min(max(s, 0.0), 1.0)
-            ox, oy = dx - t * ex, dy - t * ey
-            distance = ox * ox + oy * oy
+    starts, content, owners, shape = shapes.edges.starts, shapes.edges.content, shapes.owners, shapes.clearances.shape
+    least, nearest = reach * reach, -1
+    first_row, last_row, first, last = cells_around(x - reach, y - reach, x + reach, y + reach, shapes.grid, shape)
+    columns = shape[1]
+    for row in range(first_row, last_row + 1):
+        for column in range(first, last + 1):
+            cell = row * columns + column
+            for k in range(starts[cell], starts[cell + 1]):
+                i = content[k]
+                if owners[i] != p:
+                    continue
+                distance = _edge_distance(x, y, corners, i, i - 1 if i > start else end - 1)
+                if distance < least:
+                    least, nearest = distance, i
+    if nearest < 0:
+        if not inside(x, y, shapes, p):
+            return np.inf, 1.0, 0.0, 0.0
+        least = np.inf
+        for i in range(start, end):
+            distance = _edge_distance(x, y, corners, i, i - 1 if i > start else end - 1)
             if distance < least:
-                least, px, py, corner = distance, ox, oy, t != s
-                size = math.sqrt(ex * ex + ey * ey)
-                nx, ny = ey / size, -ex / size
-            j = i
-    if px == np.inf:
-        return np.inf, nx, ny, 0.0
+                least, nearest = distance, i
+    i, j = nearest, nearest - 1 if nearest > start else end - 1
+    ex, ey, dx, dy = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1], x - corners[j, 0], y - corners[j, 1]
+    s = (dx * ex + dy * ey) / (ex * ex + ey * ey)
+    t = min(max(s, 0.0), 1.0)
     distance = math.sqrt(least)
     if distance < 1e-12:
-        return 0.0, nx, ny, 0.0
+        size = math.sqrt(ex * ex + ey * ey)
+        return 0.0, ey / size, -ex / size, 0.0
+    # Beside an edge its side tells; off its ends whether the corner sticks out of the solid.
+    within = ex * dy - ey * dx > 0.0 if t == s else shapes.convex[j if t == 0.0 else i] == 0.0
     gap = -distance if within else distance
-    return gap, px / gap, py / gap, 1.0 / gap if corner else 0.0
+    return gap, (dx - t * ex) / gap, (dy - t * ey) / gap, 1.0 / gap if t != s else 0.0
+
+
+@compiled_inline
+def _edge_distance(x: float, y: float, corners: NDArray[np.float64], i: int, j: int) -> float:
+    """Return the squared distance from the edge that begins at corner j and ends at corner i [m^2]."""
+    ex, ey, dx, dy = corners[i, 0] - corners[j, 0], corners[i, 1] - corners[j, 1], x - corners[j, 0], y - corners[j, 1]
+    t = min(max((dx * ex + dy * ey) / (ex * ex + ey * ey), 0.0), 1.0)
+    return float((dx - t * ex) ** 2 + (dy - t * ey) ** 2)
 
 
 @compiled
@@ -215,19 +255,7 @@ def _find_clearances(shapes: Shapes) -> None:
             shapes.clearances[i, j] = gap - 0.75 * side  # half a diagonal and more
 
 
-@compiled
-def clear(x: float, y: float, reach: float, grid: NDArray[np.float64], clearances: NDArray[np.float64]) -> bool:
-    """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
-
-    All but the wall, that is, which is in the cells at the border already.
-    """
-    rows, columns = clearances.shape
-    i = int(min(max((y - grid[1]) / grid[2], 0.0), rows - 1.0))
-    j = int(min(max((x - grid[0]) / grid[2], 0.0), columns - 1.0))
-    return bool(clearances[i, j] > reach)
-
-
-@compiled
+@compiled_inline
 def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDArray[np.float64]) -> int:
     """Write what a round point sinks into; return how many.
 
@@ -266,7 +294,7 @@ def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDAr
     return count
 
 
-@compiled
+@compiled_inline
 def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> tuple[float, float, float, float]:
     """Return distance of a point c from the line through a and b, its normal away from c, and where (0 at a)."""
     ex, ey = bx - ax, by - ay
@@ -279,7 +307,7 @@ def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: floa
     return gap, nx, ny, s
 
 
-@compiled
+@compiled_inline
 def segment_contacts(
     ax: float,
     ay: float,
@@ -320,28 +348,44 @@ def segment_contacts(
             rows[count, 0], rows[count, 1], rows[count, 2] = reach - gap, nx, ny
             rows[count, 3], rows[count, 4] = gap, s
             count += 1
-    near = radius + 0.75 * size  # of the middle: half of the length along, and what is near across
-    for p in range(shapes.boxes.shape[0]):
-        box = shapes.boxes[p]
-        around = radius + 0.5 * size
-        if not (box[0] - around < mx < box[2] + around and box[1] - around < my < box[3] + around):
-            continue
-        first, end = shapes.starts[p], shapes.starts[p + 1]
-        for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
-            box, begin = shapes.runs[run], first + RUN * (run - shapes.first_runs[p])
-            if not (box[0] - near < mx < box[2] + near and box[1] - near < my < box[3] + near):
-                continue
-            for i in range(begin, min(begin + RUN, end)):
-                if shapes.convex[i] == 0.0:
+    # A chord this deep behind a corner passes beside it, not over it.
+    deepest = max(radius, 0.25 * size)
+    first_row, last_row, first, last = cells_around(
+        min(ax, bx) - deepest,
+        min(ay, by) - deepest,
+        max(ax, bx) + deepest,
+        max(ay, by) + deepest,
+        shapes.grid,
+        shapes.clearances.shape,
+    )
+    columns, corners = shapes.clearances.shape[1], shapes.corners
+    starts, content = shapes.sharp.starts, shapes.sharp.content
+    for row in range(first_row, last_row + 1):
+        for column in range(first, last + 1):
+            cell = row * columns + column
+            for k in range(starts[cell], starts[cell + 1]):
+                i = content[k]
+                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
+                if not (0.0 < s < 1.0 and gap < deepest):
                     continue
-                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, shapes.corners[i, 0], shapes.corners[i, 1])
-                # A chord this deep behind a corner passes beside it, not over it.
-                if not (0.0 < s < 1.0 and gap < max(radius, 0.25 * size)):
-                    continue
-                if inside(ax + s * (bx - ax), ay + s * (by - ay), shapes, p):
+                if _is_behind(ax + s * (bx - ax), ay + s * (by - ay), gap, shapes, i):
                     gap, nx, ny = -gap, -nx, -ny
                 if gap < radius and count < rows.shape[0]:
                     rows[count, 0], rows[count, 1], rows[count, 2] = radius - gap, nx, ny
                     rows[count, 3], rows[count, 4] = gap, s
                     count += 1
     return count
+
+
+@compiled_inline
+def _is_behind(x: float, y: float, distance: float, shapes: Shapes, i: int) -> bool:
+    """Return whether a point at a distance from a corner that sticks out is in the corner's polygon."""
+    p, corners = shapes.owners[i], shapes.corners
+    if distance >= shapes.free[i]:
+        return inside(x, y, shapes, p)
+    start, end = shapes.starts[p], shapes.starts[p + 1]
+    j, k = i - 1 if i > start else end - 1, i + 1 if i + 1 < end else start
+    dx, dy = x - corners[i, 0], y - corners[i, 1]
+    before = (corners[i, 0] - corners[j, 0]) * dy - (corners[i, 1] - corners[j, 1]) * dx
+    after = (corners[k, 0] - corners[i, 0]) * dy - (corners[k, 1] - corners[i, 1]) * dx
+    return bool(before > 0.0 and after > 0.0)

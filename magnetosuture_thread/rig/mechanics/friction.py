@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact_grid import clear
 from magnetosuture_thread.rig.mechanics.rod import Rod
 
 SLIP_SPEED = 2e-6  # m/s

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts
+from magnetosuture_thread.rig.mechanics.contact_grid import clear
 
 NODES = 16  # of the integration along the body
 

@@ -36,13 +36,16 @@ FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere els
 
 
 class NewtonBuffers(NamedTuple):
-    """What a step works in, N = 2n + 3 unknowns: trial state, step, right side, bands, drag, contact rows.
+    """What a step works in, N = 2n + 3 unknowns.
+
+    Trial state, that of the least energy so far, step, right side, bands, drag, contact rows.
 
     Of friction: what rubs, the state that slip is measured from, and the slip that smooths it. Of the thread's contact
     with itself: the rows of `find_pairs`, their second derivatives, and how many there are.
     """
 
     trial: NDArray[np.float64]
+    lowest: NDArray[np.float64]
     step: NDArray[np.float64]
     gradient: NDArray[np.float64]
     band: NDArray[np.float64]
@@ -64,6 +67,7 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
     size = 2 * segments + 3
     return NewtonBuffers(
         trial=np.zeros(size),
+        lowest=np.zeros(size),
         step=np.zeros(size),
         gradient=np.zeros(size),
         band=np.zeros((size, WIDTH)),
@@ -146,13 +150,15 @@ def _minimise(
 
     Newton, with the convex part of the second derivatives where they are not positive definite. Without a line
     search a contact is found in one or two steps; with one, steps end short of every new contact. So the first way is
-    given few steps of at most half a segment, and must end below where it started.
+    given few steps of at most half a segment, must not rise twice in a row, and must end below where it started. The
+    other way goes on from where the value was least.
     """
     trial, size = buffers.trial, start.shape[0]
     arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
     current = start.copy()
-    first = energy = assemble_energy(start, field, needle, rod, shapes, buffers, driven, False)
-    move, force = np.inf, _largest(buffers.gradient, arm)
+    buffers.lowest[:] = start
+    first = lowest = energy = assemble_energy(start, field, needle, rod, shapes, buffers, driven, False)
+    move, force, rises = np.inf, _largest(buffers.gradient, arm), 0
     for iteration in range(1, (MAX_ITERATIONS if search else MAX_FULL_STEPS) + 1):
         buffers.chol[:, :] = buffers.band
         if not factor(buffers.chol):
@@ -190,6 +196,11 @@ def _minimise(
                 return -1, move, force
         current[:] = trial
         energy = new
+        rises = rises + 1 if new > lowest else 0
+        if new < lowest:
+            lowest, buffers.lowest[:] = new, trial
+        if rises > 1 and not search:
+            return -1, move, force
     return -1, move, force
 
 
@@ -250,6 +261,7 @@ def advance(
     start = trial.copy()
     done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
     if done < 0:
+        start[:] = buffers.lowest
         done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, True)
     if done > 0 and shapes.self_contact and crosses_anew(q, trial):
         done = -1
