@@ -46,6 +46,7 @@ SCALES = (1, 2)  # how much smaller the image is in which a faint, a pale or a w
 RIM_REACH_PX = 5.0  # by which the rim reaches into a signed ridge, at each scale
 FAINT_HALF = 3  # vertices to both sides, over which a faint walk is centred
 COARSE, COARSE_MEDIAN = 4, 25  # how much smaller an image shows what is wide, and the window of its surroundings [px]
+BESIDE = 2.5  # of its pixels, within which they show what is beside a walk
 COARSE_LEVELS = 90.0  # as which the contrast at the tail is coded there
 WIDE_FAINTEST = 0.3  # of the contrast at the tail, that it shows everywhere
 WIDE_STIFFNESS = 3.0  # of a wide thread, that bends in many of its widths, in the shrunk image
@@ -220,18 +221,23 @@ class ThreadSearch:
         """Return how much of a walk's contrast what it runs along keeps in a shrunk image.
 
         What is wide keeps its contrast in a shrunk image, what is thin loses it: in the one that was walked in, too.
+        Beside a shape of the scene it is the shape's; of a walk that is nowhere else, nothing tells.
         """
-        contrast = None
-        factor = self._picture.factor
+        mask, points = self._picture.mask, walk.points
+        points = points if mask is None else points[mask.depths(points) < -BESIDE * COARSE]
+        if len(points) < MIN_CENTRED:
+            return 0.0
+        contrast, factor = None, self._picture.factor
         box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
         for layer in (self._picture.darkest, self._picture.brightest):
             small = shrunk(layer.small[box], COARSE // factor)
-            floor = cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            differs = cv2.absdiff(small, floor)
+            differs = cv2.absdiff(
+                small, cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            )
             contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
         usual = middle(near[::3, ::3])
-        contrast = self._median_along(walk.points, near, COARSE) - usual
+        contrast = self._median_along(points, near, COARSE) - usual
         return contrast / max(1e-6, walk.strength * math.sqrt(walk.ridge.scale))
 
     def between_edges(self, walk: Walk) -> Walk | None:
