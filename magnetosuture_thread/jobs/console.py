@@ -31,6 +31,7 @@ def console(
     setup_name: str = "",
     *,
     running: bool = False,
+    namespace: str = "",
     bag: Path | None = None,
     recordings: Path,
     address: str | None = None,
@@ -44,6 +45,7 @@ def console(
         setup_name: name or path of a setup; where it is empty, that which the bag names, or the default.
         running: whether the page is served on the graph of the ROS domain that the environment names; else around a
             simulated rig.
+        namespace: of the running graph, where it is in one.
         bag: to play through the nodes in its place.
         recordings: folder that gets a bag for each recording.
         address: that the page is served on; the setup's if None.
@@ -67,7 +69,7 @@ def console(
     with ExitStack() as stack:
         if running:
             setup = read_setup(name)
-            graph = ConsoleGraph(stack.enter_context(joined()), settings(setup))
+            graph = ConsoleGraph(stack.enter_context(joined(namespace=namespace)), settings(setup))
             host = RecordingHost(graph, setup, recordings, log)
         elif bag is not None:
             replayed = stack.enter_context(open_bag(bag, log, setup_name=setup_name))
