@@ -37,6 +37,9 @@ def console(
     address: str | None = None,
     port: int | None = None,
     token: str | None = None,
+    certificate: str | None = None,
+    private_key: str | None = None,
+    origin: str | None = None,
     log: Log = lambda text: None,
 ) -> None:
     """Serve the operator's page until this process gets SIGINT, SIGTERM or SIGHUP.
@@ -51,6 +54,9 @@ def console(
         address: that the page is served on; the setup's if None.
         port: of it; the setup's if None.
         token: that commands need; the setup's if None.
+        certificate: file of the certificate to serve over TLS; the setup's if None.
+        private_key: file of its key; the setup's if None.
+        origin: under which browsers reach the page besides; the setup's if None.
         log: called with a line for a person at each stage.
 
     Raises:
@@ -59,6 +65,7 @@ def console(
         GraphError: a node ended or did not come.
     """
     options = {"address": address, "port": port, "token": token}
+    options |= {"certificate": certificate, "private_key": private_key, "origin": origin}
     given = {name: value for name, value in options.items() if value is not None}
 
     def settings(setup: Setup) -> ConsoleSettings:

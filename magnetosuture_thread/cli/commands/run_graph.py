@@ -75,6 +75,9 @@ def add(subparsers: Subparsers) -> None:
     option("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the running graph")
     option("--address", help="network address to serve on (default: the setup's, 127.0.0.1)")
     option("--port", type=whole_number, help="of it; 0 takes a free one (default: the setup's, 8090)")
+    option("--certificate", metavar="FILE", help="serve over TLS by this certificate, a PEM file")
+    option("--key", metavar="FILE", help="of the certificate, where it is not in the same file")
+    option("--origin", metavar="URL", help="under which browsers reach the page, as https://rig.example")
     option("--token", help=f"that commands need (default: {TOKEN} in the environment, or a new one)")
     recordings = "folder that gets a bag for each recording (default: output/recordings)"
     option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
@@ -231,6 +234,9 @@ def run_console(options: argparse.Namespace) -> int:
         address=options.address,
         port=options.port,
         token=options.token or os.environ.pop(TOKEN, None) or None,  # no node gets it
+        certificate=options.certificate,
+        private_key=options.key,
+        origin=options.origin,
         log=make_log(make_console()),
     )
     return DONE
