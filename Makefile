@@ -31,8 +31,7 @@ demo: $(READY)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
-	$(RUN)/python -m pytest -m whole_graph
+	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal
 
 lint: $(READY)
 	$(RUN)/ruff check .
