@@ -1,5 +1,6 @@
 # make demo   play the example bag through the live graph
 # make test   run all tests
+# make coverage  measure which lines of the core packages their tests run
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
 # make docs  build the documentation into output/docs
@@ -23,7 +24,7 @@ INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip 
 # Every node is a process that imports most of the packages: without their bytecode that takes it thrice as long.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint docs colcon peers clean help
+.PHONY: demo test coverage lint docs colcon peers clean help
 .PHONY: .packages .messages
 
 demo: $(READY)
@@ -31,8 +32,14 @@ demo: $(READY)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
-	$(RUN)/python -m pytest -m whole_graph
+	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not real_time"
+	$(RUN)/python -m pytest -m real_time
+
+# Of the packages' own tests; those of the page in a browser run the server in the same process.
+coverage: $(READY)
+	@mkdir -p output
+	$(RUN)/python -m coverage run -m pytest -q $(addprefix test/,coils console geometry guidance model planning safety scene vision)
+	$(RUN)/python -m coverage report --skip-covered --show-missing
 
 lint: $(READY)
 	$(RUN)/ruff check .

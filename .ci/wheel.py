@@ -15,6 +15,7 @@ import venv
 from pathlib import Path
 
 from installed_nodes import NODES, check_nodes
+from kernels import copy_kernels
 
 ROOT = Path(__file__).resolve().parent.parent
 BACKEND = next(re.finditer(r"scikit-build-core==[\d.]+", (ROOT / "pyproject.toml").read_text()))[0]
@@ -79,11 +80,13 @@ def main() -> int:
         programs = folder / "clean" / "bin"
         venv.create(folder / "clean", with_pip=True)
         run(programs / "python", "-m", "pip", "install", "-q", wheel)
+        (package,) = (folder / "clean").glob("lib/python*/site-packages/magnetosuture_thread")
+        copy_kernels(package)
         check_without_ros(programs)
         run(programs / "python", "-m", "pip", "install", "-q", f"{wheel}[ros]")
-        # Three of them, as each environment compiles its kernels anew: CI starts all after the build by colcon.
+        # Three of them: CI starts all after the build by colcon.
         started = {name: f'exec "{programs / name}"' for name in ("scene_server", "thread_model", "coil_bridge")}
-        return check_nodes(started, programs / "python", folder)
+        return check_nodes(started, programs / "python", folder, 100)
 
 
 if __name__ == "__main__":

@@ -83,6 +83,7 @@ def test_help_waits_for_no_package_of_a_command():
         ("calibrate-camera", "--markers"),
         ("calibrate-coils", "--model"),
         ("coils", "ACTION"),
+        ("console", "--namespace"),
         ("console", "--replay"),
         ("evaluate", "--rig"),
     ],

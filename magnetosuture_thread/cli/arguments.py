@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -77,6 +78,13 @@ def whole_number(text: str) -> int:
     if not (text.isascii() and text.isdigit()):
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 0")
     return int(text)
+
+
+def namespace_argument(text: str) -> str:
+    """Return a ROS namespace, as `lab1` or `/lab1/left`, or none: an argument type."""
+    if text and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"{text!r} is no ROS namespace, as lab1 or /lab1/left")
+    return text
 
 
 def output_file(text: str) -> Path:

@@ -13,6 +13,7 @@ from collections import Counter
 from urllib.parse import quote, urlsplit
 
 TOKEN_BYTES = 18
+DEFAULT_PORTS = {"http": 80, "https": 443}  # by scheme
 
 
 class RateCounter:
@@ -61,24 +62,39 @@ def same_token(given: object, token: str) -> bool:
     )
 
 
-def page_url(address: str, port: int, token: str) -> str:
-    """Return the URL of the page; the token is in the fragment, which browsers do not send."""
+def server_origin(address: str, port: int, scheme: str = "http") -> str:
+    """Return the origin of a server's pages, as `http://127.0.0.1:8090`."""
     host = f"[{address}]" if ":" in address else address
-    return f"http://{host}:{port}/#token={quote(token, safe='')}"
+    return f"{scheme}://{host}:{port}"
 
 
-def host_refusal(host: str, address: str, port: int) -> str:
+def page_url(origin: str, token: str) -> str:
+    """Return the URL of the page; the token is in the fragment, which browsers do not send."""
+    return f"{origin}/#token={quote(token, safe='')}"
+
+
+def is_origin(text: str) -> bool:
+    """Return whether a text is the origin of a website: scheme, name, and a port if it is not the scheme's own."""
+    parts = urlsplit(text)
+    return parts.scheme in DEFAULT_PORTS and text == f"{parts.scheme}://{parts.netloc}" and bool(_split(parts.netloc))
+
+
+def host_refusal(host: str, address: str, port: int, *, scheme: str = "http", origin: str = "") -> str:
     """Return why a request for this host is rejected; empty if it is accepted.
 
     Names that others can point to this machine are rejected: a loopback server accepts only loopback names, others
-    only the bound address, or any numeric address if all are bound.
+    only the bound address, or any numeric address if all are bound; and each the host of the configured origin.
 
     Args:
         host: the request's Host header.
         address: that the server is bound to.
         port: that the server is bound to.
+        scheme: of the server.
+        origin: under which the page is reached besides; empty if there is no other.
     """
-    parts = _host_and_port(host)
+    if origin and host.lower() == urlsplit(origin).netloc.lower():
+        return ""
+    parts = _split(host, DEFAULT_PORTS[scheme])
     if parts is None:
         return f"Host: got {host[:80]!r}, expected a host and a port"
     name, given = parts
@@ -88,19 +104,25 @@ def host_refusal(host: str, address: str, port: int) -> str:
     return "" if name == address.lower() or local or numeric else f"Host: got {name[:80]!r}, expected {address}"
 
 
-def origin_refusal(origin: str, host: str) -> str:
+def origin_refusal(origin: str, host: str, *, scheme: str = "http", allowed: str = "") -> str:
     """Return why a WebSocket of this origin is rejected; empty if it is accepted.
 
     Args:
         origin: the request's Origin header; empty for programs other than browsers.
         host: the request's Host header, already accepted.
+        scheme: of the server.
+        allowed: origin under which the page is reached besides; empty if there is no other.
     """
-    if not origin or origin.lower() == f"http://{host.lower()}":
+    by_address = f"{scheme}://{host}"
+    # By the other name's host a page comes from its origin alone: a plain one could be another's on the way.
+    by_name = bool(allowed) and host.lower() == urlsplit(allowed).netloc.lower()
+    expected = [allowed] if by_name else [by_address, *([allowed] if allowed else [])]
+    if not origin or origin.lower() in (each.lower() for each in expected):
         return ""
-    return f"Origin: got {origin[:80]!r}, expected http://{host}"
+    return f"Origin: got {origin[:80]!r}, expected {' or '.join(expected)}"
 
 
-def _host_and_port(host: str) -> tuple[str, int] | None:
+def _split(host: str, default_port: int = 0) -> tuple[str, int] | None:
     try:
         parts = urlsplit(f"//{host}")
         name, port = parts.hostname, parts.port
@@ -108,4 +130,4 @@ def _host_and_port(host: str) -> tuple[str, int] | None:
         return None
     if not name or parts.path or parts.query or parts.fragment or parts.username is not None:
         return None
-    return name, 80 if port is None else port
+    return name, default_port if port is None else port

@@ -16,12 +16,14 @@ from magnetosuture_thread.console.access import (
     origin_refusal,
     page_url,
     same_token,
+    server_origin,
 )
 from magnetosuture_thread.console.client import Client, RequestHandler
 from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.outbox import encode_frame, encode_state
 from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.console.tls import server_context
 from magnetosuture_thread.errors import ConfigurationError
 
 MAX_CLIENTS = 16  # with the token
@@ -66,6 +68,7 @@ class ConsoleServer:
         self._new_watchers, self._request_rate = RateCounter(), RateCounter()
         self._count = 0
         self._port = 0
+        self._scheme = "https" if settings.certificate else "http"
         self._frame_number, self._frame = -1, b""
         self._runner: web.ServerRunner | None = None
         self._broadcast_task: asyncio.Task[None] | None = None
@@ -74,13 +77,16 @@ class ConsoleServer:
         """Start the server; return the URL of the page, with the token in its fragment.
 
         Raises:
-            ConfigurationError: the address cannot be bound.
+            ConfigurationError: the address cannot be bound, or the certificate not be used.
         """
+        context = server_context(self._settings)
         runner = web.ServerRunner(_Server(self._respond), shutdown_timeout=1.0)
         await runner.setup()
         address = self._settings.address
         try:
-            site = web.TCPSite(runner, "127.0.0.1" if address == "localhost" else address, self._settings.port)
+            site = web.TCPSite(
+                runner, "127.0.0.1" if address == "localhost" else address, self._settings.port, ssl_context=context
+            )
             await site.start()
         except OSError as error:
             await runner.cleanup()
@@ -93,7 +99,8 @@ class ConsoleServer:
         # Excludes loaded objects from garbage collection, which would take tens of milliseconds each time.
         gc.collect()
         gc.freeze()
-        return page_url("127.0.0.1" if is_any(address) else address, self._port, self._token)
+        bound = server_origin("127.0.0.1" if is_any(address) else address, self._port, self._scheme)
+        return page_url(self._settings.origin or bound, self._token)
 
     async def stop(self) -> None:
         """Stop the needle, then close all connections; raise the error that ended the broadcast, if any."""
@@ -105,7 +112,14 @@ class ConsoleServer:
         await asyncio.gather(*(client.close() for client in list(self._clients.values())), return_exceptions=True)
         await self._requests.close()
         if self._runner is not None:
+            server = self._runner.server
+            connections = [] if server is None else server.connections
+            transports = [connection.transport for connection in connections if connection.transport is not None]
             await self._runner.cleanup()
+            # Over TLS each would wait up to 30 s for its browser to close it too.
+            for transport in transports:
+                transport.abort()
+            await asyncio.sleep(0)
         self._runner = None
         if task is not None and not task.cancelled():
             task.result()
@@ -115,7 +129,8 @@ class ConsoleServer:
             now = asyncio.get_running_loop().time()
             if self._request_rate.count(request.remote or "", now) > MAX_REQUESTS:
                 await asyncio.sleep(1.0 - now % 1.0)
-        refusal = host_refusal(request.headers.get("Host", ""), self._settings.address, self._port)
+        settings, host = self._settings, request.headers.get("Host", "")
+        refusal = host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
         if refusal:
             return _answer(403, refusal)
         if request.method not in ("GET", "HEAD"):
@@ -132,7 +147,8 @@ class ConsoleServer:
         return web.Response(body=body, content_type=content_type, charset="utf-8", headers=HEADERS)
 
     async def _connect(self, request: web.BaseRequest) -> web.StreamResponse:
-        refusal = origin_refusal(request.headers.get("Origin", ""), request.headers.get("Host", ""))
+        origin, host = (request.headers.get(name, "") for name in ("Origin", "Host"))
+        refusal = origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin)
         if refusal:
             return _answer(403, refusal)
         # Only for a place: commands need the token of the greeting.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, quantity
-from magnetosuture_thread.console.access import is_loopback
+from magnetosuture_thread.console.access import is_loopback, is_origin
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.shared_parameters import shared_parameter
@@ -24,6 +24,13 @@ class ConsoleSettings(Configuration):
     address: str = quantity("127.0.0.1", "network address of the server; any but loopback requires a token")
     port: int = quantity(8090, "of that address; 0 selects a free one", minimum=0, maximum=65535)
     token: str = quantity("", "permits commands; empty generates a random one at every start")
+    certificate: str = quantity(
+        "", "PEM file of the certificate chain by which the page is served over TLS; none if empty"
+    )
+    private_key: str = quantity("", "PEM file of the certificate's key; empty if the key is in the certificate's file")
+    origin: str = quantity(
+        "", "under which browsers reach the page besides its address: a name, or a TLS proxy, as https://rig.example"
+    )
     image_transport: str = quantity("compressed", "camera topic to show", choices=("compressed", "raw"))
     scene: str = shared_parameter("scene")
     needle_length: float = shared_parameter("needle_length")
@@ -37,7 +44,11 @@ class ConsoleSettings(Configuration):
     )
 
     def check(self) -> None:
-        """Reject a public page without a token, a speed above the maximum, a short timeout, and a coiled needle."""
+        """Reject what does not fit.
+
+        A public page without a token, a key without a certificate, an origin that is none, a speed above the maximum,
+        a short timeout, and a coiled needle.
+        """
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if not self.address:
             raise ConfigurationError(
@@ -54,6 +65,11 @@ class ConsoleSettings(Configuration):
                 "…",
                 f"at least {MIN_TOKEN_LENGTH} printable ASCII characters without a space, or none",
             )
+        if self.private_key and not self.certificate:
+            raise ConfigurationError(f"{self.GROUP}.private_key", self.private_key, "none without a certificate")
+        if self.origin and not is_origin(self.origin):
+            expectation = "scheme and name, and a port if it is another than the scheme's, as https://rig.example"
+            raise ConfigurationError(f"{self.GROUP}.origin", self.origin, expectation)
         if self.speed > self.max_speed:
             raise ConfigurationError(f"{self.GROUP}.speed", self.speed, f"at most max_speed, {self.max_speed:g} m/s")
         if self.rate * self.hold_timeout < MIN_COMMANDS_PER_TIMEOUT:

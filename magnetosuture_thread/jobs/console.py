@@ -31,11 +31,15 @@ def console(
     setup_name: str = "",
     *,
     running: bool = False,
+    namespace: str = "",
     bag: Path | None = None,
     recordings: Path,
     address: str | None = None,
     port: int | None = None,
     token: str | None = None,
+    certificate: str | None = None,
+    private_key: str | None = None,
+    origin: str | None = None,
     log: Log = lambda text: None,
 ) -> None:
     """Serve the operator's page until this process gets SIGINT, SIGTERM or SIGHUP.
@@ -44,11 +48,15 @@ def console(
         setup_name: name or path of a setup; where it is empty, that which the bag names, or the default.
         running: whether the page is served on the graph of the ROS domain that the environment names; else around a
             simulated rig.
+        namespace: of the running graph, where it is in one.
         bag: to play through the nodes in its place.
         recordings: folder that gets a bag for each recording.
         address: that the page is served on; the setup's if None.
         port: of it; the setup's if None.
         token: that commands need; the setup's if None.
+        certificate: file of the certificate to serve over TLS; the setup's if None.
+        private_key: file of its key; the setup's if None.
+        origin: under which browsers reach the page besides; the setup's if None.
         log: called with a line for a person at each stage.
 
     Raises:
@@ -57,6 +65,7 @@ def console(
         GraphError: a node ended or did not come.
     """
     options = {"address": address, "port": port, "token": token}
+    options |= {"certificate": certificate, "private_key": private_key, "origin": origin}
     given = {name: value for name, value in options.items() if value is not None}
 
     def settings(setup: Setup) -> ConsoleSettings:
@@ -67,7 +76,7 @@ def console(
     with ExitStack() as stack:
         if running:
             setup = read_setup(name)
-            graph = ConsoleGraph(stack.enter_context(joined()), settings(setup))
+            graph = ConsoleGraph(stack.enter_context(joined(namespace=namespace)), settings(setup))
             host = RecordingHost(graph, setup, recordings, log)
         elif bag is not None:
             replayed = stack.enter_context(open_bag(bag, log, setup_name=setup_name))

@@ -339,5 +339,6 @@ class SimulatedHost(RecordingHost):
 
 
 def served_as(settings: ConsoleSettings, other: ConsoleSettings) -> ConsoleSettings:
-    """Return a setup's settings with address, port and token as they are served."""
-    return replace(settings, address=other.address, port=other.port, token=other.token)
+    """Return a setup's settings with address, port, token, certificate and origin as they are served."""
+    served = ("address", "port", "token", "certificate", "private_key", "origin")
+    return replace(settings, **{name: getattr(other, name) for name in served})

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
@@ -84,14 +85,24 @@ def many_definitions(path: Path, count: int, text: Callable[[int], str]) -> Path
 
 def chunks_of_definitions(path: Path, chunks: int, each: int, size: int) -> Path:
     """Write an mcap file of chunks full of definitions of types, all of them different."""
+    text_size = 8 + size
+    head = struct.pack("<I9sI7s", 9, b"pkg/msg/T", 7, b"ros2msg")
+    layout = [("code", "u1"), ("size", "<u8"), ("id", "<u2"), ("head", f"V{len(head)}"), ("text_size", "<u4")]
+    schemas = np.zeros(each, [*layout, ("text", "u1", text_size)])
+    schemas["code"], schemas["size"], schemas["head"], schemas["text_size"] = (
+        3,
+        6 + len(head) + text_size,
+        head,
+        text_size,
+    )
+    schemas["id"] = 1 + np.arange(each)
+    schemas["text"][:, 2] = ord(" ")
+    schemas["text"][:, 3:8] = ord("0") + np.arange(each)[:, None] // 10 ** np.arange(5) % 10
     builder = RecordBuilder()
     mcap_records.Header("ros2", "bomb").write(builder)
     for number in range(chunks):
-        inner = RecordBuilder()
-        for index in range(each):
-            own = f"{number} {index}".encode() + bytes(size)
-            mcap_records.Schema(1 + index, own, "ros2msg", "pkg/msg/T").write(inner)
-        data = inner.end()
+        schemas["text"][:, :2] = np.frombuffer(f"{number:02}".encode(), np.uint8)
+        data = schemas.tobytes()
         compressed = zstandard.ZstdCompressor().compress(data)
         mcap_records.Chunk("zstd", compressed, 1, 1, zlib.crc32(data), len(data)).write(builder)
     mcap_records.DataEnd(0).write(builder)
@@ -117,17 +128,39 @@ def encoded(*records: mcap_records.McapRecord) -> bytes:
     return builder.end()
 
 
-def chunk(*records: mcap_records.McapRecord) -> bytes:
-    """Return a chunk with its checksum."""
-    data = encoded(*records)
+def chunk(data: bytes) -> bytes:
+    """Return a chunk of records with its checksum."""
     return encoded(
         mcap_records.Chunk("zstd", zstandard.ZstdCompressor().compress(data), 1, 1, zlib.crc32(data), len(data))
     )
 
 
-def many_entries(count: int) -> dict[str, str]:
-    """Return entries of metadata, ten times as large in memory as in a file."""
-    return {f"{index:x}": "" for index in range(count)}
+def with_many_entries(record: mcap_records.McapRecord, count: int) -> bytes:
+    """Return a record, whose last field is a map without entries, with many: ten times as large in memory as here."""
+    digits = np.frombuffer(b"0123456789abcdef", np.uint8)
+    entries = np.zeros(count, [("key_size", "<u4"), ("key", "u1", 6), ("value_size", "<u4")])
+    entries["key_size"] = 6
+    for place in range(6):
+        entries["key"][:, place] = digits[np.arange(count) >> 4 * place & 15]
+    whole, data = encoded(record), entries.tobytes()
+    content = whole[9:-4] + struct.pack("<I", len(data)) + data
+    return whole[:1] + struct.pack("<Q", len(content)) + content
+
+
+def wide_messages(number: int) -> bytes:
+    """Return an empty message on each of 60000 channels, and on one of its own."""
+    layout = [
+        ("code", "u1"),
+        ("size", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log", "<u8"),
+        ("publish", "<u8"),
+    ]
+    messages = np.zeros(60_001, layout)
+    messages["code"], messages["size"], messages["log"], messages["publish"] = 5, 22, 1, 1
+    messages["channel"] = [*range(60_000), 61_000 + number]
+    return messages.tobytes()
 
 
 def long_definition(number: int) -> str:
@@ -235,13 +268,13 @@ BOMBS: dict[str, Callable[[Path], Path]] = {
     "many_definitions": lambda p: many_definitions(p / "a.mcap", 40, long_definition),
     "entries_of_channels": lambda p: lone_records(
         p / "a.mcap",
-        *(chunk(mcap_records.Channel(2 + n, f"/t{n}", "cdr", many_entries(180_000), 0)) for n in range(16)),
+        *(chunk(with_many_entries(mcap_records.Channel(2 + n, f"/t{n}", "cdr", {}, 0), 180_000)) for n in range(16)),
     ),
     "entries_of_metadata": lambda p: lone_records(
-        p / "a.mcap", *(encoded(mcap_records.Metadata(f"m{n}", many_entries(180_000))) for n in range(10))
+        p / "a.mcap", *(with_many_entries(mcap_records.Metadata(f"m{n}", {}), 180_000) for n in range(10))
     ),
     "one_large_definition": lambda p: lone_records(
-        p / "a.mcap", chunk(mcap_records.Channel(2, "/t", "cdr", many_entries(4_000_000), 0))
+        p / "a.mcap", chunk(with_many_entries(mcap_records.Channel(2, "/t", "cdr", {}, 0), 4_000_000))
     ),
     "lone_records": lambda p: lone_records(p / "a.mcap", struct.pack("<BQ", 0x80, 0) * 1_000_000),
     "footers": lambda p: lone_records(
@@ -249,7 +282,7 @@ BOMBS: dict[str, Callable[[Path], Path]] = {
     ),
     "wide_chunks": lambda p: lone_records(
         p / "a.mcap",
-        *(chunk(*(mcap_records.Message(c, 1, b"", 1, 0) for c in (*range(60_000), 61_000 + n))) for n in range(20)),
+        *(chunk(wide_messages(n)) for n in range(20)),
     ),
     "split": lambda p: split_bomb(p / "bag", 40),
     "all_at_once": lambda p: all_at_once(p / "a.mcap"),

@@ -11,6 +11,7 @@ from magnetosuture_thread.console.access import (
     origin_refusal,
     page_url,
     same_token,
+    server_origin,
 )
 from magnetosuture_thread.console.outbox import MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
@@ -42,6 +43,17 @@ def test_an_address_that_others_reach_needs_a_token(address: str):
         ({"rate": 10.0, "hold_timeout": 0.1}, "console.rate"),
         ({"needle_curvature": 900.0}, "console.needle_curvature"),
         ({"port": 70000}, "console.port"),
+        ({"private_key": "key.pem"}, "console.private_key"),
+        *(
+            ({"origin": origin}, "console.origin")
+            for origin in (
+                "rig.example",
+                "https://rig.example/page",
+                "ftp://rig.example",
+                "https://",
+                "https://u@rig.example",
+            )
+        ),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(values: dict, named: str):
@@ -59,8 +71,8 @@ def test_tokens_are_compared_whole():
 
 def test_every_start_has_a_token_of_its_own_and_it_is_in_the_fragment_alone():
     assert new_token() != new_token()
-    assert page_url("127.0.0.1", 8090, "a%b#c") == "http://127.0.0.1:8090/#token=a%25b%23c"
-    assert page_url("::1", 80, "t").startswith("http://[::1]:80/#")
+    assert page_url(server_origin("127.0.0.1", 8090), "a%b#c") == "http://127.0.0.1:8090/#token=a%25b%23c"
+    assert page_url(server_origin("::1", 80, "https"), "t").startswith("https://[::1]:80/#")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8090", "localhost:8090", "LOCALHOST:8090", "[::1]:8090"])
@@ -82,6 +94,24 @@ def test_where_every_address_is_bound_only_figures_are_good():
     assert host_refusal("192.168.1.5:8090", "0.0.0.0", 8090) == ""
     assert host_refusal("evil.example:8090", "0.0.0.0", 8090) != ""
     assert host_refusal("Rig.example:8090", "rig.example", 8090) == ""
+
+
+def test_the_name_of_a_certificate_or_a_proxy_is_good_besides():
+    origin = "https://rig.example"
+    for host in ("rig.example", "RIG.example", "127.0.0.1:8090"):
+        assert host_refusal(host, "127.0.0.1", 8090, origin=origin) == ""
+        assert origin_refusal("https://rig.example", host, allowed=origin) == ""
+    for host in ("rig.example:8090", "evil.example", "rig.example.evil.example"):
+        assert host_refusal(host, "127.0.0.1", 8090, origin=origin) != ""
+    for other in ("http://rig.example", "https://rig.example:8090", "https://evil.example"):
+        assert "expected https://rig.example" in origin_refusal(other, "rig.example", allowed=origin)
+
+
+def test_over_tls_only_pages_that_came_over_tls_open_the_socket():
+    assert host_refusal("rig.example", "rig.example", 443, scheme="https") == ""
+    assert host_refusal("rig.example", "rig.example", 443) != ""
+    assert origin_refusal("https://127.0.0.1:8090", "127.0.0.1:8090", scheme="https") == ""
+    assert origin_refusal("http://127.0.0.1:8090", "127.0.0.1:8090", scheme="https") != ""
 
 
 def test_only_our_own_page_opens_the_socket_in_a_browser():

@@ -59,7 +59,7 @@ def cluster_of_two(folder: Path) -> Iterator[str]:
     with mock.patch.dict(os.environ), pytest.MonkeyPatch.context() as patch, once:
         patch.syspath_prepend(str(folder))
         patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        with LocalCluster(n_workers=2, threads_per_worker=2, processes=True, dashboard_address=None) as local:
+        with LocalCluster(n_workers=2, threads_per_worker=2, processes=True, dashboard_address="127.0.0.1:0") as local:
             yield local.scheduler_address
 
 

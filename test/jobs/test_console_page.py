@@ -19,6 +19,8 @@ from test.jobs.test_console import running, wire
 
 __all__ = ["browser"]
 
+pytestmark = [pytest.mark.whole_graph, pytest.mark.real_time]
+
 DRIFT = 1.8e-4  # m/s; at rest the needle may still be pulled by its thread: 0.1 mm in eleven frames at 20 Hz
 
 
@@ -125,7 +127,6 @@ def light_and_dark(page: Page, folder: Path, name: str) -> None:
     page.emulate_media(color_scheme="light")
 
 
-@pytest.mark.whole_graph
 def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path):
     pilot, page = bench.pilot, bench.page
     pilot.begin()
@@ -172,7 +173,6 @@ def test_a_person_steers_around_the_hernia_by_keys(bench: Bench, tmp_path: Path)
     assert bench.complaints == []
 
 
-@pytest.mark.whole_graph
 def test_a_dropped_connection_stops_the_needle(bench: Bench):
     pilot, page = bench.pilot, bench.page
     pilot.press("ArrowUp")

@@ -39,10 +39,10 @@ class Graph:
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
-    def add(self, make: Callable[..., Any], **parameters: Any) -> Any:
+    def add(self, make: Callable[..., Any], *, namespace: str = "", **parameters: Any) -> Any:
         """Make a node of the package with parameters and add it to the graph."""
         overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        node = make(context=self.context, parameter_overrides=overrides)
+        node = make(context=self.context, namespace=namespace, parameter_overrides=overrides)
         self.nodes.append(node)
         self.executor.add_node(node)
         return node

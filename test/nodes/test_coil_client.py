@@ -10,9 +10,9 @@ from magnetosuture_thread.nodes.coil_bridge import client
 from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 
 
-def press(capsys, action: str) -> tuple[int, str]:
+def press(capsys, action: str, *options: str) -> tuple[int, str]:
     """Run the command and return its exit code and what it printed."""
-    code = main(["coils", action])
+    code = main(["coils", action, *options])
     printed = capsys.readouterr()
     return code, printed.out + printed.err
 
@@ -44,6 +44,24 @@ def test_every_switch_works_and_shows_the_state(
     assert code == 1
     assert "rejected deactivate" in said
     assert node.stage == "unconfigured"
+
+
+def test_a_bridge_in_a_namespace_is_reached_by_it_alone(
+    graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    monkeypatch.setattr(client, "TIMEOUT", 5.0)
+    node = graph.add(CoilBridgeNode, namespace="lab1", autostart="active", scene="dish_35mm")
+    code, printed = press(capsys, "arm", "--namespace", "lab1")
+    assert (code, node.stage) == (0, "active"), printed
+    assert printed.splitlines()[0].split(maxsplit=1) == ["state", "active, armed"]
+    monkeypatch.setattr(client, "TIMEOUT", 0.5)
+    code, printed = press(capsys, "stop", "--namespace", "/lab2")
+    assert code == 1
+    assert "no coil_bridge" in printed
+    with pytest.raises(SystemExit):
+        press(capsys, "stop", "--namespace", "2 labs")
+    assert "is no ROS namespace" in capsys.readouterr().err
 
 
 def test_without_a_bridge_it_fails_and_says_so(

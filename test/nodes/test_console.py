@@ -253,6 +253,16 @@ def test_the_age_of_the_camera_image_is_sent(graph, console):
     assert 0.0 <= console.state()["camera"]["age"] < 60.0
 
 
+def test_in_a_namespace_nodes_of_other_rigs_are_not_shown(graph):
+    names = ("left/coil_bridge", "left/rig_simulator", "right/thread_model", "right/console", "scene_server", "usb_cam")
+    with joined(domain=graph.domain, namespace="left") as node:
+        console = ConsoleGraph(node, ConsoleSettings())
+        report = DiagnosticArray(status=[DiagnosticStatus(name=f"{name}: state", message="x") for name in names])
+        tell(graph, topics.DIAGNOSTICS, report, lambda: "usb_cam" in console.nodes(), "the report")
+        assert set(console.nodes()) == {"coil_bridge", "rig_simulator", "usb_cam"}
+        assert GraphHost(console).state()["simulated"]
+
+
 def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
     node = graph.add(CoilBridgeNode)
     graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")

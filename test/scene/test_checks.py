@@ -85,6 +85,16 @@ def test_check_reports_a_hole_too_narrow_for_the_needle():
     assert warning.value == pytest.approx(0.00038, rel=0.02)
 
 
+def test_the_width_of_a_hole_with_a_corner_is_that_of_its_largest_circle():
+    """Two channels of 0.3 mm meet at a corner, where a circle touches both outer sides and the inner corner."""
+    corner = ((0.0, 0.0), (4.0, 0.0), (4.0, 0.3), (0.3, 0.3), (0.3, 4.0), (0.0, 4.0))
+    hole = tuple((1e-3 * x, 1e-3 * y) for x, y in corner)
+    around = ((-0.001, -0.001), (0.005, -0.001), (0.005, 0.005), (-0.001, 0.005))
+    (warning,) = scene_warnings(scene(Polygon(around, (hole,))), WIDTH)
+    assert warning.what == "hole"
+    assert warning.value == pytest.approx(0.0006 / (1.0 + 0.5**0.5), abs=0.02 * WIDTH)
+
+
 def test_the_farthest_point_of_a_disc_in_the_middle_is_on_its_rim():
     assert farthest_point(SceneShape("a", "wall", Disc((0.0, 0.0), 0.002))) == (0.002, 0.0)
 
@@ -104,6 +114,14 @@ def test_names_stand_clear_of_other_shapes_and_of_each_other():
         assert shapely.Point(0.0, 0.0).buffer(0.025).contains(box)
         assert not any(box.intersects(shape.solid) for shape in known.shapes)
         assert not any(box.intersects(other) for other in boxes[:index])
+
+
+def test_a_name_beside_a_flat_shape_keeps_its_own_height_from_it():
+    flat = Polygon(((-0.015, -0.0004), (0.015, -0.0004), (0.015, 0.0004), (-0.015, 0.0004)))
+    (place,) = label_positions(scene(flat), [(0.006, 0.001)])
+    # Beside it there is no dish; above its right half is the next direction, at 45 degrees.
+    across, upward = 0.015 + 0.003 + 0.001, 0.0004 + 0.0005 + 0.001
+    assert place.middle == pytest.approx((across * 0.5**0.5, upward * 0.5**0.5))
 
 
 def test_a_name_that_fits_stands_in_its_shape_and_one_that_fits_nowhere_too():

@@ -14,6 +14,7 @@ from magnetosuture_thread.cli.arguments import (
     bag_location,
     bag_selection,
     command,
+    namespace_argument,
     number_argument,
     output_file,
     whole_number,
@@ -71,14 +72,19 @@ def add(subparsers: Subparsers) -> None:
     graph = parser.add_mutually_exclusive_group()
     graph.add_argument("--graph", action="store_true", help="on the graph that runs on this ROS domain")
     graph.add_argument("--replay", type=Path, metavar="BAG", help="on a bag that is played through the nodes")
+    option("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the running graph")
     option("--address", help="network address to serve on (default: the setup's, 127.0.0.1)")
     option("--port", type=whole_number, help="of it; 0 takes a free one (default: the setup's, 8090)")
+    option("--certificate", metavar="FILE", help="serve over TLS by this certificate, a PEM file")
+    option("--key", metavar="FILE", help="of the certificate, where it is not in the same file")
+    option("--origin", metavar="URL", help="under which browsers reach the page, as https://rig.example")
     option("--token", help=f"that commands need (default: {TOKEN} in the environment, or a new one)")
     recordings = "folder that gets a bag for each recording (default: output/recordings)"
     option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
 
     parser = command(subparsers, "coils", run_coils)
     parser.add_argument("action", choices=COIL_ACTIONS, metavar="ACTION", help=", ".join(COIL_ACTIONS))
+    parser.add_argument("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the bridge")
 
     parser = command(subparsers, "reproduce", text="Reproduce a result of the paper, simulated.")
     results = parser.add_subparsers(title="results", metavar="RESULT", required=True)
@@ -214,16 +220,23 @@ def run_console(options: argparse.Namespace) -> int:
 
     Ctrl-C ends everything that this command has started; a recording that runs is kept.
     """
+    if options.namespace and not options.graph:
+        raise ConfigurationError("--namespace", options.namespace, "none without --graph, as no other graph is joined")
+
     from magnetosuture_thread.jobs.console import console
 
     console(
         options.setup,
         running=options.graph,
+        namespace=options.namespace,
         bag=options.replay,
         recordings=options.record,
         address=options.address,
         port=options.port,
         token=options.token or os.environ.pop(TOKEN, None) or None,  # no node gets it
+        certificate=options.certificate,
+        private_key=options.key,
+        origin=options.origin,
         log=make_log(make_console()),
     )
     return DONE
@@ -248,7 +261,7 @@ def run_coils(options: argparse.Namespace) -> int:
     from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
 
     log = make_log(make_console())
-    with CoilClient() as client:
+    with CoilClient(options.namespace) as client:
         if options.action != "state":
             problem = client.execute(options.action)
             if problem:

@@ -44,9 +44,14 @@ _STATE_NAMES = {
 
 
 class CoilClient:
-    """Client of the coil bridge on the ROS domain of the environment."""
+    """Client of the coil bridge on the ROS domain of the environment.
 
-    def __init__(self) -> None:
+    Args:
+        namespace: of the bridge, where it is in one.
+    """
+
+    def __init__(self, namespace: str = "") -> None:
+        self._namespace = namespace
         self._context = Context()
         self._state: CoilBridgeState | None = None
         self._values: dict[str, str] = {}
@@ -54,7 +59,10 @@ class CoilClient:
     def __enter__(self) -> CoilClient:
         """Join the graph."""
         rclpy.init(context=self._context, args=[])
-        self._node = GuardedNode("coil_client", context=self._context, start_parameter_services=False)
+        self._node = GuardedNode(
+            "coil_client", context=self._context, namespace=self._namespace, start_parameter_services=False
+        )
+        self._bridge = f"{self._node.get_namespace()}/coil_bridge".lstrip("/")
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
@@ -159,7 +167,7 @@ class CoilClient:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name.startswith("coil_bridge:"):
+            if status.name.startswith(f"{self._bridge}:"):
                 _, self._values = read_status(status)
 
     def _on_state(self, message: CoilBridgeState) -> None:

@@ -148,6 +148,7 @@ NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
 FORECAST_PERIOD = 0.1  # s; 400 points take a millisecond to read
 SCENE_PERIOD = 0.5  # s; a large scene takes a tenth of that
+PACKAGE_NODES = (*ALL_NODES, "console")
 MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
 MAX_NODES = 32  # shown
 MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
@@ -273,15 +274,18 @@ class ConsoleGraph:
         }
 
     def nodes(self) -> dict[str, dict[str, Any]]:
-        """Return the last diagnostics of each node, and their age.
+        """Return the last diagnostics of each node by its name in this graph's namespace, and their age.
 
-        The nodes of this package stay; of all others the latest are kept, for a while.
+        The nodes of this package stay, but for those of other rigs, which are left out; of all others the latest are
+        kept, for a while.
         """
+        space = self.node.get_namespace().strip("/")
         for report, arrived in self._reports.read():
             for status in report.status[:MAX_NODES]:
-                self._diagnostics[shortened(status.name.split(":")[0])] = (messages.node_state(status), arrived)
-        space = self.node.get_namespace().strip("/")
-        own = {f"{space}/{name}".lstrip("/") for name in ALL_NODES}
+                name = _name_within(space, shortened(status.name.split(":")[0]))
+                if name:
+                    self._diagnostics[name] = (messages.node_state(status), arrived)
+        own = set(ALL_NODES)
         others = sorted(self._diagnostics.keys() - own, key=lambda name: self._diagnostics[name][1])
         oldest = time.time_ns() - round(DROP_TIMEOUT * 1e9)
         too_many = len(others) + len(own) - MAX_NODES
@@ -322,6 +326,17 @@ class ConsoleGraph:
         for name, (status, arrived) in sorted(self._diagnostics.items()):
             age = max(0.0, time.time() - arrived * 1e-9)
             yield name, {**status, "level": "silent" if age > NODE_TIMEOUT else status["level"], "age": age}
+
+
+def _name_within(space: str, name: str) -> str:
+    """Return a node's name without the namespace of the graph, empty for a node of a rig in another namespace.
+
+    /diagnostics is one topic for all rigs of a ROS domain.
+    """
+    inside = name.removeprefix(f"{space}/") if space else name
+    is_ours = inside.rpartition("/")[2] in PACKAGE_NODES
+    is_elsewhere = "/" in inside or (bool(space) and inside == name)
+    return "" if is_ours and is_elsewhere else inside
 
 
 def _file_scene(settings: ConsoleSettings) -> dict[str, Any] | None:

@@ -36,17 +36,19 @@ NO_SERVICE = [Parameter("start_type_description_service", value=False)]
 
 
 @contextmanager
-def joined(*, domain: int | None = None, simulated_clock: bool = False) -> Iterator[Node]:
+def joined(*, domain: int | None = None, namespace: str = "", simulated_clock: bool = False) -> Iterator[Node]:
     """Create a node in a graph, without an executor.
 
     Args:
         domain: the graph's ROS domain; the one that the environment names if None.
+        namespace: of the graph, where it is in one.
         simulated_clock: whether its time is that of /clock.
     """
     context = Context()
     rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=SignalHandlerOptions.NO)
     parameters = [*NO_SERVICE, Parameter("use_sim_time", value=simulated_clock)]
-    node = rclpy.create_node(NAME, context=context, parameter_overrides=parameters, start_parameter_services=False)
+    options = {"parameter_overrides": parameters, "start_parameter_services": False}
+    node = rclpy.create_node(NAME, context=context, namespace=namespace, **options)
     try:
         yield node
     finally:
