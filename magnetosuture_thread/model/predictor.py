@@ -14,6 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.forces import ThreadForces
+from magnetosuture_thread.model.forces_in_motion import forces_in_motion
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
@@ -292,7 +293,8 @@ class ThreadPredictor:
                 worst = done if worst is None or worst.status == SOLVED else worst
         substeps = taken
         self.pose, self.state = pose, state
-        return self._prediction(pose, interval, substeps, done, worst, residuals, converged)
+        others = tuple((node, (ends[node] - place) / interval) for node, place in zip(nodes, begin, strict=True))
+        return self._prediction(pose, interval, substeps, done, worst, residuals, converged, others)
 
     def _follow(
         self,
@@ -329,9 +331,12 @@ class ThreadPredictor:
         worst: StepResult | None,
         residuals: Residuals,
         converged: bool,
+        prescribed: Sequence[tuple[int, Points]] = (),
     ) -> Prediction:
-        assert self.state is not None
-        positions, formulation = self.state.positions, self.formulation
+        state, formulation = self.state, self.formulation
+        assert state is not None
+        positions = state.positions
+        warm_start = formulation.warm_start() if prescribed and pose.motion is not None else None
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
@@ -340,7 +345,10 @@ class ThreadPredictor:
             return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
-            return None if last is None else formulation.forces(last, pose.heading)
+            found = None if last is None else formulation.forces(last, pose.heading)
+            if found is None or warm_start is None:
+                return found
+            return forces_in_motion(formulation, state, pose, prescribed, warm_start) or found
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
