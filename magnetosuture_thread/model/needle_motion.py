@@ -70,12 +70,12 @@ class NeedleMotionFilter:
         filter_pose(self._state, self._covariance, measured, interval, place**2, angle**2)
         c, s = math.cos(self._state[2]), math.sin(self._state[2])
         along, across, turning = self._state[3:].tolist()
-        variances = np.diagonal(self._covariance)
+        own = np.diagonal(self._covariance)
         return replace(
             pose,
             tail=self._state[:2].copy(),
             heading=np.array([c, s]),
-            deviation=(math.sqrt(0.5 * (variances[0] + variances[1])), math.sqrt(variances[2])),
+            deviation=(math.sqrt(0.5 * (own[0] + own[1])), math.sqrt(own[2])),
             motion=NeedleMotion(np.array([along * c - across * s, along * s + across * c]), turning),
         )
 
@@ -130,4 +130,5 @@ def _predicted_covariance(state: Vector, covariance: Vector, interval: float) ->
     noise = np.zeros((SIZE, SIZE))
     noise[3, 3] = noise[4, 4] = interval * ACCELERATION**2
     noise[5, 5] = interval * TURNING**2
-    return move @ covariance @ move.T + half @ noise @ half.T
+    moved: Vector = move @ covariance @ move.T + half @ noise @ half.T
+    return moved

@@ -19,6 +19,11 @@ PLACE, ANGLE = 1e-5, 5e-3  # m and rad; deviations of a tracked needle
 SPEED, RADIUS = 4e-3, 6e-3  # m/s and m; of a needle on a circle
 
 
+def eastward(stamp: float, x: float) -> NeedlePose:
+    """Return the exact pose of a needle that heads east on the x axis."""
+    return NeedlePose(stamp, np.array([x, 0.0]), np.array([1.0, 0.0]))
+
+
 def on_circle(time: float) -> NeedlePose:
     """Return the exact pose of a needle that goes round."""
     turn = SPEED * time / RADIUS
@@ -91,12 +96,12 @@ def test_a_heading_that_passes_pi_is_no_turn():
 def test_forces_are_those_of_the_given_motion():
     """A thread dragged along itself at one speed by the poses and at another by the motion."""
     predictor = ThreadPredictor.create("silk_6_0", length=0.019, segments=25)
-    predictor.start(NeedlePose(0.0, (0.0, 0.0), (1.0, 0.0)))
+    predictor.start(eastward(0.0, 0.0))
     plain = ThreadPredictor.create("silk_6_0", length=0.019, segments=25)
-    plain.start(NeedlePose(0.0, (0.0, 0.0), (1.0, 0.0)))
+    plain.start(eastward(0.0, 0.0))
     motion, kept = NeedleMotion(np.array([3e-3, 0.0]), 0.0), []
     for k in range(1, 30):
-        pose = NeedlePose(k / RATE, (2e-3 * k / RATE, 0.0), (1.0, 0.0))
+        pose = eastward(k / RATE, 2e-3 * k / RATE)
         prediction, other = predictor.step(replace(pose, motion=motion)), plain.step(pose)
         np.testing.assert_array_equal(prediction.positions, other.positions)
         kept.append(prediction)
@@ -114,7 +119,7 @@ def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():
     random, settings = np.random.default_rng(7), ThreadModelSettings(initial_shape="straight", estimator=False)
     session, pulls = ThreadSession(settings, None), []
     for k in range(300):
-        exact = NeedlePose(k / RATE, np.array([SPEED * k / RATE, 0.0]), np.array([1.0, 0.0]))
+        exact = eastward(k / RATE, SPEED * k / RATE)
         result = session.on_pose(round(1e9 * k / RATE), measured(exact, random))
         assert result.prediction is not None
         if k > 60:
