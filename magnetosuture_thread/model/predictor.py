@@ -33,6 +33,7 @@ from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, che
 from magnetosuture_thread.scene import Scene
 
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
+MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
@@ -305,22 +306,33 @@ class ThreadPredictor:
         interval: float,
         halvings: int = 0,
     ) -> Iterator[StepResult]:
-        """Yield the sub-step that ends at a part of the interval, or more of them where the thread would pass itself.
+        """Yield the sub-step that ends at a part of the interval, or more of them where the thread is in its own way.
 
         Raises:
             SolverError: it would do so in the shortest of them, or see `step`.
         """
-        done = self.formulation.step(state, drive(part), duration)
-        if not done.passed:
+        done, crowded = None, self.formulation.touches_itself and halvings < MAX_CROWDED_HALVINGS
+        try:
+            done = self.formulation.step(state, drive(part), duration)
+        except SolverError:
+            if not crowded:
+                raise
+        if done is not None and not done.passed and (done.converged or not crowded):
             yield done
             return
-        if halvings == MAX_HALVINGS:
+        if done is not None and done.passed and halvings == MAX_HALVINGS:
             self.formulation.forget()
             raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
-        for end in (part - 0.5 * duration / interval, part):
-            for done in self._follow(state, drive, end, 0.5 * duration, interval, halvings + 1):
-                state = done.state
-                yield done
+        parts, begin = list[StepResult](), state
+        try:
+            for end in (part - 0.5 * duration / interval, part):
+                parts += self._follow(begin, drive, end, 0.5 * duration, interval, halvings + 1)
+                begin = parts[-1].state
+        except SolverError:
+            if done is None or done.passed:
+                raise
+            parts = [done]  # no better than it was
+        yield from parts
 
     def _prediction(
         self,
