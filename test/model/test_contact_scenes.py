@@ -31,7 +31,7 @@ def polygon(*corners: tuple[float, float]) -> Polygon:
     return Polygon(tuple((1e-3 * x, 1e-3 * y) for x, y in corners))
 
 
-SHAPES = {
+SHAPES: dict[str, tuple[Disc | Polygon, ...]] = {
     "concave_corner": (polygon((3, -6), (9, -6), (9, 6), (5, 6), (5, -2), (3, -2)),),
     "thin_wedge": (polygon((0, 2), (9, 1.9), (9, 2.9)),),
     "gap": (Disc((5e-3, 2.04e-3), 2e-3), Disc((5e-3, -2.04e-3), 2e-3)),
