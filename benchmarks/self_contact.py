@@ -94,10 +94,11 @@ class RecordingFormulation(RodFormulation):
     path: list[Points]
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
-        """Record the step, unless the predictor divides it; see `RodFormulation`."""
+        """Record the step in place of one that the predictor divides, from whose end nothing goes on."""
         done = super().step(state, drive, interval)
-        if not done.passed:
-            self.path.append(done.state.positions)
+        while self.path and self.path[-1] is not state.positions:
+            self.path.pop()
+        self.path.append(done.state.positions)
         return done
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,18 @@ MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
 STARTED = "started"  # status of a prediction that no step led to
 
 
+class NeedleMotion(NamedTuple):
+    """The needle's motion at a pose.
+
+    Attributes:
+        velocity: of its tail, shape (d,) [m/s].
+        turning: rate at which its heading turns, counter-clockwise, in the plane [rad/s].
+    """
+
+    velocity: NDArray[np.float64]
+    turning: float
+
+
 @dataclass(frozen=True)
 class NeedlePose:
     """The needle at one instant, in the dish frame.
@@ -28,12 +41,14 @@ class NeedlePose:
         tail: the blunt end, where the thread is attached, shape (d,) [m].
         heading: unit vector from tail to tip, shape (d,).
         deviation: standard deviations of the tail in each direction [m] and of the heading [rad]; zeros if not known.
+        motion: of the needle, for the forces; None if only the poses tell.
     """
 
     stamp: float
     tail: Points
     heading: Points
     deviation: tuple[float, float] = (0.0, 0.0)
+    motion: NeedleMotion | None = None
 
     def __post_init__(self) -> None:
         """Take sequences of numbers as arrays."""

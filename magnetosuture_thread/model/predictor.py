@@ -14,6 +14,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.forces import ThreadForces
+from magnetosuture_thread.model.forces_in_motion import forces_in_motion
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
@@ -32,6 +33,7 @@ from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, che
 from magnetosuture_thread.scene import Scene
 
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
+MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
 
@@ -292,7 +294,8 @@ class ThreadPredictor:
                 worst = done if worst is None or worst.status == SOLVED else worst
         substeps = taken
         self.pose, self.state = pose, state
-        return self._prediction(pose, interval, substeps, done, worst, residuals, converged)
+        others = tuple((node, (ends[node] - place) / interval) for node, place in zip(nodes, begin, strict=True))
+        return self._prediction(pose, interval, substeps, done, worst, residuals, converged, others)
 
     def _follow(
         self,
@@ -303,22 +306,33 @@ class ThreadPredictor:
         interval: float,
         halvings: int = 0,
     ) -> Iterator[StepResult]:
-        """Yield the sub-step that ends at a part of the interval, or more of them where the thread would pass itself.
+        """Yield the sub-step that ends at a part of the interval, or more of them where the thread is in its own way.
 
         Raises:
             SolverError: it would do so in the shortest of them, or see `step`.
         """
-        done = self.formulation.step(state, drive(part), duration)
-        if not done.passed:
+        done, crowded = None, self.formulation.touches_itself and halvings < MAX_CROWDED_HALVINGS
+        try:
+            done = self.formulation.step(state, drive(part), duration)
+        except SolverError:
+            if not crowded:
+                raise
+        if done is not None and not done.passed and (done.converged or not crowded):
             yield done
             return
-        if halvings == MAX_HALVINGS:
+        if done is not None and done.passed and halvings == MAX_HALVINGS:
             self.formulation.forget()
             raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
-        for end in (part - 0.5 * duration / interval, part):
-            for done in self._follow(state, drive, end, 0.5 * duration, interval, halvings + 1):
-                state = done.state
-                yield done
+        parts, begin = list[StepResult](), state
+        try:
+            for end in (part - 0.5 * duration / interval, part):
+                parts += self._follow(begin, drive, end, 0.5 * duration, interval, halvings + 1)
+                begin = parts[-1].state
+        except SolverError:
+            if done is None or done.passed:
+                raise
+            parts = [done]  # no better than it was
+        yield from parts
 
     def _prediction(
         self,
@@ -329,9 +343,12 @@ class ThreadPredictor:
         worst: StepResult | None,
         residuals: Residuals,
         converged: bool,
+        prescribed: Sequence[tuple[int, Points]] = (),
     ) -> Prediction:
-        assert self.state is not None
-        positions, formulation = self.state.positions, self.formulation
+        state, formulation = self.state, self.formulation
+        assert state is not None
+        positions = state.positions
+        warm_start = formulation.warm_start() if prescribed and pose.motion is not None else None
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
@@ -340,7 +357,10 @@ class ThreadPredictor:
             return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
-            return None if last is None else formulation.forces(last, pose.heading)
+            found = None if last is None else formulation.forces(last, pose.heading)
+            if found is None or warm_start is None:
+                return found
+            return forces_in_motion(formulation, state, pose, prescribed, warm_start) or found
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))

@@ -18,7 +18,8 @@ from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.estimator.session import observation_of
 from magnetosuture_thread.model.margins import FrictionLaw, Margins
-from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, Prediction
+from magnetosuture_thread.model.needle_motion import NeedleMotionFilter
+from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, Prediction, check_pose
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.scene import Scene
@@ -37,6 +38,7 @@ class PredictionResult:
 
     Attributes:
         stamp: of the pose [ns].
+        pose: of the needle, with what the poses before say of it; None of a late observation.
         prediction: of the thread by the model alone; None where there is none.
         problem: why there is none; None while the thread is waited for.
         estimate: the thread by model and camera; None until the camera has measured the thread, and where thread or
@@ -50,6 +52,7 @@ class PredictionResult:
     """
 
     stamp: int
+    pose: NeedlePose | None = field(default=None, repr=False, compare=False)
     prediction: Prediction | None = None
     problem: InvalidInputError | SolverError | None = None
     estimate: ThreadEstimate | None = None
@@ -160,6 +163,7 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
+        self._needle_motion = NeedleMotionFilter()
         self._initial_observation = InitialObservation()
         self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
         self._motion_before = self._estimate_motion  # the estimate's, before its last pose
@@ -243,7 +247,7 @@ class ThreadSession:
         # The pose of the same frame may have come first, and others after it.
         early = [(at, pose) for at, pose in self._early if at >= stamp]
         self._early.clear()
-        return (self.predict(at, pose) for at, pose in early)
+        return (self._follow(at, pose) for at, pose in early)
 
     def on_observation(self, stamp: int, observation: ThreadObservation) -> Iterator[PredictionResult]:
         """Take what the camera sees of the thread.
@@ -303,18 +307,13 @@ class ThreadSession:
             stamp: of the frame [ns]; `pose.stamp` is the same in seconds.
             pose: as tracked; where the thread is fixed to it, `attachment_offset` says.
         """
-        return self.estimate(self.predict(stamp, pose), pose)
+        return self.estimate(self.predict(stamp, pose))
 
-    def estimate(self, result: PredictionResult, pose: NeedlePose) -> PredictionResult:
-        """Add the estimate to the prediction of a pose; the second half of `on_pose`.
-
-        Args:
-            result: of `predict` of this pose.
-            pose: as tracked.
-        """
-        if self._estimator is None:
+    def estimate(self, result: PredictionResult) -> PredictionResult:
+        """Add the estimate to the prediction of a pose; the second half of `on_pose`."""
+        if self._estimator is None or result.pose is None:
             return result
-        attached = self.settings.attachment_pose(pose)
+        attached = self.settings.attachment_pose(result.pose)
         found = self._estimator.on_pose(attached)
         if isinstance(found.problem, SolverError) and not self._measured:
             # The thread has been laid straight behind the needle, where a shape or the wall may be; begin anew here.
@@ -332,14 +331,26 @@ class ThreadSession:
         return replace(result, estimate=found.estimate, estimate_problem=found.problem, law=law, speeds=speeds)
 
     def predict(self, stamp: int, pose: NeedlePose) -> PredictionResult:
-        """Return what the model alone says of a pose; the first half of `on_pose`."""
+        """Return what the model alone says of a pose; the first half of `on_pose`.
+
+        A pose with deviations is filtered by those before, and its velocity is that of the forces.
+        """
         if self._last is not None and stamp < self._last - MAX_LATENESS:
             self._predictor.reset()
+            self._needle_motion.reset()
             self._last = None
             self._initial_observation.reset()
             self._early.clear()
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back
+        try:
+            check_pose(pose)
+        except InvalidInputError as error:
+            return PredictionResult(stamp, pose, problem=error, scene_version=self.scene_version)
+        return self._follow(stamp, self._needle_motion.update(pose))
+
+    def _follow(self, stamp: int, pose: NeedlePose) -> PredictionResult:
+        """Step the prediction to a filtered pose, or keep the pose until the thread is measured."""
         try:
             attached = self.settings.attachment_pose(pose)
             if self._predictor.started:
@@ -348,13 +359,13 @@ class ThreadSession:
                 prediction = self._predictor.start(attached, centreline)
             else:
                 self._early.append((stamp, pose))
-                return PredictionResult(stamp, scene_version=self.scene_version)
+                return PredictionResult(stamp, pose, scene_version=self.scene_version)
         except (InvalidInputError, SolverError) as error:
-            return PredictionResult(stamp, problem=error, scene_version=self.scene_version)
+            return PredictionResult(stamp, pose, problem=error, scene_version=self.scene_version)
         self._last = stamp
         speeds = self._motion.update(prediction.positions, prediction.interval)
         law = self.settings.friction_law()
-        return PredictionResult(stamp, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
+        return PredictionResult(stamp, pose, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

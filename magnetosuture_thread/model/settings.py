@@ -260,7 +260,10 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
             return pose
         along, left = self.attachment_offset
         x, y = pose.heading
-        return replace(pose, tail=pose.tail + np.array([along * x - left * y, along * y + left * x]))
+        lever, motion = np.array([along * x - left * y, along * y + left * x]), pose.motion
+        if motion is not None:
+            motion = motion._replace(velocity=motion.velocity + motion.turning * np.array([-lever[1], lever[0]]))
+        return replace(pose, tail=pose.tail + lever, motion=motion)
 
     def attached_observation(self, observation: ThreadObservation) -> ThreadObservation:
         """Return an observation whose arc lengths are measured from where the thread is fixed."""

@@ -92,7 +92,7 @@ class ThreadModelNode(PackageNode):
         result = self._session.predict(reading.nanoseconds(stamp), read)
         step_time = time.perf_counter() - began
         self._publish_prediction(result, step_time)  # at once, as it is waited for
-        result = self._session.estimate(result, read)
+        result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
             self._forecasts.publish(result, read)

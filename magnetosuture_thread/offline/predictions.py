@@ -140,7 +140,7 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
         pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading, observation.deviation)
         predicted = session.predict(observation.stamp, pose)
         taken = time.perf_counter() - began
-        yield step(observation, session.estimate(predicted, pose), taken)
+        yield step(observation, session.estimate(predicted), taken)
         for late in session.late_estimates():  # of observations that are refused: all others come with their poses
             yield step(observation, late, 0.0)
         while len(waiting) > 2 * MAX_WAITING_POSES:

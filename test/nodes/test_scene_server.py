@@ -143,6 +143,8 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ),
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
     ("add", {"name": "a", "shape": "{disc: {center: [1, 1], radius: 0.1}}"}, "a: got 'a shape outside of the dish"),
+    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: -0.1}"}, "a.friction: got -0.1"),
+    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: 1e9}"}, "a.friction: got 1"),
     ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
     ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
     (

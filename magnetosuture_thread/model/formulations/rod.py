@@ -110,6 +110,7 @@ class RodFormulation(Formulation):
         self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
         self._self_contact = selves[0] if selves else None
+        self.touches_itself = bool(selves)
         self._waits = len(barriers) == len(selves)  # there are no added rows until the thread touches itself
         if not self._waits:  # compiled code knows nothing of their rows, and leaves every solve to `step`
             self._banded = BandedSolver(iterations=0)

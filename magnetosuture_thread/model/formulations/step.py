@@ -150,11 +150,13 @@ class Formulation(ABC):
         name: of the formulation.
         dimension: 2 or 3.
         has_friction: whether it knows friction; else shapes have none.
+        touches_itself: whether the thread cannot pass through itself.
         added: the barriers that a user has added.
     """
 
     name: str
     has_friction = False
+    touches_itself = False
 
     def __init__(
         self,
