@@ -88,14 +88,8 @@ class EstimatedThread:
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
         squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        return cls(
-            estimate.positions,
-            estimate.corrected,
-            squared,
-            estimate.disturbances,
-            estimate.hidden,
-            estimate.slow_parameters,
-        )
+        found, hidden, learned = estimate.disturbances, estimate.hidden, estimate.slow_parameters
+        return cls(estimate.positions, estimate.corrected, squared, found, hidden, learned)
 
 
 @dataclass
