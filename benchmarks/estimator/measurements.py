@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ def targets(run: Run, segments: int) -> NDArray[np.float64]:
 def estimator_of(thread: Thread, run: Run, case: Case | None = None) -> ThreadEstimator:
     """Return an estimator that knows of a run what the case lets it."""
     posts = () if case is not None and case.post == "unknown" else run.posts
-    options = EstimatorOptions(slow_parameters=case.learned if case is not None else ())
+    options = EstimatorOptions() if case is None or not case.learned else EstimatorOptions(slow_parameters=case.learned)
     estimator = ThreadEstimator(ThreadPredictor(thread, Workspace(posts, 5e-3, wall_radius=run.wall_radius)), options)
     estimator.warm_up()
     return estimator
@@ -112,14 +112,26 @@ def _bent(nodes: Points, length: float) -> Points:
     return np.asarray(nodes + np.linspace(0.0, 1.0, len(nodes))[:, None] * aside)
 
 
+class Played(NamedTuple):
+    """Estimates of a run.
+
+    Attributes:
+        current: at each pose but the first, as it is known when the pose comes.
+        measured: at the stamps of the observations, which may come late.
+    """
+
+    current: list[ThreadEstimate]
+    measured: list[ThreadEstimate]
+
+
 def play(
     case: Case, run: Run, seen: Sequence[ThreadObservation | None], estimator: ThreadEstimator, first: Points
-) -> list[ThreadEstimate]:
-    """Return the estimate at each pose but the first, as it is known when the pose comes."""
+) -> Played:
+    """Return the estimates of a run."""
     session = EstimatorSession(estimator)
     estimator.reset()
     poses = [_scaled(pose, case.camera) for pose in run.poses]
-    estimates: list[ThreadEstimate] = []
+    played = Played([], [])
     for index, pose in enumerate(poses):
         late = seen[index - case.latency] if index >= case.latency else None
         observed = late if case.start == "measured" or index > 0 else None
@@ -135,8 +147,10 @@ def play(
             raise result.problem
         if index > 0:
             assert result.estimate is not None
-            estimates.append(result.estimate)
-    return estimates
+            played.current.append(result.estimate)
+            if result.measured is not None and observed is not None:
+                played.measured.append(result.measured)
+    return played
 
 
 def _scaled(pose: NeedlePose, camera: CameraModel) -> NeedlePose:
@@ -168,7 +182,7 @@ def measure_case(
             thread = _with_segments(run.thread, segments)
             truth, estimator = targets(run, segments), estimator_of(thread, run, case)
             seen = observations(case, run, number)
-            estimates = play(case, run, seen, estimator, truth[0])
+            estimates, measured = play(case, run, seen, estimator, truth[0])
             contact = contact_frame(run) if case.post else len(truth)
             judged = _judged(case, run, contact, segments)
             off = _off(np.array([each.positions for each in estimates]), truth, thread.length)
@@ -184,8 +198,8 @@ def measure_case(
                 errors["registration"].append(_off(by_drift, truth, thread.length)[judged])
             worse += bool(off[judged].mean() > alone[judged].mean())
             runs += 1
-            squared = _squared(estimates)
-            inside += _within_band(estimates, squared)
+            squared = _squared(measured)
+            inside += _within_band(measured, squared)
             innovations.append(squared[np.isfinite(squared)])
             alarms_at = [index + 1 for index, each in enumerate(estimates) if each.disturbances]
             if case.post == "unknown":
@@ -296,7 +310,7 @@ def measure_references(folder: Path, seed: int, progress: Callable[[], None]) ->
         run = Run(thread, poses, reference.threads[::step], reference.discs, np.inf)
         case = CASES["right, free"]
         truth, estimator = targets(run, thread.segments), estimator_of(thread, run)
-        estimates = play(case, run, observations(case, run, seed), estimator, truth[0])
+        estimates = play(case, run, observations(case, run, seed), estimator, truth[0]).current
         off = Errors.of(_off(np.array([each.positions for each in estimates]), truth, thread.length)[int(RATE) :])
         alone = Errors.of(_off(predict(run, estimator, truth[0]), truth, thread.length)[int(RATE) :])
         found[reference.name] = {

@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from magnetosuture_thread.evaluation.frames import Array, FrameResult, TimeSeries
 from magnetosuture_thread.evaluation.silence import SILENT_PERIODS
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.model.estimator import Disturbance
+from magnetosuture_thread.model.estimator import Disturbance, SlowParameter
+from magnetosuture_thread.model.estimator.parameter_kinds import KINDS
 
 ESTIMATE_COLUMNS = ("hidden", "corrected", "innovations", "innovation_squared")
 MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is
@@ -300,6 +301,7 @@ class EstimationFigures:
         hidden: how much of the thread was hidden; None where nothing was estimated.
         disturbances: what the model does not know, by its beginning.
         disturbance_count: of all, also of those that are not kept.
+        learned: slow parameters in the end, where any are learned.
     """
 
     corrected: int = 0
@@ -307,9 +309,12 @@ class EstimationFigures:
     hidden: HiddenShares | None = None
     disturbances: tuple[DisturbanceEvent, ...] = ()
     disturbance_count: int = 0
+    learned: tuple[SlowParameter, ...] = ()
 
     @classmethod
-    def of(cls, series: TimeSeries, disturbances: DisturbanceLog) -> EstimationFigures:
+    def of(
+        cls, series: TimeSeries, disturbances: DisturbanceLog, learned: tuple[SlowParameter, ...] = ()
+    ) -> EstimationFigures:
         """Return the figures of a run."""
         return cls(
             int(np.nansum(series.column("corrected"))),
@@ -317,6 +322,7 @@ class EstimationFigures:
             HiddenShares.of(series),
             tuple(disturbances.events),
             disturbances.count,
+            learned,
         )
 
     @property
@@ -334,4 +340,16 @@ class EstimationFigures:
             "all_hidden_time_share": hidden.all_time if hidden else None,
             "hidden_length_share": hidden.length if hidden else None,
             "disturbances": self.disturbance_count,
+            "learned": _learned(self.learned),
         }
+
+
+def _learned(parameters: tuple[SlowParameter, ...]) -> dict[str, float | None]:
+    """Return value and 95 % interval of each slow parameter that there can be, None of those that are not learned."""
+    found = {each.name: each for each in parameters}
+    names = [kind.name for kinds in KINDS.values() for kind in kinds]
+    return {
+        f"{name}{suffix}": getattr(found[name], of) if name in found else None
+        for name in names
+        for suffix, of in (("", "value"), ("_95_low", "low"), ("_95_high", "high"))
+    }

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.model.estimator import Disturbance, SlowParameter, ThreadEstimate
 from magnetosuture_thread.model.margins import Margins, node_clearance
 from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -74,6 +74,7 @@ class EstimatedThread:
         squared: normalised innovation squared of each window of arc length, shape (w,); nan where nothing is measured.
         disturbances: what the model does not know.
         hidden: part of the thread that no point shows, 0 to 1.
+        learned: slow parameters, where any are learned.
     """
 
     vertices: Points
@@ -81,12 +82,14 @@ class EstimatedThread:
     squared: Array = field(default_factory=lambda: np.empty(0))
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
+    learned: tuple[SlowParameter, ...] = ()
 
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
         squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden)
+        found, hidden, learned = estimate.disturbances, estimate.hidden, estimate.slow_parameters
+        return cls(estimate.positions, estimate.corrected, squared, found, hidden, learned)
 
 
 @dataclass

@@ -34,6 +34,7 @@ from magnetosuture_thread.evaluation.frames import (
 from magnetosuture_thread.evaluation.silence import SensorSilence as SensorSilence
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
+from magnetosuture_thread.model.estimator import SlowParameter
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
@@ -230,6 +231,7 @@ class RunMetrics:
         reasons: why not.
         contact_frames: those in which the thread touches an obstacle or the wall.
         disturbances: that the estimate reported.
+        learned: slow parameters of the last estimate that has any.
     """
 
     def __init__(
@@ -252,6 +254,7 @@ class RunMetrics:
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
         self._worst = {(kind, target): WorstFrames(of=kind) for kind in KINDS for target in self.targets}
         self.disturbances = DisturbanceLog()
+        self.learned: tuple[SlowParameter, ...] = ()
         self._fresh: list[FrameResult] = []
         self._first: FrameResult | None = None
 
@@ -282,6 +285,8 @@ class RunMetrics:
                     self._minimum[row.barrier] = replace(held, value=value)
             self.contact_frames += frame.in_contact
         self.disturbances.add(self._time(frame.stamp), frame)
+        if frame.estimate is not None and frame.estimate.learned:
+            self.learned = frame.estimate.learned
         if self._fresh and len(frame.vertices) != len(self._fresh[0].vertices):  # the model's segments have changed
             self.compare()
         self._fresh.append(frame)
@@ -342,7 +347,7 @@ class RunMetrics:
     @property
     def estimation(self) -> EstimationFigures:
         """What the run tells of its estimate beside the errors."""
-        return EstimationFigures.of(self.series, self.disturbances)
+        return EstimationFigures.of(self.series, self.disturbances, self.learned)
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""

@@ -375,6 +375,8 @@ def _add_estimation(table: Table, estimation: EstimationFigures) -> None:
     within = f"{low:.2f} to {high:.2f} in {found.within} of {found.windows} windows of {found.width:.1f} s"
     table.add_row("normalised innovation squared", f"{found.mean:.3f}", within)
     table.add_row("disturbances", str(estimation.disturbance_count), "that the model does not know")
+    for each in estimation.learned:
+        table.add_row(f"learned {each.name}", *str(each).split(", ", 1))
 
 
 def _micrometres(metres: float) -> str:

@@ -71,7 +71,8 @@ class EstimatorSettings(Configuration):
     )
     estimator_slow_parameters: tuple[str, ...] = quantity(
         _OPTIONS.slow_parameters,
-        f"what the estimator learns of the thread as it runs, some of {', '.join(SLOW_PARAMETERS)}; else nothing",
+        f"what the estimator learns of the thread as it runs, some of {', '.join(SLOW_PARAMETERS)}, or nothing; "
+        "auto: stiffness over drag, once the thread moves as the model cannot explain",
     )
     estimator_slow_time: float = quantity(
         _OPTIONS.slow_time, "time over which those may change", unit="s", minimum=0.1, maximum=1e5

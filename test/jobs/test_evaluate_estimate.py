@@ -87,6 +87,12 @@ def test_a_whole_path_corrects_what_the_model_does_not_know(tmp_path: Path, push
     low, high = row["consistency"]["band_95_low"], row["consistency"]["band_95_high"]
     assert 0.8 < low < 1.0 < high < 1.2
     assert row["disturbances"] > 0
+    learned = row["learned"]
+    assert (
+        learned["stiffness_over_drag_95_low"] < learned["stiffness_over_drag"] < learned["stiffness_over_drag_95_high"]
+    )
+    assert learned["flow_x"] is None
+    assert "learned by the estimate" in page
     for text in (
         "estimate, against the ground truth",
         'id="plot-consistency"',

@@ -12,6 +12,7 @@ from magnetosuture_thread.evaluation.estimation import EstimationFigures, compar
 from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.silence import SensorSilence
+from magnetosuture_thread.model.estimator import SlowParameter
 from magnetosuture_thread.model.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
@@ -209,6 +210,7 @@ def headlines(about: BagDetails, figures: BagFigures) -> list[Headline]:
             if target in errors and (kind == "prediction" or figures.estimation.estimated)
         ),
         *([_consistency(figures.estimation), _hidden(figures.estimation)] if figures.estimation.estimated else []),
+        *(_learned(each) for each in figures.estimation.learned),
         _frames(figures),
         _margin(about, figures),
         _strain(figures),
@@ -259,6 +261,11 @@ def _hidden(estimation: EstimationFigures) -> Headline:
     if found.all_time > 0.0:
         detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
     return Headline(name, f"{100.0 * found.time:.1f} %", detail, *_grade(found.time, *grades))
+
+
+def _learned(parameter: SlowParameter) -> Headline:
+    value, interval = str(parameter).split(", ", 1)
+    return Headline(parameter.name.replace("_", " "), value, interval, NONE, "learned by the estimate")
 
 
 def _frames_of(count: float) -> str:

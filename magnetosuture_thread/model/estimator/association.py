@@ -64,7 +64,7 @@ def usable_points(
         largest: coordinate and deviation [m].
         min_deviation: what is less is taken as this [m].
         unit: D, the unit of what is returned [m].
-        max_points: that are returned; of more, every so many is taken.
+        max_points: that are returned; of more, so many are taken evenly, with both ends.
     """
     good = np.empty(len(points), dtype=np.int64)
     count = 0
@@ -77,7 +77,7 @@ def usable_points(
     taken = -(-count // stride)
     places, deviations = np.empty((taken, 2)), np.empty(taken)
     for k in range(taken):
-        p = good[k * stride]
+        p = good[k * (count - 1) // (taken - 1) if taken > 1 else 0]  # both ends are among them
         places[k, 0], places[k, 1] = points[p, 0] / unit, points[p, 1] / unit
         deviations[k] = max(deviation[p], min_deviation) / unit
     return places, deviations, count

@@ -365,7 +365,8 @@ def correct(
         if contacts < 0:
             return NO_ROOM, solves, off, found, scale
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
-        if solves > 0 and ((off <= 1.0 and change <= CHANGED) or solves >= MAX_SOLVES):
+        done = off <= 1.0 and change <= CHANGED and max(found) <= tolerance
+        if solves > 0 and (done or solves >= MAX_SOLVES):
             break
         prior_information(density, noise, length, stiffness, scale, rod.clamped, work.normals, buffers)
         rows = row + contacts
@@ -373,7 +374,7 @@ def correct(
         u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
         _, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
         solves += 1
-        if not max(found) <= tolerance:
+        if not max(found) < np.inf:
             return FAILED, solves, off, found, scale
         moved[:] = u
         about[:] = start + moved
@@ -387,6 +388,8 @@ def correct(
             dx, dy = (1.0 - t) * u[i, 0] + t * u[i + 1, 0], (1.0 - t) * u[i, 1] + t * u[i + 1, 1]
             residual[p] = points.innovation[p] - (-ey * dx + ex * dy) / size
         change = robust_weights(points, residual, points.variance, weights) if solves < MAX_REWEIGHTED else 0.0
+    if not max(found) <= tolerance:
+        return FAILED, solves, off, found, scale
     selected_inverse(6, 2 * nodes, solver_buffers.band, work.inverse)
     for i in range(nodes):
         for a in range(2):

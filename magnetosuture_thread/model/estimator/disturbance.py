@@ -261,9 +261,13 @@ class DisturbanceTest:
         forces = np.linalg.lstsq(across, aside, rcond=1e-3)[0]
         return np.asarray(np.einsum("k,kij->ij", forces, responses))
 
+    def confirmed(self, stamp: float) -> bool:
+        """Return whether the camera has moved the thread too far for long."""
+        return stamp - self._since >= CONFIRMED * self._time
+
     def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
         """Return the forces that explain what the camera moves the thread by, if it does so for long."""
-        if not stamp - self._since >= CONFIRMED * self._time:
+        if not self.confirmed(stamp):
             return ()
         thread = self._thread
         drag, bending = thread.medium, thread.bending_stiffness * self._time

@@ -204,7 +204,7 @@ class ThreadEstimator:
         self, points: MeasuredPoints, end: tuple[float, float], pose: NeedlePose, state: ThreadState
     ) -> ThreadState:
         """Learn the slow parameters; return where the thread is predicted with them."""
-        if not self._slow.kinds:
+        if not self._slow.active:
             return state
         weights, noise = np.ones(len(points.place)), np.empty(self.thread.segments + 1)
         interpolate_to_nodes(self._noise.intensity, len(noise), noise)
@@ -282,6 +282,8 @@ class ThreadEstimator:
         if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
             deviations = np.asarray(pose.deviation)
             self._test.add(work.moved * unit, work.normals, variance, pose.stamp, deviations)
+            if self._test.confirmed(pose.stamp):
+                self._slow.activate()
         corrected = ThreadState(positions, state.velocities, state.interval)
         self.predictor.pose, self.predictor.state = pose, corrected
         self._converged = True

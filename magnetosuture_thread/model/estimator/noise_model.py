@@ -118,7 +118,7 @@ def learn_noise(
     )
     learn(bank, grid, mean, sums.own * unit**2, elapsed, time_constant)
     # Where the bank knows of an error that the last correction left, the noise was too low: as if it came at once.
-    intensity_with_excess(bank, mean, max(elapsed, MIN_INTERVAL), intensity)
+    intensity_with_excess(bank, mean, max(elapsed, MIN_INTERVAL), learned_for >= time_constant, intensity)
     grow(before, intensity, max(elapsed, MIN_INTERVAL) / unit**2, factor, variance, density)
     interpolate_to_nodes(intensity, len(noise), noise)
     noise /= unit**2

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from magnetosuture_thread.errors import ConfigurationError
 
 SLOW_PARAMETERS = ("stiffness_over_drag", "drag_anisotropy", "rest_curvature", "flow")
+AUTOMATIC = "auto"
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class EstimatorOptions:
             length.
         disturbance_time: averaging time of the test for what the model does not know [s].
         history: how late an observation may come [s].
-        slow_parameters: what is learned on line, some of `SLOW_PARAMETERS`; nothing by default.
+        slow_parameters: what is learned on line, some of `SLOW_PARAMETERS`, or nothing. By default `AUTOMATIC` alone:
+            stiffness over drag, from the first time on that the thread moves as the model cannot explain.
         slow_time: time over which those may change [s].
 
     Raises:
@@ -38,17 +40,23 @@ class EstimatorOptions:
     initial_error: float = 0.2
     disturbance_time: float = 0.4
     history: float = 1.0
-    slow_parameters: tuple[str, ...] = ()
+    slow_parameters: tuple[str, ...] = (AUTOMATIC,)
     slow_time: float = 10.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for name in self.slow_parameters:
+        for name in self.slow_parameters if self.slow_parameters != (AUTOMATIC,) else ():
             if name not in SLOW_PARAMETERS:
-                raise ConfigurationError("estimator.slow_parameters", name, f"some of {', '.join(SLOW_PARAMETERS)}")
+                expected = f"some of {', '.join(SLOW_PARAMETERS)}, or {AUTOMATIC} alone"
+                raise ConfigurationError("estimator.slow_parameters", name, expected)
         for each in fields(self):
             if each.name == "slow_parameters":
                 continue
             value = getattr(self, each.name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")
+
+    @property
+    def automatic(self) -> bool:
+        """Whether slow parameters are learned only where the model turns out to be wrong."""
+        return self.slow_parameters == (AUTOMATIC,)

@@ -94,6 +94,7 @@ class LearnedState:
     """What is known of p parameters; arrays are never written to.
 
     Attributes:
+        active: whether they are learned; see `EstimatorOptions.automatic`.
         x: of the parameters, shape (p,).
         information: inverse of their covariance, shape (p, p).
         sensitivities: derivatives of the nodes and of their velocities by x, shape (2, p, n + 1, 2) [m], [m/s].
@@ -106,6 +107,7 @@ class LearnedState:
         dispersion: sums over blocks of squared scores and of what was expected, shape (2, p).
     """
 
+    active: bool
     x: Vector
     information: NDArray[np.float64]
     sensitivities: NDArray[np.float64]
@@ -139,19 +141,30 @@ class SlowParameters:
 
     def __init__(self, predictor: ThreadPredictor, options: EstimatorOptions) -> None:
         self._predictor, self._thread, self._time = predictor, predictor.thread, options.slow_time
-        thread = self._thread
-        if options.slow_parameters and not min(thread.bending_stiffness, *_drags(thread)) > 0.0:
+        thread, names, self._automatic = self._thread, options.slow_parameters, options.automatic
+        resists = min(thread.bending_stiffness, *_drags(thread)) > 0.0
+        if self._automatic:
+            names = ("stiffness_over_drag",) if resists else ()
+        if names and not resists:
             raise ConfigurationError(
                 "estimator.slow_parameters",
                 list(options.slow_parameters),
                 "none for a thread without stiffness or drag",
             )
-        self.kinds = tuple(kind for name in dict.fromkeys(options.slow_parameters) for kind in KINDS[name])
+        self.kinds = tuple(kind for name in dict.fromkeys(names) for kind in KINDS[name])
         self._start = np.array([kind.to_x(kind.read(thread)) for kind in self.kinds])
         bounds = np.array([[kind.to_x(each) for each in kind.bounds(thread)] for kind in self.kinds]).reshape(-1, 2)
         # What is set counts, even where nobody would look for it.
         self._low, self._high = np.minimum(bounds[:, 0], self._start), np.maximum(bounds[:, 1], self._start)
         self._deviation = np.array([kind.deviation(thread) for kind in self.kinds])
+        if (
+            self._automatic
+        ):  # a thread that is held looks like one without stiffness: that is to be reported, not learned
+            known = NORMAL_95 * self._deviation
+            self._low, self._high = (
+                np.maximum(self._low, self._start - known),
+                np.minimum(self._high, self._start + known),
+            )
         self.reset()
 
     def reset(self) -> None:
@@ -159,6 +172,7 @@ class SlowParameters:
         count, nodes = len(self.kinds), self._thread.segments + 1
         self.restore(
             LearnedState(
+                bool(self.kinds) and not self._automatic,
                 self._start,
                 np.diag(self._deviation**-2.0),
                 np.zeros((2, count, nodes, 2)),
@@ -177,6 +191,16 @@ class SlowParameters:
         self.state = state
         if self.kinds:
             self._use(state.x)
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is learned."""
+        return self.state.active
+
+    def activate(self) -> None:
+        """Begin to learn, where that waited for the model to be found wrong."""
+        if self.kinds and not self.active:
+            self.state = replace(self.state, active=True)
 
     def restart(self) -> None:
         """Take the thread's place as one that does not depend on the parameters, as where it was measured whole."""
@@ -198,7 +222,7 @@ class SlowParameters:
         """
         predictor, state = self._predictor, self.state
         formulation, last_pose, before = predictor.formulation, predictor.pose, predictor.state
-        if not self.kinds or last_pose is None or before is None:
+        if not self.active or last_pose is None or before is None:
             return predictor.step(pose)
         warm_start = formulation.warm_start()
         prediction = predictor.step(pose)
@@ -280,7 +304,7 @@ class SlowParameters:
             corrector: that has solved it.
             variance: of the nodes after it, shape (n + 1,) [D^2].
         """
-        if self.kinds:
+        if self.active:
             unit, sensitivities = self._thread.segment_length, self.state.sensitivities.copy()
             found = corrector.sensitivities(sensitivities[0] / unit)
             sensitivities[0] = unit * np.where(np.isfinite(found.corrected), found.corrected, 0.0)
@@ -299,7 +323,7 @@ class SlowParameters:
     def report(self) -> tuple[SlowParameter, ...]:
         """Return the parameters as they are known now."""
         state = self.state
-        if not self.kinds:
+        if not self.active:
             return ()
         variance = np.diag(np.linalg.inv(state.information))
         own = 1.0 / np.sqrt(variance * np.diag(state.information))  # of the effect of each, no other makes up for

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.model.estimator.association import path_lengths, path_without_outliers, search_start
+from magnetosuture_thread.model.estimator.association import (
+    path_lengths,
+    path_without_outliers,
+    search_start,
+    usable_points,
+)
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
     DEVIATION,
@@ -33,6 +38,17 @@ def test_points_far_aside_are_left_out_of_the_path() -> None:
     kept = np.zeros(100, dtype=np.bool_)
     path_without_outliers(points, 0.12, 0.3, kept)
     np.testing.assert_array_equal(kept, ~wrong)
+
+
+@pytest.mark.parametrize("count", [99, 100, 119, 120, 350])
+def test_of_too_many_points_both_ends_are_kept(count: int) -> None:
+    points = np.column_stack([np.linspace(0.0, 0.019, count), np.zeros(count)])
+    kept, _, finite = usable_points(points, np.full(count, 1e-5), 10.0, 1e-6, 1e-3, 100)
+    assert finite == count
+    assert 50 <= len(kept) <= 100
+    np.testing.assert_allclose(kept[[0, -1], 0], [0.0, 19.0])
+    steps = np.diff(kept[:, 0])
+    assert steps.max() < 2.1 * steps.min()
 
 
 def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:

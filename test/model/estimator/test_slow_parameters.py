@@ -11,6 +11,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.model.estimator.correction import MeasuredPoints, normals_of, prior_information
 from magnetosuture_thread.model.estimator.corrector import Corrector
+from magnetosuture_thread.model.estimator.options import AUTOMATIC
 from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
@@ -19,6 +20,7 @@ from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
+    LENGTH,
     RATE,
     estimator_of,
     piece_of,
@@ -225,3 +227,51 @@ def test_a_thread_half_hidden_is_learned_from_what_is_measured() -> None:
     (found,) = estimate.slow_parameters
     assert found.low <= KINDS_BY_NAME[found.name].read(real) <= found.high
     assert np.abs(estimate.positions - shapes[-1]).max() < 1e-4
+
+
+def test_by_default_a_right_model_learns_nothing_and_the_estimate_is_the_same_to_the_last_bit() -> None:
+    thread, way = thread_of(material="polyamide_7_0"), poses(120)
+    shapes = true_shapes(thread, way)
+    usual, without = play(estimator_of(thread), way, shapes), play(learner(thread), way, shapes)
+    for one, other in zip(usual, without, strict=True):
+        np.testing.assert_array_equal(one.positions, other.positions)
+    assert usual[-1].slow_parameters == ()
+
+
+@pytest.mark.parametrize("factor", [5.0, 0.2])
+def test_by_default_a_wrong_stiffness_is_learned_once_the_model_is_found_wrong(factor: float) -> None:
+    """So that half of the thread, hidden afterwards, goes the way that a thread of that stiffness goes."""
+    told, way, half = thread_of(material="polyamide_7_0"), poses(240), 0.5 * LENGTH
+    shapes = true_shapes(changed(told, stiffness_over_drag=factor), way)
+    shown = [
+        whole(nodes, k) if k < 150 else ThreadObservation((piece_of(nodes, k, end=half),), False)
+        for k, nodes in enumerate(shapes)
+    ]
+    hidden = {}
+    for names in (AUTOMATIC,), ():
+        estimator = learner(told, *names)
+        estimates = [estimator.start_observed(way[0], shown[0])]
+        estimates += [estimator.step(*each) for each in zip(way[1:], shown[1:], strict=True)]
+        off = np.array([each.positions for each in estimates]) - shapes
+        hidden[names] = np.linalg.norm(off[150:, 13:], axis=2).max()
+        if names:
+            began = next(k for k, each in enumerate(estimates) if each.slow_parameters)
+            assert any(each.disturbances for each in estimates[: began + 1])
+            (learned,) = estimates[149].slow_parameters
+            true = factor * told.bending_stiffness / told.medium.drag_across
+            assert learned.value == pytest.approx(true, rel=0.03)
+            assert learned.low <= true <= learned.high
+    assert hidden[(AUTOMATIC,)] < 0.2 * hidden[()]
+
+
+def test_what_is_learned_by_itself_stays_within_a_factor_of_ten() -> None:
+    """Beyond, something else is wrong with the model, which is reported as that."""
+    told, way = thread_of(material="polyamide_7_0"), poses(240)
+    estimates = play(estimator_of(told), way, true_shapes(changed(told, stiffness_over_drag=100.0), way))
+    (learned,) = estimates[-1].slow_parameters
+    assert learned.value == pytest.approx(10.0 * told.bending_stiffness / told.medium.drag_across, rel=1e-6)
+
+
+def test_automatic_learning_stands_alone() -> None:
+    with pytest.raises(ConfigurationError, match="auto alone"):
+        EstimatorOptions(slow_parameters=("auto", "flow"))
