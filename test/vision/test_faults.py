@@ -34,11 +34,10 @@ def check(pose: Pose, frame: np.ndarray) -> str:
 @pytest.mark.parametrize("opacity", [1.0, 0.6, 0.1])
 @pytest.mark.parametrize("share", [-0.02, 0.03, 0.3, 0.6, 0.9, 1.0])
 def test_glare_over_a_part_of_the_needle(share: float, opacity: float):
-    noises = np.random.default_rng([round(100 * abs(share)), round(10 * opacity)]).integers(0, 2**31, (2, 2, 2))
     for seed in range(2):
         pose = random_pose(np.random.default_rng(seed), curved=seed > 0)
-        for radius, drawn in zip((0.0003, 0.0008), noises[seed].tolist(), strict=True):
-            for noise in drawn:
+        for radius in (0.0003, 0.0008):
+            for noise in range(5):
                 cover = blob(pose.at(share), radius, WHITE, opacity)
                 reason = check(pose, render(pose, seed=noise, covers=(cover,)))
                 assert not reason or opacity > 0.1

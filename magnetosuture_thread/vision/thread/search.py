@@ -231,13 +231,11 @@ class ThreadSearch:
         box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
         for layer in (self._picture.darkest, self._picture.brightest):
             small = shrunk(layer.small[box], COARSE // factor)
-            differs = cv2.absdiff(
-                small, cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            )
+            floor = cv2.resize(layer.floor[box], small.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            differs = cv2.absdiff(small, floor)
             contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
-        usual = middle(near[::3, ::3])
-        contrast = self._median_along(points, near, COARSE) - usual
+        contrast = self._median_along(points, near, COARSE) - middle(near[::3, ::3])
         return contrast / max(1e-6, walk.strength * math.sqrt(walk.ridge.scale))
 
     def between_edges(self, walk: Walk) -> Walk | None:
