@@ -223,10 +223,12 @@ class ThreadSearch:
         What is wide keeps its contrast in a shrunk image, what is thin loses it: in the one that was walked in, too.
         Beside a shape of the scene it is the shape's; of a walk that is nowhere else, nothing tells.
         """
-        mask, points = self._picture.mask, walk.points
-        points = points if mask is None else points[mask.depths(points) < -BESIDE * COARSE]
-        if len(points) < MIN_CENTRED:
-            return 0.0
+        mask, points, strength = self._picture.mask, walk.points, walk.strength
+        if mask is not None and len(walk.path) == len(points):
+            clear = mask.depths(points) < -BESIDE * COARSE
+            if clear.sum() < MIN_CENTRED:
+                return 0.0
+            points, strength = points[clear], float(np.median(walk.path[clear, 4]))
         contrast, factor = None, self._picture.factor
         box = tuple(slice(side.start // factor, -(-side.stop // factor)) for side in self._box)
         for layer in (self._picture.darkest, self._picture.brightest):
@@ -236,7 +238,7 @@ class ThreadSearch:
             contrast = differs if contrast is None else cv2.max(contrast, differs)
         near = cv2.dilate(contrast, np.ones((3, 3), np.uint8))
         contrast = self._median_along(points, near, COARSE) - middle(near[::3, ::3])
-        return contrast / max(1e-6, walk.strength * math.sqrt(walk.ridge.scale))
+        return contrast / max(1e-6, strength * math.sqrt(walk.ridge.scale))
 
     def between_edges(self, walk: Walk) -> Walk | None:
         """Return a walk along one edge of something wide moved to its middle; None if no other edge runs beside it."""
@@ -375,19 +377,17 @@ class ThreadSearch:
             high = np.maximum(0.0, tail + (AT_WALL_PX / scale - RIM_REACH_PX)).astype(int)
             box = slice(low[1], high[1]), slice(low[0], high[0])
             kept = ridge.strength[box].copy()
-        radius = (self._reach + WALL_PX) / scale
         # A ring from where the rim shows up to its outer side.
-        at = round(u * 16.0), round(v * 16.0)
+        at, radius = (round(u * 16.0), round(v * 16.0)), (self._reach + WALL_PX) / scale
         cv2.circle(ridge.strength, at, round(radius * 16.0), ridge.noise, round(2.0 * width), cv2.LINE_8, 4)
         if kept is not None:
             ridge.strength[box] = kept
 
     def _clear_shade(self, ridge: Ridge, shade: float) -> None:
         """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
-        scale = ridge.scale
         axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
-        axis = (axis - 0.5 * (scale - 1)) / scale
-        thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / scale)
+        axis = (axis - 0.5 * (ridge.scale - 1)) / ridge.scale
+        thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / ridge.scale)
         left, top = np.maximum(axis.min(axis=0) - thickness, 0.0).astype(int)
         right, bottom = np.maximum(axis.max(axis=0) + thickness, 0.0).astype(int)
         near = ridge.strength[top:bottom, left:right]
