@@ -157,14 +157,10 @@ class SlowParameters:
         # What is set counts, even where nobody would look for it.
         self._low, self._high = np.minimum(bounds[:, 0], self._start), np.maximum(bounds[:, 1], self._start)
         self._deviation = np.array([kind.deviation(thread) for kind in self.kinds])
-        if (
-            self._automatic
-        ):  # a thread that is held looks like one without stiffness: that is to be reported, not learned
+        if self._automatic:  # a thread that is held looks like one without stiffness: that is reported, not learned
             known = NORMAL_95 * self._deviation
-            self._low, self._high = (
-                np.maximum(self._low, self._start - known),
-                np.minimum(self._high, self._start + known),
-            )
+            self._low = np.maximum(self._low, self._start - known)
+            self._high = np.minimum(self._high, self._start + known)
         self.reset()
 
     def reset(self) -> None:
