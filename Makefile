@@ -32,8 +32,8 @@ demo: $(READY)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not real_time"
-	$(RUN)/python -m pytest -m real_time
+	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
+	$(RUN)/python -m pytest -m whole_graph
 
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
 coverage: $(READY)

@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
+from procedure_animation import draw_procedure
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
@@ -104,6 +105,13 @@ def hernia_animation(folder: Path) -> Path:
     return folder / "hernia" / "hernia.gif"
 
 
+def autonomous_hernia(folder: Path) -> Path:
+    """Return the hernia repair by a procedure on the whole graph, over frames of its camera."""
+    magnetosuture("simulate", "hernia_ring", "--procedure", "hernia", "--output", folder / "bag")
+    draw_procedure(folder / "bag", "hernia_ring", folder / "autonomous_hernia.gif")
+    return folder / "autonomous_hernia.gif"
+
+
 def console(folder: Path) -> Path:
     """Return the operator page of the whole graph; the example writes it to its place by itself."""
     run(ROOT / "examples" / "console_picture.py")
@@ -112,7 +120,18 @@ def console(folder: Path) -> Path:
 
 MAKERS: dict[str, Callable[[Path], Path]] = {
     maker.__name__: maker
-    for maker in (demo, report, frames, calibration, own_barrier, behaviour, hernia, hernia_animation, console)
+    for maker in (
+        demo,
+        report,
+        frames,
+        calibration,
+        own_barrier,
+        behaviour,
+        hernia,
+        hernia_animation,
+        autonomous_hernia,
+        console,
+    )
 }
 
 

@@ -232,7 +232,7 @@ class ProcedureExecutor:
             self.state, self.reason, self._unsure = ProcedureState.RUNNING, "", False  # on the path of before
         if self.state is not ProcedureState.RUNNING:
             self._rest = _Rest()
-            if not (self._unsure and thread.may_hold):
+            if self.path is None or not (self._unsure and thread.may_hold):
                 self._holder = None
                 return self._output(np.zeros(2))
             return self._hold(stamp, middle, angle, thread)

@@ -59,7 +59,6 @@ def run(scenario: Path, tmp_path_factory: pytest.TempPathFactory):
     return bag, summary, said, shares
 
 
-@pytest.mark.real_time
 def test_the_needle_follows_its_path_and_the_thread_is_predicted(run):
     _, summary, said, shares = run
     assert summary.setup == "short"
@@ -100,7 +99,6 @@ def test_the_driver_for_real_boards_drives_simulated_ones_in_the_loop(scenario: 
     assert max(abs(current) for state in following for current in state.measured_current) > 0.5
 
 
-@pytest.mark.real_time
 def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     bag = Bag(run[0])
     assert bag.damage is None
@@ -134,7 +132,6 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
     assert all(0.0 < covariance[0] < 1e-8 for covariance in covariances)
 
 
-@pytest.mark.real_time
 def test_replay_takes_the_bag(run, scenario: Path, tmp_path: Path):
     scenario.rename(scenario.with_suffix(".gone"))  # the bag must know it by itself
     try:

@@ -39,9 +39,7 @@ def name_of(kind: Any) -> str:
 
 def started(graph: Any, kind: Any, file: Path) -> Any:
     """Return a node that starts with a parameter file."""
-    return graph.add(
-        lambda context, parameter_overrides: kind(context=context, cli_args=["--ros-args", "--params-file", str(file)])
-    )
+    return graph.add(lambda context, **_: kind(context=context, cli_args=["--ros-args", "--params-file", str(file)]))
 
 
 def answer(graph: Any, future: Any) -> Any:
