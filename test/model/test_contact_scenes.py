@@ -104,7 +104,7 @@ def test_a_shape_that_appears_around_a_moving_node_pushes_it_out_or_no_margin_is
     assert all(proven[:59])
 
 
-def test_more_shapes_at_once_than_there_was_room_for():
+def test_more_shapes_at_once_than_rows_of_contacts_at_first():
     """Small discs with friction on both sides of a straight thread, many more than rows of contacts at first."""
     discs = [Disc((-1e-3 - 4.5e-4 * k, side * 4.4e-4), 4e-4) for k in range(36) for side in (-1.0, 1.0)]
     predictor = ThreadPredictor.create(
