@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
+from collections.abc import Awaitable, Callable
 from importlib.resources import files
+from weakref import WeakSet
 
 from aiohttp import web
 
@@ -70,6 +72,7 @@ class ConsoleServer:
         self._port = 0
         self._scheme = "https" if settings.certificate else "http"
         self._frame_number, self._frame = -1, b""
+        self._transports: WeakSet[asyncio.Transport] = WeakSet()
         self._runner: web.ServerRunner | None = None
         self._broadcast_task: asyncio.Task[None] | None = None
 
@@ -80,7 +83,7 @@ class ConsoleServer:
             ConfigurationError: the address cannot be bound, or the certificate not be used.
         """
         context = server_context(self._settings)
-        runner = web.ServerRunner(_Server(self._respond), shutdown_timeout=1.0)
+        runner = web.ServerRunner(_Server(self._respond, self._transports), shutdown_timeout=1.0)
         await runner.setup()
         address = self._settings.address
         try:
@@ -112,13 +115,10 @@ class ConsoleServer:
         await asyncio.gather(*(client.close() for client in list(self._clients.values())), return_exceptions=True)
         await self._requests.close()
         if self._runner is not None:
-            server = self._runner.server
-            connections = [] if server is None else server.connections
-            transports = [connection.transport for connection in connections if connection.transport is not None]
-            await self._runner.cleanup()
             # Over TLS each would wait up to 30 s for its browser to close it too.
-            for transport in transports:
+            for transport in list(self._transports):
                 transport.abort()
+            await self._runner.cleanup()
             await asyncio.sleep(0)
         self._runner = None
         if task is not None and not task.cancelled():
@@ -226,6 +226,16 @@ def _answer(status: int, text: str) -> web.Response:
 class _Connection(web.RequestHandler):
     """HTTP connection whose errors carry our headers too; what is no HTTP is answered, not logged."""
 
+    def __init__(self, server: _Server) -> None:
+        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
+        self._opened = server.transports
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Remember the transport, which aiohttp forgets before it is closed."""
+        assert isinstance(transport, asyncio.Transport)
+        self._opened.add(transport)
+        super().connection_made(transport)
+
     def handle_error(
         self,
         request: web.BaseRequest,
@@ -242,10 +252,18 @@ class _Connection(web.RequestHandler):
 
 
 class _Server(web.Server):
-    """Makes such connections."""
+    """Makes such connections; `transports` holds those that are not closed."""
+
+    def __init__(
+        self,
+        respond: Callable[[web.BaseRequest], Awaitable[web.StreamResponse]],
+        transports: WeakSet[asyncio.Transport],
+    ) -> None:
+        super().__init__(respond)
+        self.transports = transports
 
     def __call__(self) -> _Connection:
-        return _Connection(self, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
+        return _Connection(self)
 
 
 def page_files() -> dict[str, tuple[str, bytes]]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import datetime
 import ipaddress
+import selectors
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,7 +32,8 @@ class ServedConsole:
 
     def __init__(self, port: int = 0, **settings: Any) -> None:
         self.graph, self.host = RecordingGraph(), RecordingHost()
-        self.loop = asyncio.new_event_loop()
+        self._selector = selectors.DefaultSelector()
+        self.loop = asyncio.SelectorEventLoop(self._selector)
         self._thread = threading.Thread(target=self.loop.run_forever)
         self._thread.start()
         self.server = ConsoleServer(ConsoleSettings(port=port, token=TOKEN, **settings), self.graph, self.host)
@@ -52,11 +55,21 @@ class ServedConsole:
         self.run(abort())
 
     def close(self) -> None:
-        """Stop the server and its loop."""
-        self.run(self.server.stop())
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join()
-        self.loop.close()
+        """Stop the server and its loop, which has to outlast connections that a browser opens in advance."""
+        try:
+            self.run(self.server.stop())
+            self.run(self.all_closed())
+        finally:
+            self.loop.call_soon_threadsafe(self.loop.stop)
+            self._thread.join()
+            self.loop.close()
+
+    async def all_closed(self) -> None:
+        """Return once no socket is open; fail after 10 s."""
+        deadline = time.monotonic() + 10.0
+        while len(self._selector.get_map()) > 1:  # the loop's own pipe
+            assert time.monotonic() < deadline, "a connection is left open"
+            await asyncio.sleep(0.01)
 
 
 @pytest.fixture

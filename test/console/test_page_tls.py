@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import ssl
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +21,7 @@ def over_tls(certificate: tuple[Path, Path]) -> Iterator[ServedConsole]:
     console = ServedConsole(certificate=path, private_key=key)
     console.url = console.run(console.server.start())
     yield console
-    console.close()
+    console.close()  # which holds that no connection is left open
 
 
 def opened(browser: Browser, url: str) -> Page:
@@ -55,3 +57,15 @@ def test_a_browser_refuses_a_certificate_that_nobody_vouches_for(browser: Browse
     with pytest.raises(Error, match="ERR_CERT_AUTHORITY_INVALID"):
         page.goto(over_tls.url)
     page.context.close()
+
+
+@pytest.mark.parametrize("last_header", ["Connection: close", "Connection: keep-alive"])
+def test_stopping_closes_a_connection_that_the_browser_does_not_close(over_tls: ServedConsole, last_header: str):
+    port = int(over_tls.url.split(":")[2].split("/")[0])
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with socket.create_connection(("127.0.0.1", port)) as plain, context.wrap_socket(plain) as encrypted:
+        encrypted.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{last_header}\r\n\r\n".encode())
+        assert encrypted.recv(15) == b"HTTP/1.1 200 OK"
+        over_tls.run(over_tls.server.stop())
+        over_tls.run(over_tls.all_closed())
