@@ -16,6 +16,7 @@ from benchmarks.attack import command as attack
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
 from benchmarks.forecast import command as forecast
+from benchmarks.network import command as network
 from benchmarks.page import command as page
 from benchmarks.solver import command as solver
 from benchmarks.vision import command as vision
@@ -26,7 +27,7 @@ from magnetosuture_thread.cli.terminal import make_console, write_json
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
 BENCHMARKS: dict[str, Any] = {
     **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "contact": contact},
-    **{"attack": attack, "vision": vision, "estimator": estimator, "forecast": forecast},
+    **{"attack": attack, "vision": vision, "estimator": estimator, "forecast": forecast, "network": network},
 }
 
 

@@ -13,9 +13,9 @@ from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.motion_observer import MotionObserver
-from magnetosuture_thread.coils.pose_extrapolator import PoseExtrapolator
+from magnetosuture_thread.coils.pose_extrapolator import TOPIC, PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor
+from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor, StampAges
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.safety.filter import STUCK, rest_reason
@@ -110,6 +110,7 @@ class CoilBridge:
         watchdogs: command watchdogs by input, "operator" and "needle".
         extrapolator: extrapolates the needle's pose.
         prediction_monitor: monitors the thread model's margins.
+        stamp_ages: how old commands and poses are when they arrive.
         feedforward: compensates the thread's pull on the needle; None if nothing shall.
 
     Raises:
@@ -130,7 +131,7 @@ class CoilBridge:
             min_hold=self._hold,
             max_hold=settings.hold_time,
         )
-        self.prediction_monitor = PredictionMonitor(settings.prediction_timeout)
+        self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
         self.feedforward = settings.feedforward()
         self._observer = MotionObserver(settings.needle().kinematics) if settings.motion_compensation else None
         self._settings = settings
@@ -181,6 +182,7 @@ class CoilBridge:
             now: the same clock now [s].
             arrival: a monotonic clock now [s].
         """
+        self.stamp_ages.add(INPUTS[source], now - stamp, arrival)
         self.watchdogs[source].update(velocity, stamp, number, now, arrival)
 
     def on_pose(
@@ -194,6 +196,7 @@ class CoilBridge:
         covariance: Vector | None = None,
     ) -> None:
         """Register a measured needle pose; see `PoseExtrapolator.update`."""
+        self.stamp_ages.add(TOPIC, now - stamp, arrival)
         self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance)
         if self._observer is not None:
             self._observer.update(tail, heading, stamp)

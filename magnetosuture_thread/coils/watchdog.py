@@ -6,6 +6,7 @@ Pure: it reads no clock. `arrival` is a monotonic time, `now` the time of the st
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ Vector = NDArray[np.float64]
 CLOCK_TOLERANCE = 0.05  # s; clocks of two machines may differ by this much
 SILENCE_TIMEOUT = 0.5  # s; a publisher without a message for this long is gone
 MAX_GAP = 100  # consecutive messages that may get lost
+AGE_WINDOW = 5.0  # s
 SCENE_GRACE_PERIOD = 0.5  # s for which model and bridge may be on different versions of the scene during a change
 
 
@@ -46,6 +48,42 @@ def check_stamp(topic: str, stamp: float, now: float, last: float, max_age: floa
         raise InvalidInputError(field, f"{stamp - now:.3f} s ahead", f"at most {CLOCK_TOLERANCE:g} s")
     if stamp < last <= now + CLOCK_TOLERANCE:
         raise InvalidInputError(field, f"{stamp:.6f} s", f"no earlier than the last one's {last:.6f} s")
+
+
+class StampAges:
+    """Keeps how old messages were when they arrived, by topic.
+
+    The minimum age of the last seconds is the network's shortest delay plus how far the sender's clock is behind; a
+    negative one says that it is ahead, by that much at least.
+    """
+
+    def __init__(self) -> None:
+        self._ages: dict[str, deque[tuple[float, float]]] = {}
+
+    def add(self, topic: str, age: float, arrival: float) -> None:
+        """Register a message, accepted or not.
+
+        Args:
+            topic: of the message.
+            age: time of its arrival minus its stamp, by the stamps' clock [s].
+            arrival: a monotonic time [s].
+        """
+        entries = self._ages.setdefault(topic, deque())
+        while entries and entries[-1][1] >= age:  # later and less: those before will not be the minimum again
+            entries.pop()
+        entries.append((arrival, age))
+        self._drop_old(entries, arrival)
+
+    def minimum(self, arrival: float) -> dict[str, float]:
+        """Return the minimum age of each topic with a message in the last `AGE_WINDOW` before a monotonic time [s]."""
+        for entries in self._ages.values():
+            self._drop_old(entries, arrival)
+        return {topic: entries[0][1] for topic, entries in self._ages.items() if entries}
+
+    @staticmethod
+    def _drop_old(entries: deque[tuple[float, float]], arrival: float) -> None:
+        while entries and arrival - entries[0][0] > AGE_WINDOW:
+            entries.popleft()
 
 
 class PublisherCounter:

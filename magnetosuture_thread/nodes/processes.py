@@ -108,10 +108,20 @@ class NodeProcesses:
         arguments: for each, after `--ros-args`.
         environment: for each.
         logs: folder that gets a log file of each.
+        prefix: of each command, as of one that runs it on another host; it has to become the process itself.
     """
 
-    def __init__(self, names: Sequence[str], arguments: Sequence[str], environment: dict[str, str], logs: Path) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        arguments: Sequence[str],
+        environment: dict[str, str],
+        logs: Path,
+        *,
+        prefix: Sequence[str] = (),
+    ) -> None:
         self._names = names
+        self._prefix = prefix
         self._arguments = arguments
         # What a node keeps over a restart is of this run: an emergency stop of another one does not hold here.
         self._state = tempfile.TemporaryDirectory(prefix="magnetosuture_state_")
@@ -153,7 +163,7 @@ class NodeProcesses:
             arguments: besides those for all, after `--ros-args`.
         """
         program = module or f"magnetosuture_thread.nodes.{name}"
-        command = [sys.executable, "-m", program, "--ros-args", *self._arguments, *arguments]
+        command = [*self._prefix, sys.executable, "-m", program, "--ros-args", *self._arguments, *arguments]
         with (self._logs / f"{name}.log").open("wb") as log:
             self._processes[name] = subprocess.Popen(
                 command,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.watchdog import CommandWatchdog
+from magnetosuture_thread.coils.watchdog import AGE_WINDOW, CommandWatchdog, StampAges
 from magnetosuture_thread.errors import InvalidInputError
 
 TIMEOUT = 0.1
@@ -121,3 +121,14 @@ def test_two_publishers_are_a_conflict_until_one_is_silent():
         elif at > 0.72:
             watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
             assert watchdog.stale_reason(at, at) == ""
+
+
+def test_the_minimum_age_of_the_last_seconds_is_kept_for_each_topic():
+    ages = StampAges()
+    for arrival, age in ((0.0, 0.004), (1.0, 0.050), (2.0, 0.020), (3.0, 0.030)):
+        ages.add("needle/servo_cv", age, arrival)
+    ages.add("needle/measured_cp", -0.012, 3.0)
+    assert ages.minimum(3.0) == {"needle/servo_cv": 0.004, "needle/measured_cp": -0.012}
+    assert ages.minimum(0.5 + AGE_WINDOW)["needle/servo_cv"] == 0.020
+    assert ages.minimum(2.5 + AGE_WINDOW)["needle/servo_cv"] == 0.030
+    assert ages.minimum(3.5 + AGE_WINDOW) == {}

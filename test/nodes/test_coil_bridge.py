@@ -204,6 +204,28 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     drive_until(graph, lambda: driven(node), "a good command")
 
 
+@pytest.mark.parametrize("offset_ms", [-300, 300])
+def test_the_offset_of_another_hosts_clock_is_measured_and_its_commands_refused(graph, offset_ms):
+    node = armed(graph, pose_timeout=1.0)
+    diagnostics = graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
+
+    def minimum_age() -> float:
+        graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(shifted(graph.now(), offset_ms), EAST))
+        values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
+        return float(values.get("minimum age of needle/servo_cv [ms]", "nan"))
+
+    # The age has the transport in it, which on a busy machine takes its time.
+    graph.wait(lambda: -offset_ms <= minimum_age() < 250 - offset_ms, "the offset")
+    assert not driven(node)
+
+
+def shifted(stamp: Time, milliseconds: int) -> Time:
+    """Return a stamp of a clock that is ahead."""
+    nanoseconds = stamp.sec * 10**9 + stamp.nanosec + milliseconds * 10**6
+    return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+
+
 def test_currents_stay_within_their_limit_and_saturation_is_said(graph):
     node = armed(graph, max_current=0.5, max_speed=0.04, **LONG)
     states = graph.listen(topics.BRIDGE_STATE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -64,6 +65,9 @@ SCHEDULING = "scheduling"
 
 
 JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
+
+
+AGE_KEY = "minimum age of {topic} [ms]"  # of the last seconds; negative where the sender's clock is ahead
 
 
 STATE_PERIOD = 0.1  # s between two messages of an unchanged state
@@ -154,6 +158,8 @@ class CoilReport:
             self._filter.publish(MESSAGES.filter_message(stamp, output))
         jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)
         self._health.note(**{key: round(value, 3) for key, value in jitter})
+        ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
+        self._health.note(**{AGE_KEY.format(topic=topic): round(1e3 * age, 1) for topic, age in ages.items()})
         self._health.note(
             driver=system.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
         )

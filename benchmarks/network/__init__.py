@@ -1,0 +1,1 @@
+"""Two hosts, and what happens to the coils when the cable between them is pulled."""
