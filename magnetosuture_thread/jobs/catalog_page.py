@@ -11,6 +11,7 @@ from typing import Any
 
 from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.catalog.query import query_catalog
+from magnetosuture_thread.catalog.series import COLUMNS, COUNTS
 from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
 from magnetosuture_thread.files import parse_location
 from magnetosuture_thread.jobs.evaluate import name_of
@@ -21,6 +22,7 @@ ADDRESS = "127.0.0.1"
 PACKAGE = "magnetosuture_thread.catalog"
 POLICY = "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; connect-src 'self'; base-uri 'none'"
 BAGS = "SELECT * FROM bags ORDER BY path"
+SECONDS = "SELECT * EXCLUDE (path) FROM seconds WHERE path = ? ORDER BY second"
 
 Log = Callable[[str], None]
 
@@ -42,7 +44,8 @@ def make_page_server(file: Path, port: int, log: Log = lambda text: None) -> Thr
     texts = {
         "/": ("text/html", page),
         "/page.js": ("text/javascript", read_source(PACKAGE, "page.js")),
-        "/bags.json": ("application/json", json.dumps({"columns": columns, "rows": rows}, allow_nan=False)),
+        "/bags.json": ("application/json", _table(columns, rows)),
+        "/series.json": ("application/json", json.dumps([*COLUMNS, *COUNTS])),
     }
     paths = [str(row[columns.index("path")]) for row in rows]
     one_at_a_time = threading.Lock()
@@ -55,16 +58,19 @@ def make_page_server(file: Path, port: int, log: Log = lambda text: None) -> Thr
                 self._answer(403, "text/plain", "for a browser on this machine only")
             elif self.path in texts:
                 self._answer(200, *texts[self.path], policy=POLICY)
-            elif (path := self._bag()) is not None:
+            elif (path := self._bag("/report/")) is not None:
                 with one_at_a_time:
                     self._answer(*_report(path, log))
+            elif (path := self._bag("/seconds/", ".json")) is not None:
+                self._answer(200, "application/json", _table(*query_catalog(file, SECONDS, [path])))
             else:
                 self._answer(404, "text/plain", "no such page")
 
-        def _bag(self) -> str | None:
-            number = self.path.removeprefix("/report/")
-            is_bag = number != self.path and number.isascii() and number.isdigit() and int(number) < len(paths)
-            return paths[int(number)] if is_bag else None
+        def _bag(self, before: str, after: str = "") -> str | None:
+            """Return the path of the bag whose number is in the request's path, if one is."""
+            number = self.path[len(before) : len(self.path) - len(after)]
+            is_number = self.path == before + number + after and number.isascii() and number.isdigit()
+            return paths[int(number)] if is_number and len(number) < 10 and int(number) < len(paths) else None
 
         def _answer(self, code: int, kind: str, text: str, policy: str = "") -> None:
             body = text.encode()
@@ -82,6 +88,10 @@ def make_page_server(file: Path, port: int, log: Log = lambda text: None) -> Thr
 
     server = ThreadingHTTPServer((ADDRESS, port), Handler)
     return server
+
+
+def _table(columns: list[str], rows: list[tuple[Any, ...]]) -> str:
+    return json.dumps({"columns": columns, "rows": rows}, allow_nan=False)
 
 
 def _report(path: str, log: Log) -> tuple[int, str, str]:
