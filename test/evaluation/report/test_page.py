@@ -373,7 +373,10 @@ def test_the_forces_are_drawn_and_their_greatest_stated():
     assert [peaks, pulls] == pytest.approx([1e6 * peak, 5.0], rel=1e-3)  # in uN
     (headline,) = [each for each in headlines(ABOUT, figures) if each.name == "peak tension"]
     assert headline.value == f"{1e6 * peak:.0f} µN"
-    assert "Forces in the thread" in made_page()
+    sentence = "The pull differs from the ground truth by 2.5 % of its peak"
+    assert "Forces in the thread" in (page := made_page())
+    assert sentence[:40] not in page
+    assert sentence in write_page(ABOUT, metrics, replace(figures, pull_error=2.5), [])
     nothing = replace(figures, tension=math.nan, pull=math.nan)
     assert "none" in {each.value for each in headlines(ABOUT, nothing) if each.name == "peak tension"}
 
