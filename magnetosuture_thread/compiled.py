@@ -17,12 +17,17 @@ COMPILED_MARK = b"magnetosuture_thread.compiled"
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+# Said of every function, as numba takes it over from whatever calls one first where it is not said.
+_COUNTED: dict[str, Any] = {"_nrt": True}
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+
+
 def compiled(function: _Function) -> _Function:
     """Compile a function with numba at its first call, with numpy's rules for division by zero.
 
     The result is cached beside the source file, so that only the first start of a node on a machine compiles.
     """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_COUNTED)(function))
 
 
 def compiled_inline(function: _Function) -> _Function:
@@ -32,8 +37,16 @@ def compiled_inline(function: _Function) -> _Function:
     array of a tuple is counted twice a call, by atomic operations, which took six times as long as the contacts that
     were looked for. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
     """
-    options: dict[str, Any] = {"forceinline": True, "_nrt": False}
-    return cast(_Function, numba.njit(error_model="numpy", **options)(function))
+    return cast(_Function, numba.njit(error_model="numpy", forceinline=True, **_UNCOUNTED)(function))
+
+
+def compiled_uncounted(function: _Function) -> _Function:
+    """Compile a function as `compiled` does, without counting references to arrays; see `compiled_inline`.
+
+    For kernels of which a step calls dozens with tuples of arrays. They may neither make arrays, which numba refuses,
+    nor return any, whose references nobody would have counted.
+    """
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_UNCOUNTED)(function))
 
 
 def compiled_without_gil(function: _Function) -> _Function:
@@ -41,7 +54,7 @@ def compiled_without_gil(function: _Function) -> _Function:
 
     For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
     """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True)(function))
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
 
 
 def delete_stale_cache(package: Path = PACKAGE) -> bool:

@@ -204,6 +204,11 @@ GROUND_TRUTH_NEEDLE = Channel(
     "simulated ground truth of the needle",
 )
 GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "simulated ground truth of the thread")
+GROUND_TRUTH_PULL = Channel(
+    "ground_truth/thread_pull",
+    "geometry_msgs/msg/WrenchStamped",
+    "simulated ground truth of what the thread exerts on the needle at its tail, in the frame of the dish",
+)
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 

@@ -17,6 +17,7 @@ from magnetosuture_thread.interface import (
     ESTIMATED_THREAD,
     FILTER_STATE,
     GROUND_TRUTH_NEEDLE,
+    GROUND_TRUTH_PULL,
     GROUND_TRUTH_THREAD,
     MARGINS,
     MEASURED_THREAD,
@@ -41,7 +42,7 @@ from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 
 OF_CAMERA = (COMPRESSED_IMAGE, CAMERA_INFO)
-GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD)
+GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
 OF_TRACKER = (NEEDLE_POSE, THREAD_OBSERVATION, MEASURED_THREAD)
 OF_MODEL = (PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS)
 OF_BRIDGE = (NEEDLE_COMMAND, CURRENTS, FILTER_STATE)
@@ -93,6 +94,8 @@ class RunBag:
         placed = MESSAGES.placed(stamp, frame.tail, frame.heading)
         self._bag.write_message(GROUND_TRUTH_NEEDLE.recorded, stamp, placed)
         self._bag.write(GROUND_TRUTH_THREAD.recorded, stamp, packed_path(time_of(stamp), frame.thread))
+        pull = MESSAGES.wrench_message(stamp, frame.pull, frame.moment)
+        self._bag.write_message(GROUND_TRUTH_PULL.recorded, stamp, pull)
 
     def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
         """Write what was measured, predicted and estimated in a frame, and the command that came of it."""

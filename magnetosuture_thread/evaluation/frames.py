@@ -1,4 +1,4 @@
-"""Frames of a run, measured and predicted, and what is kept of them: columns, error along the thread, worst frames."""
+"""Frames of a run, measured and predicted, and what is kept of them: columns, worst frames."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,6 @@ from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]
 
-MAP_GAP = 3.0  # times the usual interval; the error map is empty where nothing came for longer
-MAP_COLUMNS = 300
 WORST_FRAMES, WORST_ESTIMATES = 5, 2
 MIN_DISTANCE = 1.0  # s; between two of the worst frames
 MARGIN = "margin_"  # columns of margins, by the barrier's name
@@ -42,6 +39,7 @@ class Observation:
         heading: unit vector from tail to tip, shape (2,); shape (0,) where the needle was not found.
         measured: the thread's centreline, from the tail on, shape (m, 2) [m]; m = 0 for none.
         ground_truth: of the thread, if the bag holds it, shape (m, 2) [m].
+        true_pull: of the thread upon the needle, if the bag holds it, shape (2,) [N]; shape (0,) if not.
         reason: why the needle was not found.
         processing: time that the tracker took for the frame [s]; nan where the poses were recorded.
         observation: what is seen of the thread; None where a bag holds the centreline alone.
@@ -57,6 +55,7 @@ class Observation:
     processing: float = math.nan
     observation: ThreadObservation | None = None
     deviation: tuple[float, float] = (0.0, 0.0)
+    true_pull: Array = field(default_factory=lambda: np.empty(0))
 
     @property
     def found(self) -> bool:
@@ -103,7 +102,8 @@ class FrameResult:
         residual: of the solves.
         step_time: of the model [s].
         tension: greatest tension of a segment [N]; nan where no force is known.
-        pull: of the thread upon the needle, magnitude [N]; nan where no force is known.
+        pull: of the thread upon the needle, shape (2,) [N]; shape (0,) where no force is known.
+        true_pull: the same by the ground truth, shape (2,) [N]; shape (0,) where the bag does not hold it.
         margins: None if they prove nothing.
         in_contact: whether the thread touches an obstacle or the wall.
         measured: the thread's centreline, shape (m, 2) [m].
@@ -123,7 +123,7 @@ class FrameResult:
     residual: float = math.nan
     step_time: float = math.nan
     tension: float = math.nan
-    pull: float = math.nan
+    pull: Array = field(default_factory=lambda: np.empty(0))
     margins: Margins | None = None
     in_contact: bool = False
     measured: Points = field(default_factory=_no_points)
@@ -135,6 +135,7 @@ class FrameResult:
     errors: dict[str, float] = field(default_factory=dict)
     estimate: EstimatedThread | None = None
     observation: ThreadObservation | None = None
+    true_pull: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def of(
@@ -174,7 +175,7 @@ class FrameResult:
             prediction.residual,
             step_time,
             math.nan if forces is None else forces.peak_tension,
-            math.nan if forces is None else math.hypot(*forces.needle_force),
+            np.empty(0) if forces is None else np.asarray(forces.needle_force),
             margins,
             margins is not None and bool(margins.in_contact),
             observation.measured,
@@ -185,6 +186,7 @@ class FrameResult:
             recorded,
             estimate=kept,
             observation=observation.observation,
+            true_pull=observation.true_pull,
         )
 
     def target_curve(self, target: str) -> Points:
@@ -194,7 +196,8 @@ class FrameResult:
     def columns(self) -> dict[str, float]:
         """Return the figures of the frame that need no other curve, by their columns' names."""
         row = {"strain": self.strain, "residual": self.residual, "step_time": self.step_time}
-        row |= {"tension": self.tension, "pull": self.pull}
+        row["tension"] = self.tension
+        row |= {name: math.hypot(*force) for name, force in self._pulls().items() if len(force) == 2}
         if self.margins is not None:
             row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in self.margins.minima}
         if self.estimate is not None:
@@ -202,6 +205,15 @@ class FrameResult:
             row |= {"corrected": float(self.estimate.corrected), "innovations": len(known)}
             row["innovation_squared"] = float(known.mean()) if len(known) else math.nan
         return row
+
+    def _pulls(self) -> dict[str, Array]:
+        """Return pull, true pull and how far they are apart, by their columns' names; those without length are none."""
+        both = len(self.pull) == len(self.true_pull)
+        return {
+            "pull": self.pull,
+            "true_pull": self.true_pull,
+            "pull_error": self.pull - self.true_pull if both else np.empty(0),
+        }
 
     @property
     def clearance(self) -> Array:
@@ -274,71 +286,6 @@ class TimeSeries:
     def has(self, name: str) -> bool:
         """Return whether a column holds any number."""
         return bool(np.isfinite(self.column(name)).any())
-
-
-class ErrorGrid(NamedTuple):
-    """The greatest error by time and arc length.
-
-    Attributes:
-        times: of each column [s].
-        lengths: arc length of each row, from the needle's tail on [m].
-        errors: shape (rows, columns) [% of the thread's length]; nan where nothing is known.
-    """
-
-    times: Array
-    lengths: Array
-    errors: Array
-
-
-class ErrorMap:
-    """Accumulates the error along the thread: when it is full, neighbouring columns become one, with the greater error.
-
-    Args:
-        length: of the thread [m].
-        columns: of the map.
-    """
-
-    def __init__(self, length: float, columns: int = MAP_COLUMNS) -> None:
-        self._length = length
-        self._limit = 2 * columns
-        self._frames = 1  # of a column
-        self._filled = 0  # frames in the last column
-        self._times: list[float] = []
-        self._columns: list[Array] = []
-
-    def add(self, time: float, errors: Array) -> None:
-        """Add the errors of one frame's nodes, in % of the length."""
-        if not np.isfinite(errors).any():
-            return
-        if self._columns and self._filled < self._frames:
-            self._columns[-1] = np.fmax(self._columns[-1], errors)
-            self._filled += 1
-            return
-        if len(self._columns) == self._limit:
-            self._columns = [np.fmax(a, b) for a, b in zip(self._columns[::2], self._columns[1::2], strict=True)]
-            self._times = self._times[::2]
-            self._frames *= 2
-        self._times.append(time)
-        self._columns.append(errors)
-        self._filled = 1
-
-    def grid(self) -> ErrorGrid | None:
-        """Return the map, an empty column in each long gap; None if there is nothing."""
-        if not self._columns:
-            return None
-        times, errors = np.array(self._times), np.column_stack(self._columns)
-        rows = errors.shape[0]
-        lengths = self._length * np.arange(1, rows + 1) / rows
-        if len(times) > 2:
-            steps = np.diff(times)
-            usual = float(np.median(steps))
-            gaps = np.flatnonzero(steps > MAP_GAP * usual) + 1
-            # A column just after the gap's beginning and one just before its end: both are empty.
-            times = np.insert(
-                times, np.repeat(gaps, 2), np.column_stack([times[gaps - 1] + usual, times[gaps] - usual]).ravel()
-            )
-            errors = np.insert(errors, np.repeat(gaps, 2), np.nan, axis=1)
-        return ErrorGrid(times, lengths, errors)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ OF_FRAMES = {
         interface.ESTIMATED_THREAD,
         interface.MARGINS,
         interface.GROUND_TRUTH_THREAD,
+        interface.GROUND_TRUTH_PULL,
     )
 }
 
@@ -70,13 +71,14 @@ class GraphCollector:
         stamp = nanoseconds(message.header.stamp)
         frame = self._frames.setdefault(stamp, FrameResult(stamp))
         if topic == interface.NEEDLE_POSE.recorded:
-            x, y, frame.heading = planar_pose(message.pose.pose)
-            frame.tail = np.array([x, y])
-            self.poses += 1
+            *tail, frame.heading = planar_pose(message.pose.pose)
+            frame.tail, self.poses = np.array(tail), self.poses + 1
         elif topic == interface.MEASURED_THREAD.recorded:
             frame.measured = _path(message)
         elif topic == interface.GROUND_TRUTH_THREAD.recorded:
             frame.ground_truth = _path(message)
+        elif topic == interface.GROUND_TRUTH_PULL.recorded:
+            frame.true_pull = _in_plane(message.wrench.force)
         elif topic == interface.THREAD_OBSERVATION.recorded:
             frame.observation = _observation(message)
         elif topic == interface.ESTIMATED_THREAD.recorded:
@@ -86,8 +88,7 @@ class GraphCollector:
             frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
             frame.residual, frame.step_time = message.residual, message.step_time
             if len(tension := getattr(message, "tension", ())):  # older bags have none
-                frame.tension, pull = float(np.max(tension)), message.needle_force
-                frame.pull = float(np.hypot(pull.x, pull.y))
+                frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
         elif message.valid:
             frame.margins = margins_of(message)
             frame.in_contact = bool(frame.margins.in_contact)
@@ -109,6 +110,10 @@ class GraphCollector:
             metrics.add(frame)
         metrics.compare()
         return metrics
+
+
+def _in_plane(vector: Any) -> Array:
+    return np.array([vector.x, vector.y])
 
 
 def _path(message: Any) -> Points:

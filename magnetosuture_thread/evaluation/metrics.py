@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.evaluation import pull
+from magnetosuture_thread.evaluation.error_map import ErrorMap
 from magnetosuture_thread.evaluation.estimation import (
     ESTIMATE_COLUMNS,
     DisturbanceLog,
@@ -23,7 +25,6 @@ from magnetosuture_thread.evaluation.frames import (
     MIN_DISTANCE,
     WORST_ESTIMATES,
     Array,
-    ErrorMap,
     FrameResult,
     Observation,
     TimeSeries,
@@ -241,7 +242,7 @@ class RunMetrics:
         errors = [f"error_{target}" for target in self.targets]
         of_bag = [f"recorded_{name}" for name in errors] if recorded else []
         margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
-        others = ["strain", "residual", "step_time", "tension", "pull", "seen_share", *ESTIMATE_COLUMNS]
+        others = ["strain", "residual", "step_time", "tension", *pull.COLUMNS, "seen_share", *ESTIMATE_COLUMNS]
         of_estimate = [f"{kind}_{name}" for kind in ("estimate", "max_node", "max_node_estimate") for name in errors]
         self._series = TimeSeries([*errors, *of_estimate, *of_bag, *margins, *others])
         self.observed = TimeSeries(["processing"])

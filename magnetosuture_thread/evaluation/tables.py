@@ -64,14 +64,14 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
             found = errors.get(target) or {}
             row[f"{prefix}_{target}_frames"] = found.get("count", 0)
             row |= {f"{prefix}_{target}_{short}_percent": found.get(name) for name, short in ERRORS.items()}
-    row |= {kind: dict(errors) for kind, errors in figures.compared.items()}
-    row |= figures.estimation.to_json()
+    row |= {kind: dict(errors) for kind, errors in figures.compared.items()} | figures.estimation.to_json()
     row |= {
         "seen_share": figures.measured_share,
         "stretch_max": figures.strain,
         "residual_max": figures.residual,
         "tension_max_n": figures.tension,
         "needle_pull_max_n": figures.pull,
+        "needle_pull_error_percent": figures.pull_error,
         "contact_frames": figures.contact_frames,
     }
     for barrier in BUILT_IN:
@@ -89,8 +89,8 @@ def row_of(about: BagDetails, figures: BagFigures) -> Row:
 def failed_row(name: str, path: str, problem: str) -> Row:
     """Return the row of a bag that could not be evaluated."""
     row: Row = {key: dict.fromkeys(value) if isinstance(value, dict) else None for key, value in _EMPTY.items()}
-    words = ("setup", "simulated", "source", "formulation", "damage", "unverified")
-    return row | dict.fromkeys(words, "") | {"bag": name, "path": path, "problem": problem}
+    row |= dict.fromkeys(("setup", "simulated", "source", "formulation", "damage", "unverified"), "")
+    return row | {"bag": name, "path": path, "problem": problem}
 
 
 def _percentiles(name: str, found: Percentiles | None) -> Row:

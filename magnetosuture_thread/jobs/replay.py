@@ -19,6 +19,7 @@ from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,
     CURRENTS,
+    GROUND_TRUTH_PULL,
     GROUND_TRUTH_THREAD,
     MEASURED_THREAD,
     NEEDLE_COMMAND,
@@ -260,7 +261,8 @@ class _Replay:
         given = self.given
         collector = GraphCollector(given.setup.model.thread_length)
         recorded, replayed = CurrentSeries(), CurrentSeries()
-        expected = [c for c in (GROUND_TRUTH_THREAD, CURRENTS) if given.recording.counts.get(c.recorded)]
+        truth = GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL
+        expected = [c for c in (*truth, CURRENTS) if given.recording.counts.get(c.recorded)]
         for record in given.recording.records(expected, start=given.start, duration=given.duration):
             if record.topic == CURRENTS.recorded:
                 recorded.add(record.decode())

@@ -23,7 +23,14 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
 from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.interface import DISH_FRAME, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_COMMAND, SCENE
+from magnetosuture_thread.interface import (
+    DISH_FRAME,
+    GROUND_TRUTH_PULL,
+    GROUND_TRUTH_THREAD,
+    MEASURED_THREAD,
+    NEEDLE_COMMAND,
+    SCENE,
+)
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.offline.observations import pixels
 from magnetosuture_thread.offline.predictions import chosen_source
@@ -126,7 +133,7 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     source = chosen_source(recording, selection.get("source", "auto"))
-    for channel in (MEASURED_THREAD, NEEDLE_COMMAND, GROUND_TRUTH_THREAD):
+    for channel in (MEASURED_THREAD, NEEDLE_COMMAND, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL):
         if channel.recorded in recording.unfit:
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start

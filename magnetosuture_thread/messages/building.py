@@ -22,6 +22,7 @@ from magnetosuture_thread.interface import (
     CURRENTS,
     DISH_FRAME,
     FILTER_STATE,
+    GROUND_TRUTH_PULL,
     IMAGE,
     MEASURED_THREAD,
     NEEDLE_COMMAND,
@@ -187,6 +188,11 @@ class MessageBuilder:
     def twist_message(self, stamp: Any, velocity: Vector) -> Any:
         """Return a velocity of shape (2,) [m/s] as a TwistStamped."""
         return self.twist_stamped(self.header(stamp), self.twist(self.vector(*velocity), self.vector(0.0, 0.0)))
+
+    def wrench_message(self, stamp: Any, force: Vector, moment: float) -> Any:
+        """Return a WrenchStamped of a force in the dish plane, shape (2,) [N], and a counter-clockwise moment [N m]."""
+        wrench = self.make("geometry_msgs/msg/Wrench", force=self.vector(*force), torque=self.vector(0.0, 0.0, moment))
+        return self.make(GROUND_TRUTH_PULL.type_name, header=self.header(stamp), wrench=wrench)
 
     def tracker_state(self, stamp: Any, track: Track, processing_time: float = 0.0) -> Any:
         """Return what the tracker makes of a frame.

@@ -329,6 +329,21 @@ def read_path(record: SerializedMessage) -> Points:
     return path_points(record.decode(), record.topic) if found is None else found
 
 
+def read_force(record: SerializedMessage) -> NDArray[np.float64]:
+    """Return the force in the dish plane of a recorded wrench, shape (2,) [N].
+
+    Raises:
+        BagError: it cannot be decoded.
+        InvalidInputError: it is of another frame, or not finite.
+    """
+    message = record.decode()
+    require_dish_frame(message.header.frame_id, record.topic)
+    force = np.array([message.wrench.force.x, message.wrench.force.y])
+    if not np.isfinite(force).all():
+        raise InvalidInputError(record.topic, force.tolist(), "a finite force")
+    return force
+
+
 def read_observation(record: SerializedMessage) -> ThreadObservation:
     """Return a recorded observation of the thread.
 

@@ -18,7 +18,7 @@ from magnetosuture_thread.barrier import (
     BarrierRows,
     CompiledBarrier,
 )
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, wall_contact
 from magnetosuture_thread.geometry.polyline import Points
@@ -95,7 +95,7 @@ class Compression(CompiledBarrier):
         return _distance_rows(positions, 1, self.segment_length, self.name, -1.0)
 
 
-@compiled
+@compiled_uncounted
 def distance_barrier(
     positions: Points,
     apart: int,
@@ -262,7 +262,7 @@ class WallAvoidance(_ContactBarrier):
     name = WALL
 
 
-@compiled
+@compiled_uncounted
 def moved_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> float:
     """Move each free node that is outside of a circle about the origin onto it, radially; return the longest way.
 

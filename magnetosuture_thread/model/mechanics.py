@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
@@ -23,7 +23,7 @@ CLAMP_CORRECTION = 1.5  # the same in the first segment of a clamped thread
 SHARPEST = 1.0  # rad^2; a sharper turn at a node is a kink between straight segments, and no arc
 
 
-@compiled
+@compiled_uncounted
 def metric(
     positions: Points,
     weights: NDArray[np.float64],
@@ -124,7 +124,7 @@ def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
     return bands
 
 
-@compiled
+@compiled_uncounted
 def bending_gradient(
     positions: Points, heading: Points, clamped: bool, rest_angles: NDArray[np.float64], work: Points, gradient: Points
 ) -> None:
@@ -168,7 +168,7 @@ def bending_gradient(
             gradient[i + 1, a] += moment[i, a]
 
 
-@compiled
+@compiled_uncounted
 def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> None:
     """Take the rest curvature at a node from its deviation: in the plane to the left, in space as it bends."""
     dimension = positions.shape[1]
@@ -188,7 +188,7 @@ def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> Non
             deviation[i, a] -= abs(turn) * deviation[i, a] / size
 
 
-@compiled
+@compiled_uncounted
 def chord_lengths(positions: Points, heading: Points, clamped: bool, chords: NDArray[np.float64]) -> None:
     """Write the length of the chord between the ends of each segment, whose arc is 1 long, shape (n,).
 
@@ -212,7 +212,7 @@ def chord_lengths(positions: Points, heading: Points, clamped: bool, chords: NDA
             chords[i - 1] -= share
 
 
-@compiled
+@compiled_uncounted
 def tension_stiffness(
     positions: Points,
     heading: Points,
@@ -266,7 +266,7 @@ def tension_stiffness(
             couplings[1, i - 1] += near * far * weight
 
 
-@compiled
+@compiled_inline
 def _resolved(square: float) -> tuple[float, float]:
     """Return the part of a squared turn that a chord is corrected for, and its slope.
 
@@ -280,7 +280,7 @@ def _resolved(square: float) -> tuple[float, float]:
     return square * (1.0 - share * share), max(0.0, 1.0 - 3.0 * share * share)
 
 
-@compiled
+@compiled_inline
 def _turn(positions: Points, heading: Points, i: int, a: int) -> float:
     """Return a coordinate of c_i; c_0 is that of a clamped thread."""
     if i == 0:

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -181,8 +181,15 @@ def compiled_residuals(
 
     Shares nothing with a solver, so P u is written out here once more.
     """
+    return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
+
+
+@compiled_uncounted
+def _residuals(
+    program: ChainProgram, velocities: NDArray[np.float64], multipliers: Vector, force: Points, pulled: Points
+) -> tuple[float, float, float]:
+    """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
-    force = np.empty((nodes, dimension))
     largest = 1.0
     for i in range(nodes):
         for k in range(dimension):
@@ -196,7 +203,6 @@ def compiled_residuals(
                     value += program.couplings[apart - 1, i] * velocities[i + apart, k]
             largest = max(largest, abs(value), abs(program.linear[i, k]))
             force[i, k] = value + program.linear[i, k]
-    pulled = np.zeros((nodes, dimension))
     primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
     finite = True
     for r in range(len(program.lower)):

@@ -13,12 +13,13 @@ import numpy as np
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
-from magnetosuture_thread.evaluation.frames import Observation
+from magnetosuture_thread.evaluation.frames import Array, Observation
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    GROUND_TRUTH_PULL,
     GROUND_TRUTH_THREAD,
     MEASURED_THREAD,
     NEEDLE_POSE,
@@ -26,7 +27,14 @@ from magnetosuture_thread.interface import (
     THREAD_OBSERVATION,
     Channel,
 )
-from magnetosuture_thread.messages.reading import pose_deviation, read_observation, read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.reading import (
+    pose_deviation,
+    read_force,
+    read_observation,
+    read_path,
+    read_pose,
+    stamp_of,
+)
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.offline.changes import CHANGING
@@ -48,8 +56,8 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
 Progress = Callable[[float], None]
 _CHANGING = {channel.recorded for channel in CHANGING}
 _TRUE, _SEEN = GROUND_TRUTH_THREAD.recorded, MEASURED_THREAD.recorded
-_OBSERVED = THREAD_OBSERVATION.recorded
-_NOTHING = np.empty((0, 2))
+_OBSERVED, _PULL = THREAD_OBSERVATION.recorded, GROUND_TRUTH_PULL.recorded
+_NOTHING, _NO_FORCE = np.empty((0, 2)), np.empty(0)
 
 
 class ObservationReader(Iterator[Observation]):
@@ -94,14 +102,14 @@ class ObservationReader(Iterator[Observation]):
             if source == "camera"
             else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
         )
-        given = (GROUND_TRUTH_THREAD, *CHANGING, *sources)
+        given = (GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, *CHANGING, *sources)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
         records = recording.records(channels, start=start, duration=duration)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
         self._changes = [record for record in earlier if record.time < begin]
         for record in self._changes:
             self._follow(record)
-        awaited = {GROUND_TRUTH_THREAD, MEASURED_THREAD, THREAD_OBSERVATION} & set(channels)
+        awaited = {GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, MEASURED_THREAD, THREAD_OBSERVATION} & set(channels)
         self._going = self._go(_telling(records, begin, whole, progress), awaited)
 
     def __next__(self) -> Observation:
@@ -186,6 +194,8 @@ class ObservationReader(Iterator[Observation]):
             self.on_record(stamp, record)
         if record.topic == _OBSERVED:
             known[stamp] = self._observed(record)
+        elif record.topic == _PULL:
+            known[stamp] = self._pull(record)
         else:
             known[stamp] = self._path(record)
         if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
@@ -201,6 +211,13 @@ class ObservationReader(Iterator[Observation]):
         for piece in observation.pieces:
             self._check_place(record.topic, piece.points)
         return observation
+
+    def _pull(self, record: RecordedMessage) -> Array:
+        try:
+            return read_force(record)
+        except InvalidInputError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
+            return _NO_FORCE
 
     def _path(self, record: RecordedMessage) -> Points:
         try:
@@ -220,12 +237,13 @@ class ObservationReader(Iterator[Observation]):
     def _whole(self, observation: Observation, parts: dict[str, dict[int, Any]]) -> Observation:
         truth = parts.get(_TRUE, {}).get(observation.stamp, _NOTHING)
         seen = parts.get(_SEEN, {}).get(observation.stamp, _NOTHING)
+        pull = parts.get(_PULL, {}).get(observation.stamp, _NO_FORCE)
         if self.source != "poses":
-            return replace(observation, ground_truth=truth) if len(truth) else observation
+            return replace(observation, ground_truth=truth, true_pull=pull)
         observed = observation.observation
         if _OBSERVED in parts:  # As live, the centreline alone tells nothing where observations come.
             observed = parts[_OBSERVED].get(observation.stamp, ThreadObservation())
-        return replace(observation, measured=seen, ground_truth=truth, observation=observed)
+        return replace(observation, measured=seen, ground_truth=truth, true_pull=pull, observation=observed)
 
     def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""

@@ -32,6 +32,8 @@ class RigFrame:
         tail: the needle's true tail, shape (2,) [m].
         heading: its true angle at the tail [rad].
         thread: the thread's true centreline from the tail on, shape (n + 1, 2) [m].
+        pull: force of the thread upon the needle at its tail, shape (2,) [N].
+        moment: of the thread upon the needle about its tail, counter-clockwise [N m].
     """
 
     time: float
@@ -40,6 +42,8 @@ class RigFrame:
     tail: Vector
     heading: float
     thread: Vector
+    pull: Vector
+    moment: float
 
 
 class Rig:
@@ -237,4 +241,5 @@ class Rig:
         if not faults.drops(running, float(self._random.uniform())) and rendered:
             covers = faults.covers(running, tail, dynamics.tip + away)
             image = self.camera.render(tail, dynamics.heading, thread, covers, faults.gain(running))
-        return RigFrame(self.time, image, faults.lateness(running), tail, dynamics.heading, thread)
+        truth = tail, dynamics.heading, thread, dynamics.thread_pull, dynamics.thread_moment
+        return RigFrame(self.time, image, faults.lateness(running), *truth)

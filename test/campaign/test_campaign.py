@@ -15,6 +15,7 @@ from magnetosuture_thread.campaign.run import RunResult, run_procedure
 from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.cli.main import main
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.jobs.evaluate import evaluate_bags
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
 from magnetosuture_thread.setups import Setup, read_setup
 
@@ -127,6 +128,11 @@ def test_files_and_bags_do_not_depend_on_the_number_of_processes(
     replayed = ["replay", "--offline", str(bag.path), "--duration", "2", "--output", str(tmp_path / "replayed")]
     assert main(replayed) == 0
     assert "estimate error, mean" in capsys.readouterr().out
+    assert counts["thread_pull"] == counts["needle"]
+    (row,) = evaluate_bags([bag.path], tmp_path / "evaluated", duration=4.0)
+    assert row["needle_pull_error_percent"] > 0.0
+    figures = json.loads((tmp_path / "evaluated" / "table.json").read_text())["bags"]
+    assert figures[0]["needle_pull_error_percent"] == row["needle_pull_error_percent"]
 
 
 def test_a_bag_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.evaluation.frames import ErrorMap
+from magnetosuture_thread.evaluation.error_map import ErrorMap
 
 LENGTH = 0.019
 

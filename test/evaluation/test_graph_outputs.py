@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 from types import SimpleNamespace as Message
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures, stage_latencies
+from magnetosuture_thread.evaluation.pull import pull_error_percent
 from magnetosuture_thread.evaluation.tables import summary_table
 
 
@@ -82,6 +84,21 @@ def test_messages_of_one_stamp_are_put_together():
         ("connectivity", 1e-9, 1, -1, 0.0),
         ("obstacle", -0.1, 3, 0, 1.0),
     ]
+
+
+def test_the_pull_is_compared_with_the_ground_truth_in_percent_of_its_peak():
+    collector = GraphCollector(length=1.0)
+    for k, (pull, true) in enumerate([((3.0, 4.0), (0.0, 0.0)), ((0.0, 10.0), (0.0, 10.0)), ((1.0, 0.0), None)], 1):
+        predicted = prediction(k * 10**9, STRAIGHT)
+        predicted.tension, predicted.needle_force = [1.0], Message(x=pull[0], y=pull[1])
+        collector.add("/thread/predicted", predicted)
+        if true is not None:
+            wrench = Message(force=Message(x=true[0], y=true[1]))
+            collector.add("/ground_truth/thread_pull", Message(header=header(k * 10**9), wrench=wrench))
+    series = collector.metrics(start=10**9).series
+    assert series.column("pull_error") == pytest.approx([5.0, 0.0, math.nan], nan_ok=True)
+    assert pull_error_percent(series) == pytest.approx(100.0 * math.sqrt(25.0 / 2.0) / 10.0)
+    assert math.isnan(pull_error_percent(GraphCollector(length=1.0).metrics().series))
 
 
 def estimate(nanoseconds: int, points: np.ndarray, degrees: int) -> Message:

@@ -109,6 +109,7 @@ def test_the_bag_holds_everything_and_says_that_it_is_simulated(run):
         "/camera/camera_info",
         "/ground_truth/needle",
         "/ground_truth/thread",
+        "/ground_truth/thread_pull",
         "/needle/measured_cp",
         "/needle/tracker_state",
         "/needle/servo_cv",

@@ -127,7 +127,7 @@ def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments
     rig = RigDynamics(body, properties, Surface(), None, (0.0, 0.0), 0.0, path, largest_step=5e-3)
     predictor = ThreadPredictor(thread)
     predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)), path)
-    here, pulls, expected, random = np.zeros(2), [], [], np.random.default_rng(3)
+    here, pulls, expected, moments, random = np.zeros(2), [], [], [], np.random.default_rng(3)
     for k in range(1, 200):
         heading = 1.2 * math.sin(1.1 * k / RATE) + jitter * random.standard_normal()
         ahead = np.array([math.cos(heading), math.sin(heading)])
@@ -137,5 +137,9 @@ def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments
         assert forces is not None
         pulls.append(forces.needle_force)
         expected.append(rig.thread_pull)
+        moments.append((forces.needle_moment, rig.thread_moment))
     off = np.linalg.norm(np.array(pulls) - expected, axis=1)[10:]
     assert math.sqrt(float(np.mean(off**2))) < bound * float(np.linalg.norm(expected, axis=1).max())
+    model, true = np.array(moments)[10:].T
+    assert math.sqrt(float(np.mean((model - true) ** 2))) <= bound * float(np.abs(true).max())
+    assert (attachment == "clamped") == bool(np.abs(true).max() > 0.0)

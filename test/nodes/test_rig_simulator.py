@@ -42,18 +42,24 @@ def nanoseconds(stamp) -> int:
 
 def test_frames_come_with_their_truth_and_the_camera(graph):
     frames, infos = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.CAMERA_INFO)
-    needles, threads = graph.listen_later(topics.GROUND_TRUTH_NEEDLE), graph.listen_later(topics.GROUND_TRUTH_THREAD)
-    graph.add(RigSimulatorNode, **SMALL)
-    graph.wait(lambda: min(len(frames), len(infos), len(needles), len(threads)) > 3, "frames and truth")
+    needles, threads, pulls = (graph.listen_later(topic) for topic in topics.GROUND_TRUTH)
+    rig = graph.add(RigSimulatorNode, **SMALL).rig
+    graph.wait(lambda: min(map(len, (frames, infos, needles, threads, pulls))) > 3, "frames and truth")
     image = cv2.imdecode(np.frombuffer(bytes(frames[-1].data), np.uint8), cv2.IMREAD_COLOR)
     assert image is not None
     assert image.shape == (480, 640, 3)
     assert (infos[-1].width, infos[-1].height) == (640, 480)
-    stamps = {nanoseconds(needle.header.stamp) for needle in needles}
-    assert nanoseconds(frames[-1].header.stamp) in stamps
+    stamp = nanoseconds(frames[-1].header.stamp)
+    for truth in (needles, threads, pulls):
+        graph.wait(lambda t=truth: stamp in [nanoseconds(each.header.stamp) for each in t], "the truth of a frame")
     assert needles[-1].pose.position.x == pytest.approx(0.003)
     assert needles[-1].header.frame_id == "dish"
     assert len(threads[-1].poses) == 13
+    assert pulls[-1].header.frame_id == "dish"
+    with graph.between_callbacks():
+        frame = rig.look(rig.time, rendered=False)
+    wrench = pulls[-1].wrench
+    assert [wrench.force.x, wrench.force.y, wrench.torque.z] == [*frame.pull.tolist(), frame.moment]
 
 
 def test_a_frame_period_is_kept_in_the_stamps(graph):

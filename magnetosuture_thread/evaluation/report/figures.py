@@ -11,6 +11,7 @@ import numpy as np
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
 from magnetosuture_thread.evaluation.frames import TimeSeries
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.pull import pull_error_percent
 from magnetosuture_thread.evaluation.silence import SensorSilence
 from magnetosuture_thread.model.estimator import SlowParameter
 from magnetosuture_thread.model.margins import SOLID
@@ -53,6 +54,7 @@ class BagFigures:
         residual: greatest scaled residual of a solve.
         tension: greatest tension of a segment [N]; nan where no force is known.
         pull: greatest force of the thread upon the needle [N]; nan where no force is known.
+        pull_error: of that force against the ground truth, see `pull_error_percent`; nan without both [%].
         minimum: minimum margin of each kind.
         contact_frames: predicted frames in which the thread touches an obstacle.
         step_time: of the model's step [s].
@@ -85,6 +87,7 @@ class BagFigures:
     span: float = math.nan
     tension: float = math.nan
     pull: float = math.nan
+    pull_error: float = math.nan
     estimate_error: Mapping[str, Mapping[str, float] | None] = field(default_factory=dict)
     compared: Mapping[str, Mapping[str, float | None]] = field(default_factory=lambda: compare_errors(TimeSeries([])))
     estimation: EstimationFigures = field(default_factory=EstimationFigures)
@@ -120,6 +123,7 @@ class BagFigures:
             residual=metrics.maximum("residual"),
             tension=metrics.maximum("tension"),
             pull=metrics.maximum("pull"),
+            pull_error=pull_error_percent(metrics.series),
             minimum=metrics.minimum_margins,
             contact_frames=metrics.contact_frames,
             step_time=metrics.percentiles("step_time"),

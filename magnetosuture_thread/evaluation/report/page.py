@@ -16,7 +16,8 @@ import numpy as np
 from jinja2 import Template
 from plotly.offline import get_plotlyjs
 
-from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame
+from magnetosuture_thread.evaluation.error_map import ErrorMap
+from magnetosuture_thread.evaluation.frames import MARGIN, Array, WorstFrame
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.report import figures as report
 from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, BagFigures
@@ -39,7 +40,11 @@ ERROR_LINES = (
     ("recorded_", "recorded prediction", "kind5"),
 )
 
-FORCE_LINES = (("tension", "peak tension", "predicted", ""), ("pull", "pull upon the needle", "ink", ""))
+FORCE_LINES = (
+    ("tension", "peak tension", "predicted", ""),
+    ("pull", "pull upon the needle", "ink", ""),
+    ("true_pull", "the same by the ground truth", "good", "dot"),
+)
 
 Line = tuple[str, str, str, str]  # column, name, colour, dash
 
@@ -125,6 +130,7 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
         "step_time": 1e3,
         "tension": 1e6,
         "pull": 1e6,
+        "true_pull": 1e6,
         **dict.fromkeys(solid, 1e3),
         **dict.fromkeys(others, 1e6),
     }

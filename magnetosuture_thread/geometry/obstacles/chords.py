@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, WorkspaceData, cell_of
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
 from magnetosuture_thread.geometry.obstacles.search import Vector
@@ -52,17 +52,17 @@ class ChordContacts(NamedTuple):
     place: NDArray[np.float64]
 
 
-@compiled
+@compiled_inline
 def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled
+@compiled_inline
 def _at(numbers: NDArray[np.float64], k: int) -> Vector:
     return numbers[k], numbers[k + 1], numbers[k + 2]
 
 
-@compiled
+@compiled_inline
 def _write(
     count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: ChordContacts
 ) -> int:
@@ -75,7 +75,7 @@ def _write(
     return count + 1
 
 
-@compiled
+@compiled_inline
 def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance and normal of a polygon's corner, the start of edge k; a place of -1 for none.
 
@@ -102,7 +102,7 @@ def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) ->
     return s / chord.length, distance, (nx, ny, 0.0)
 
 
-@compiled
+@compiled_inline
 def _edge(chord: Chord, numbers: NDArray[np.float64], k: int, side: int, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance and normal of a mesh's edge, one of face k; a place of -1 for none.
 
@@ -143,7 +143,7 @@ def _edge(chord: Chord, numbers: NDArray[np.float64], k: int, side: int, reach: 
     return s / chord.length, distance, normal
 
 
-@compiled
+@compiled_inline
 def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance from the centre and normal of a disc or ball; a place of -1 for none."""
     to = centre[0] - chord.start[0], centre[1] - chord.start[1], centre[2] - chord.start[2]
@@ -155,7 +155,7 @@ def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Ve
     return s / chord.length, length, (x / length, y / length, z / length)
 
 
-@compiled
+@compiled_inline
 def _bulge(points: Points, i: int, s: float, normal: Vector) -> float:
     """Return how far a segment's arc is from its chord at a place s, along a normal: s (1 - s) / 2 of its turn."""
     turn = 0.0
@@ -166,7 +166,7 @@ def _bulge(points: Points, i: int, s: float, normal: Vector) -> float:
     return 0.5 * s * (1.0 - s) * max(turn, 0.0)
 
 
-@compiled
+@compiled_uncounted
 def find_chord_contacts(
     points: Points,
     data: WorkspaceData,

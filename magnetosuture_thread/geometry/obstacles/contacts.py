@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.search import (
     ContactRows,
     Nearest,
@@ -53,7 +53,7 @@ class WorkspaceData(NamedTuple):
     entries: NDArray[np.int32]
 
 
-@compiled
+@compiled_inline
 def cell_of(point: Vector, row: int, data: WorkspaceData) -> int:
     """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
     x, y, z = point
@@ -64,7 +64,7 @@ def cell_of(point: Vector, row: int, data: WorkspaceData) -> int:
     return int(table[4] + 2 * (int(i) + table[1] * (int(j) + table[2] * int(k))))
 
 
-@compiled
+@compiled_inline
 def nearest_of(
     point: Vector,
     reach: float,
@@ -83,7 +83,7 @@ def nearest_of(
     return search_edges(x, y, reach, numbers, table[6], entries, first, last, count, rows.distance, rows.normal)
 
 
-@compiled
+@compiled_inline
 def _ball_contact(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
     frame = data.frames[obstacle + 1]
@@ -95,7 +95,7 @@ def _ball_contact(point: Vector, obstacle: int, data: WorkspaceData, count: int,
     return add_row(count, count, length - frame[5], direction, rows)
 
 
-@compiled
+@compiled_inline
 def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float]:
     """Return the distance of a point from a round wall about the origin, positive inside, and its gradient.
 
@@ -109,7 +109,7 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
     return radius, -1.0, 0.0
 
 
-@compiled
+@compiled_inline
 def _shape_contacts(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the rows of a polygon or mesh at one point; return the new count, -1 when they are too many."""
     cell = cell_of(point, obstacle + 1, data)
@@ -140,7 +140,7 @@ def _shape_contacts(point: Vector, obstacle: int, data: WorkspaceData, count: in
     return found.rows
 
 
-@compiled
+@compiled_uncounted
 def find_contacts(
     points: Points,
     data: WorkspaceData,

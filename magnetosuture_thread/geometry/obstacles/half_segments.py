@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.contacts import (
     BALL,
     FACES,
@@ -36,7 +36,7 @@ _MAX_CUTS = 60  # tangents of one feature's distance
 _NO_ROWS = -1.0  # in place of a reach
 
 
-@compiled
+@compiled_inline
 def _along(start: Vector, end: Vector, s: float) -> Vector:
     return (
         start[0] + s * (end[0] - start[0]),
@@ -45,7 +45,7 @@ def _along(start: Vector, end: Vector, s: float) -> Vector:
     )
 
 
-@compiled
+@compiled_inline
 def _from_feature(point: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> tuple[float, Vector]:
     """Return the distance of a point from an edge or a face, and the vector from there to the point."""
     x, y, z = point
@@ -61,7 +61,7 @@ def _from_feature(point: Vector, k: int, kind: int, numbers: NDArray[np.float64]
     return math.sqrt(rx * rx + ry * ry + rz * rz), (rx, ry, rz)
 
 
-@compiled
+@compiled_inline
 def _slope(distance: float, away: Vector, start: Vector, end: Vector) -> float:
     """Return the derivative of a distance along the way from start to end, by the part of that way."""
     if not distance > 0.0:
@@ -70,7 +70,7 @@ def _slope(distance: float, away: Vector, start: Vector, end: Vector) -> float:
     return (away[0] * x + away[1] * y + away[2] * z) / distance
 
 
-@compiled
+@compiled_uncounted
 def _lowest(start: Vector, end: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> float:
     """Return the least distance of a way from an edge or a face, a lower bound within the tolerance.
 
@@ -103,7 +103,7 @@ def _lowest(start: Vector, end: Vector, k: int, kind: int, numbers: NDArray[np.f
     return bound
 
 
-@compiled
+@compiled_uncounted
 def _nearest_feature(
     point: Vector, kind: int, base: int, width: int, first: int, last: int, data: WorkspaceData
 ) -> int:
@@ -166,7 +166,7 @@ def _deepest(
     return min(lowest, best)
 
 
-@compiled
+@compiled_uncounted
 def _from_shape(start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData) -> float:
     """Return the least signed distance on a way from a polygon or mesh; `signed` is that of its start."""
     table = data.tables[obstacle + 1]
@@ -187,7 +187,7 @@ def _from_shape(start: Vector, end: Vector, signed: float, obstacle: int, data: 
     return _deepest(start, end, length, obstacle, first, last, data)
 
 
-@compiled
+@compiled_inline
 def _from_ball(start: Vector, end: Vector, centre: NDArray[np.float64], radius: float) -> float:
     x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     rx, ry, rz = centre[0] - start[0], centre[1] - start[1], centre[2] - start[2]
@@ -196,7 +196,7 @@ def _from_ball(start: Vector, end: Vector, centre: NDArray[np.float64], radius: 
     return math.sqrt((rx - s * x) ** 2 + (ry - s * y) ** 2 + (rz - s * z) ** 2) - radius
 
 
-@compiled
+@compiled_uncounted
 def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, data: WorkspaceData) -> float:
     """Return the least signed distance of a node and the half segments beside it from one shape or the wall [m].
 

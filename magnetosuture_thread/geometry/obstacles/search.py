@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
 
 Vector = tuple[float, float, float]
@@ -119,7 +119,7 @@ class ContactRows(NamedTuple):
     normal: NDArray[np.float64]
 
 
-@compiled
+@compiled_inline
 def add_row(start: int, count: int, length: float, direction: Vector, rows: ContactRows) -> int:
     """Write a row unless it is the same boundary point as a row since `start`; return the new count.
 
@@ -148,7 +148,7 @@ def add_row(start: int, count: int, length: float, direction: Vector, rows: Cont
     return count + 1
 
 
-@compiled
+@compiled_uncounted
 def search_edges(
     x: float,
     y: float,
@@ -225,7 +225,7 @@ def search_edges(
     return Nearest(count, best, sign * length, nx, ny, 0.0)
 
 
-@compiled
+@compiled_uncounted
 def search_faces(
     point: Vector,
     reach: float,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
@@ -18,7 +18,7 @@ DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is as
 CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
 
 
-@compiled
+@compiled_uncounted
 def contact_rows(
     buffers: StepBuffers,
     row: int,
@@ -52,7 +52,11 @@ def contact_rows(
         The number of rows, -1 if there is no room for them, and the greatest depth of a contact [m].
     """
     nodes, dimension = about.shape
-    points = about * unit
+    points, minimum = buffers.work[0], buffers.work[1]
+    for i in range(nodes):
+        minimum[i, 0] = minimum[i, 1] = np.inf
+        for a in range(dimension):
+            points[i, a] = about[i, a] * unit
     found = find_contacts(
         points, workspace, buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.nearest
     )
@@ -65,13 +69,13 @@ def contact_rows(
         found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, to)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
-    kept, depth, minimum = 0, 0.0, np.full((2, nodes), np.inf)
+    kept, depth = 0, 0.0
     for c in range(found):
         i, s = buffers.node[c], buffers.place[c]
         if known[i] and (s == 0.0 or known[i + 1]):
             continue
         kind = 0 if s == 0.0 else 1
-        minimum[kind, i] = min(minimum[kind, i], buffers.distance[c] - radius)
+        minimum[i, kind] = min(minimum[i, kind], buffers.distance[c] - radius)
         clearance = buffers.distance[c] - radius
         depth = max(depth, -clearance)
         bound = -clearance / unit
@@ -90,17 +94,18 @@ def contact_rows(
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
         buffers.limit[here] = np.inf
         buffers.node[kept], buffers.obstacle[kept], buffers.place[kept] = i, buffers.obstacle[c], s
-        buffers.normal[kept] = buffers.normal[c]
+        for a in range(dimension):
+            buffers.normal[kept, a] = buffers.normal[c, a]
         kept += 1
     # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
     for c in range(kept):
         kind, i = 0 if buffers.place[c] == 0.0 else 1, buffers.node[c]
-        pushes = buffers.value[row + c] * unit <= max(minimum[kind, i], DEPTH_TOLERANCE)
+        pushes = buffers.value[row + c] * unit <= max(minimum[i, kind], DEPTH_TOLERANCE)
         buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
     return kept, depth
 
 
-@compiled
+@compiled_uncounted
 def stays_clear(
     buffers: StepBuffers,
     workspace: WorkspaceData,
@@ -124,7 +129,10 @@ def stays_clear(
         unit: D [m].
         radius: rho [m].
     """
-    points, clearance, minimum = about * unit, buffers.clearance, radius - DEPTH_TOLERANCE
+    points, clearance, minimum = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE
+    for i in range(len(about)):
+        for a in range(about.shape[1]):
+            points[i, a] = about[i, a] * unit
     to = ChordContacts(buffers.node, buffers.obstacle, buffers.distance, buffers.normal, buffers.place)
     for i in range(len(about)):
         square = 0.0
@@ -147,13 +155,14 @@ def stays_clear(
     return found >= 0
 
 
-@compiled
+@compiled_uncounted
 def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
     """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
 
     Of these also their forces, with those of friction.
     """
-    buffers.multipliers[: len(multipliers)] = multipliers
+    for r in range(len(multipliers)):
+        buffers.multipliers[r] = multipliers[r]
     buffers.push[:] = 0.0
     buffers.contact_force[:] = 0.0
     for r in range(rows, len(multipliers)):

@@ -22,7 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import FRICTION, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.step_buffers import GRIPS, NO_SHAPE, StepBuffers
@@ -64,9 +64,26 @@ def friction_rows(
         The number of rows, -1 if there is no room for them; and by how much the limits differ from those of the last
         solve, over the greatest of them.
     """
+    shape = buffers.grip_shape.shape
+    best, aligned = np.full(shape, -1), np.zeros(shape)
+    return _write_rows(buffers, row, contacts, workspace, before, start, known, interval, best, aligned)
+
+
+@compiled_uncounted
+def _write_rows(
+    buffers: StepBuffers,
+    row: int,
+    contacts: int,
+    workspace: WorkspaceData,
+    before: Points,
+    start: Points,
+    known: NDArray[np.bool_],
+    interval: float,
+    best: NDArray[np.int64],
+    aligned: NDArray[np.float64],
+) -> tuple[int, float]:
+    """Write the rows of `friction_rows`, with memory for the best contact of each grip and its push, -1 and 0."""
     nodes = buffers.grip.shape[1]
-    best = np.full((2, nodes, GRIPS), -1)
-    aligned = np.zeros((2, nodes, GRIPS))
     for c in range(contacts):
         kind, i = 0 if buffers.place[c] == 0.0 else 1, buffers.node[c]
         slot = _slot_of(buffers, kind, i, buffers.obstacle[c])
@@ -109,7 +126,7 @@ def friction_rows(
     return count, change / greatest if greatest > 0.0 else 0.0
 
 
-@compiled
+@compiled_uncounted
 def keep_grips(buffers: StepBuffers, multipliers: Vector, row: int, workspace: WorkspaceData) -> None:
     """Keep the normal forces of a solve, by place and shape, and what friction there was.
 
@@ -147,7 +164,7 @@ def keep_grips(buffers: StepBuffers, multipliers: Vector, row: int, workspace: W
                     buffers.grip[kind, i, slot] = 0.0
 
 
-@compiled
+@compiled_inline
 def _slot_of(buffers: StepBuffers, kind: int, node: int, shape: int) -> int:
     """Return which of the shapes of a node (kind 0) or of a chord (kind 1) this is, -1 for none."""
     for slot in range(GRIPS):

@@ -16,13 +16,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.program import SPAN, Vector
 
 
-@compiled
+@compiled_uncounted
 def keep_internal_forces(
     buffers: StepBuffers,
     known: NDArray[np.bool_],

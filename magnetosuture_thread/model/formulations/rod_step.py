@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
@@ -98,7 +98,7 @@ class MotionBuffers(NamedTuple):
         return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
 
 
-@compiled
+@compiled_uncounted
 def assemble_step(
     solves: int,
     rod: RodProperties,
@@ -141,7 +141,7 @@ def assemble_step(
     return contacts, off if solves > 0 else np.inf, rubs
 
 
-@compiled
+@compiled_uncounted
 def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
@@ -195,7 +195,7 @@ def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, 
     _taut(buffers, about, start, interval)
 
 
-@compiled
+@compiled_uncounted
 def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
@@ -217,7 +217,7 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
         buffers.couplings[0, i] -= weight
 
 
-@compiled
+@compiled_uncounted
 def segment_rows(
     buffers: StepBuffers, about: Points, start: Points, known: NDArray[np.bool_], interval: float
 ) -> float:

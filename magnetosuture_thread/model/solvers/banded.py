@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import (
     SPAN,
@@ -47,7 +47,7 @@ from magnetosuture_thread.model.solvers.multipliers import is_active, multiplier
 Axes = tuple[int, ...]
 
 
-@compiled
+@compiled_uncounted
 def assemble_matrix(
     axes: Axes, program: ChainProgram, weights: Vector, active: NDArray[np.bool_], band: NDArray[np.float64]
 ) -> None:
@@ -80,7 +80,7 @@ def assemble_matrix(
                 band[j, 0] = 1.0
 
 
-@compiled
+@compiled_uncounted
 def factorise(axes: Axes, band: NDArray[np.float64]) -> bool:
     """Replace the band by its factors L D L', the inverse of D in the first column."""
     width = SPAN * len(axes)
@@ -99,7 +99,7 @@ def factorise(axes: Axes, band: NDArray[np.float64]) -> bool:
     return True
 
 
-@compiled
+@compiled_uncounted
 def substitute(axes: Axes, band: NDArray[np.float64], x: Vector) -> None:
     """Solve L D L' x = x in place; x has room for half a width of zeros at its end."""
     width = SPAN * len(axes)
@@ -181,7 +181,7 @@ class BandedSolver:
         return self._buffers
 
 
-@compiled
+@compiled_uncounted
 def balance(axes: Axes, program: ChainProgram, u: Points, smooth: Vector) -> float:
     """Write P u + q and return its largest term."""
     d, nodes, largest = len(axes), len(u), 1.0
@@ -200,7 +200,7 @@ def balance(axes: Axes, program: ChainProgram, u: Points, smooth: Vector) -> flo
     return largest
 
 
-@compiled
+@compiled_uncounted
 def images(axes: Axes, program: ChainProgram, u: Points, image: Vector) -> None:
     """Write a_r' u of every row."""
     d, width = len(axes), SPAN * len(axes)
@@ -211,7 +211,7 @@ def images(axes: Axes, program: ChainProgram, u: Points, image: Vector) -> None:
         image[r] = value
 
 
-@compiled
+@compiled_uncounted
 def forces(
     axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
 ) -> tuple[float, float]:
@@ -236,7 +236,14 @@ def forces(
     return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
 
 
-@compiled
+@compiled_inline
+def _copy(given: Vector, factor: float, count: int, written: Vector) -> None:
+    """Write the first numbers times a factor; a slice of them is copied by way of an array."""
+    for k in range(count):
+        written[k] = factor * given[k]
+
+
+@compiled_uncounted
 def solve(
     axes: Axes,
     program: ChainProgram,
@@ -279,12 +286,13 @@ def solve(
             if not factorise(axes, band):
                 return INDEFINITE, iteration
         start = end = 0.0
-        step[:unknowns], step[unknowns : unknowns + width] = -force, 0.0
+        _copy(force, -1.0, unknowns, step)
+        step[unknowns : unknowns + width] = 0.0
         substitute(axes, band, step)
         for j in range(unknowns):
             start += smooth[j] * step[j]
             u[j // d, j % d] += step[j]
-        before[:rows] = image[:rows]
+        _copy(image, 1.0, rows, before)
         scale = balance(axes, program, u, smooth)
         images(axes, program, u, image)
         changes, gap = update(program, image, centre, weights, multipliers, active)
@@ -309,7 +317,7 @@ def solve(
         if stalled > MAX_STALLS:
             return SOLVED if max(worst / size, gap) <= ROUNDING_RESIDUAL else STALLED, iteration
         if worst <= tolerance * size:
-            centre[:rows] = multipliers[:rows]
+            _copy(multipliers, 1.0, rows, centre)
             turned, gap = update(program, image, centre, weights, multipliers, active)
             changes += turned
             forces(axes, program, smooth, multipliers, force)

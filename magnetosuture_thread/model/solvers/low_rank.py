@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.program import ChainProgram, Solution, Vector, WideRows, residuals_of
 from magnetosuture_thread.model.solvers.banded import (
@@ -43,7 +43,7 @@ from magnetosuture_thread.model.solvers.banded import (
 from magnetosuture_thread.model.solvers.multipliers import is_active, multiplier_of, search, update
 
 
-@compiled
+@compiled_uncounted
 def _wide_images(nodes: NDArray[np.int64], gradient: NDArray[np.float64], u: Points, image: Vector) -> None:
     """Write a_r' u of the wide rows, the last ones of the image."""
     base = len(image) - len(nodes)

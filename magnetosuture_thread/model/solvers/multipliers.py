@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.model.program import ChainProgram, Vector
 
 MAX_LINE_SEARCHES = 50
 
 
-@compiled
+@compiled_inline
 def multiplier_of(
     lower: float, upper: float, compliance: float, limit: float, image: float, weight: float, centre: float
 ) -> float:
@@ -27,13 +27,13 @@ def multiplier_of(
     return float(max(min(multiplier, limit), -limit))
 
 
-@compiled
+@compiled_inline
 def is_active(limit: float, multiplier: float) -> bool:
     """Return whether a row's multiplier changes with its image."""
     return multiplier != 0.0 and abs(multiplier) < limit
 
 
-@compiled
+@compiled_uncounted
 def update(
     program: ChainProgram,
     image: Vector,
@@ -58,7 +58,7 @@ def update(
     return changes, gap
 
 
-@compiled
+@compiled_uncounted
 def search(
     program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
 ) -> float:

@@ -93,7 +93,7 @@ class RigTime:
 
 
 class FramePublisher:
-    """Publishes frames as a camera does, and where needle and thread really are.
+    """Publishes frames as a camera does, and where needle and thread really are and how they pull.
 
     Args:
         node: that publishes.
@@ -108,6 +108,7 @@ class FramePublisher:
         self._info = topics.CAMERA_INFO.publisher(node)
         self._needle = topics.GROUND_TRUTH_NEEDLE.publisher(node)
         self._thread = topics.GROUND_TRUTH_THREAD.publisher(node)
+        self._pull = topics.GROUND_TRUTH_PULL.publisher(node)
         self.take(camera)
 
     def take(self, camera: DishCamera) -> None:
@@ -126,6 +127,7 @@ class FramePublisher:
             self._info.publish(self._camera)
         self._needle.publish(MESSAGES.placed(stamp, frame.tail, frame.heading))
         self._thread.publish(packed_path(time_of(nanoseconds), frame.thread))
+        self._pull.publish(MESSAGES.wrench_message(stamp, frame.pull, frame.moment))
 
 
 PERIOD = 0.005  # s between two looks at the boards, which keep real time whatever the rig's own is

@@ -154,6 +154,13 @@ class RigDynamics:
         return np.asarray(stretch - rod.bending / rod.segment**3 * bend + 2.0 * clamp[0] * gap)
 
     @property
+    def thread_moment(self) -> float:
+        """Moment of the thread upon the needle about its tail, counter-clockwise [N m]: of the clamp; 0 if pinned."""
+        direction = self._turned(self._q, np.array([self._rod.segment, self._needle.clamp[1]]))
+        edge = self.thread[1] - self.thread[0]
+        return float(2.0 * self._needle.clamp[0] * (direction[1] * edge[0] - direction[0] * edge[1]))
+
+    @property
     def energy(self) -> float:
         """Elastic energy of the thread, with the clamp's [J]."""
         rod, nodes = self._rod, self.thread

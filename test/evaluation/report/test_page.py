@@ -23,7 +23,7 @@ from matplotlib.image import imread
 
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, headlines
+from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, format_number, headlines
 from magnetosuture_thread.evaluation.report.page import page_data, write_page
 from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -373,7 +373,10 @@ def test_the_forces_are_drawn_and_their_greatest_stated():
     assert [peaks, pulls] == pytest.approx([1e6 * peak, 5.0], rel=1e-3)  # in uN
     (headline,) = [each for each in headlines(ABOUT, figures) if each.name == "peak tension"]
     assert headline.value == f"{1e6 * peak:.0f} µN"
-    assert "Forces in the thread" in made_page()
+    sentence = f"The pull differs from the ground truth by {format_number(2.5)}"
+    assert "Forces in the thread" in (page := made_page())
+    assert sentence[:40] not in page
+    assert sentence in write_page(ABOUT, metrics, replace(figures, pull_error=2.5), [])
     nothing = replace(figures, tension=math.nan, pull=math.nan)
     assert "none" in {each.value for each in headlines(ABOUT, nothing) if each.name == "peak tension"}
 
