@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ OVERLAP = 0.5  # of a piece; if so much of it lies where another one does alread
 FRESH_POINTS = 2  # of a piece, at the least
 
 
-@dataclass(frozen=True)
-class PlacedPiece:
+class PlacedPiece(NamedTuple):
     """A piece on the thread, in units of the segment length D.
 
     Attributes:
