@@ -24,7 +24,13 @@ from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup, read_setup
 
-CASES = (("petri_35mm_polyamide", 25), ("petri_35mm_polyamide_post", 25), ("hernia_ring", 40), ("hernia_ring", 80))
+CASES = (
+    ("petri_35mm_polyamide", 25),
+    ("petri_35mm_polyamide_post", 25),
+    ("hernia_ring", 40),
+    ("hernia_ring", 60),
+    ("hernia_ring", 80),
+)
 TRUE_SEGMENTS = 240
 SETTLING = 0.5  # s, after the start, in which the model finds velocities of its own
 AVERAGING = 0.1  # s, of the running means

@@ -27,7 +27,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.reproduce.hernia.replay import read_steering, start_centreline
+from magnetosuture_thread.reproduce.hernia.replay import paper_model, read_steering, start_centreline
 from magnetosuture_thread.reproduce.hernia.steering import point_filter, replay_steering
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     option = parser.add_argument
     option("--bag", type=Path, default=STEERING, metavar="BAG", help="steering to repeat (default: the example)")
     option("--motions", type=int, default=1000, metavar="N", help="random motions of a thread that touches itself")
-    option("--segments", type=int, nargs="+", default=[40, 80], metavar="N", help="of the model (default: 40 80)")
+    option("--segments", type=int, nargs="+", default=[40, 60, 80], metavar="N", help="of the model")
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     setup = read_setup("hernia_ring")
     log("the thread model steers its needle")
     needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
-    steered = replay_steering(setup.model, start_centreline(setup), read_steering(Bag(options.bag)), needle)
+    steered = replay_steering(paper_model(setup), start_centreline(setup), read_steering(Bag(options.bag)), needle)
     positions = np.array([instant.prediction.positions[:2] for instant in steered.instants])
     poses = [
         NeedlePose(instant.time, tail, (tail - first) / np.linalg.norm(tail - first))

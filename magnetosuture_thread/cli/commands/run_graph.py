@@ -93,7 +93,8 @@ def add(subparsers: Subparsers) -> None:
     hernia.add_argument("bag", type=Path, metavar="BAG", help="a bag with an operator's velocity commands")
     for result in (hernia, behavior):
         result.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder to make")
-    hernia.add_argument("--setup", default="", metavar="NAME", help="setup or YAML file (default: the bag's)")
+    default = "(default: the bag's, with the paper's 40 segments)"
+    hernia.add_argument("--setup", default="", metavar="NAME", help=f"setup or YAML file {default}")
     hernia.add_argument("--formulation", choices=("rod", "paper"), default="", help="(default: the setup's)")
     hernia.add_argument("--animation", action="store_true", help="draw hernia.gif as well")
 

@@ -215,10 +215,10 @@ def path_lengths(points: Points, spacing: float, arcs: Vector) -> None:
             continue
         total = 0.0
         for k in range(last + 1, p + 1):
-            total += np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+            arcs[k] = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+            total += arcs[k]
         for k in range(last + 1, p + 1):
-            part = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
-            arcs[k] = arcs[k - 1] + (step * part / total if total > 0.0 else 0.0)
+            arcs[k] = arcs[k - 1] + (step * arcs[k] / total if total > 0.0 else 0.0)
         last = p
 
 

@@ -80,9 +80,8 @@ class Corrector:
         thread, nodes = predictor.thread, predictor.thread.segments + 1
         self._formulation, self._length, self._segments = formulation, length, thread.segments
         self._unit = thread.segment_length
-        self._known = np.zeros(nodes, dtype=np.bool_)
-        self._known[[0, *predictor.fixed_nodes]] = True
         self.work = CorrectionBuffers.of(nodes)
+        self.work.known[[0, *predictor.fixed_nodes]] = True
         self._solver = BandedSolver()
         self._last: tuple[Points, MeasuredPoints, Vector, tuple[float, float], float]
         self._use(StepBuffers.of(nodes, 2, 3 * thread.segments + 1, 2 * nodes))
@@ -115,7 +114,6 @@ class Corrector:
         rod = self._formulation.rod
         stiffness = rod.bending_stiffness / (rod.drag_across * self._unit**4)
         while True:
-            self.work.known[:] = self._known
             code, solves, off, residuals, scale = correct(
                 (0, 1),
                 rod,

@@ -259,7 +259,7 @@ class ThreadEstimator:
         problems: list[str],
     ) -> ThreadEstimate:
         unit, segments = self._unit, self.thread.segments
-        weights = np.ones(len(points.place))
+        weights = np.empty(len(points.place))
         elapsed = pose.stamp - self._measured_at if math.isfinite(self._measured_at) else 0.0
         innovations, noise = self._noise.learn(
             points, weights, self._sums, unit, elapsed, 2.0 * self._length, self._variance, self._density

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, MeasuredPoints, robust_weights
 
 Vector = NDArray[np.float64]
@@ -59,7 +59,7 @@ class WindowSums(NamedTuple):
         return cls(*(np.empty(windows) for _ in range(4)))
 
 
-@compiled
+@compiled_inline
 def _at(values: Vector, place: float) -> float:
     low = min(int(place), len(values) - 2)
     return float((1.0 - (place - low)) * values[low] + (place - low) * values[low + 1])

@@ -234,9 +234,9 @@ def shift_errors(bank: NoiseBank, correction: Vector) -> None:
 @compiled
 def interpolate_to_nodes(values: Vector, nodes: int, result: Vector) -> None:
     """Write at each node the windows' values, interpolated in their logarithms between the windows' middles."""
-    windows = len(values)
+    windows, logs = len(values), np.log(values)
     for i in range(nodes):
         at = windows * i / (nodes - 1.0) - 0.5
         low = int(min(max(np.floor(at), 0.0), windows - 2.0))
         part = min(max(at - low, 0.0), 1.0)
-        result[i] = np.exp((1.0 - part) * np.log(values[low]) + part * np.log(values[low + 1]))
+        result[i] = np.exp((1.0 - part) * logs[low] + part * logs[low + 1])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,7 @@ OVERLAP = 0.5  # of a piece; if so much of it lies where another one does alread
 FRESH_POINTS = 2  # of a piece, at the least
 
 
-@dataclass(frozen=True)
-class PlacedPiece:
+class PlacedPiece(NamedTuple):
     """A piece on the thread, in units of the segment length D.
 
     Attributes:
@@ -140,13 +139,14 @@ def _place(
         return "a piece has fewer than two finite points"
     if len(points) < FRESH_POINTS:
         return "a piece has fewer than two points on a path"
-    if not arcs[-1] > 0.0:
+    length = float(arcs[-1])
+    if not length > 0.0:
         return "a piece has no length"
-    if arcs[-1] * (1.0 - WHOLE) > segments:
-        return f"a piece {arcs[-1] * unit * 1e3:.1f} mm long, longer than the thread"
+    if length * (1.0 - WHOLE) > segments:
+        return f"a piece {length * unit * 1e3:.1f} mm long, longer than the thread"
     ends = (piece.first_end, piece.last_end)
-    if ends in WHOLE_ENDS and abs(arcs[-1] / segments - 1.0) < WHOLE:
-        arcs *= segments / arcs[-1]
+    if ends in WHOLE_ENDS and abs(length / segments - 1.0) < WHOLE:
+        arcs *= segments / length
     low, high = (value / unit for value in piece.arc_length)
     attached = piece.first_end is PieceEnd.TAIL
     known = _known(piece) or attached

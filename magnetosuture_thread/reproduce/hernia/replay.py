@@ -16,6 +16,7 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia.pictures import draw_animation, draw_hernia
 from magnetosuture_thread.reproduce.hernia.steering import (
     HerniaSummary,
@@ -26,6 +27,7 @@ from magnetosuture_thread.reproduce.hernia.steering import (
 from magnetosuture_thread.setups import Setup, read_setup
 
 START_POINTS = 200  # of the centreline at the start
+PAPER_SEGMENTS = 40  # of the thread in the paper's figure
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -50,7 +52,7 @@ def replay_hernia(
     Args:
         bag_path: a bag with velocities that an operator asked for.
         output: folder to make.
-        setup_name: name or path of the setup; the one the bag names if empty.
+        setup_name: name or path of the setup; the one the bag names, with the paper's number of segments, if empty.
         formulation: of the thread model; the setup's if empty.
         animation: whether to draw one.
         log: called with a line for a person at each stage.
@@ -63,7 +65,8 @@ def replay_hernia(
     """
     bag = Bag(bag_path)
     setup = read_setup(setup_name or bag.notes.get("setup", "hernia_ring"))
-    settings = replace(setup.model, formulation=formulation or setup.model.formulation)
+    model = setup.model if setup_name else paper_model(setup)
+    settings = replace(model, formulation=formulation or model.formulation)
     steering = read_steering(bag)
     with whole_folder(output) as folder:
         log(f"steering {steering.duration:.0f} s in setup {setup.name}")
@@ -97,6 +100,11 @@ def read_steering(bag: Bag) -> RecordedCommands:
     if not (np.diff(times) >= 0.0).all():
         raise BagError(bag.path, f"has stamps on {OPERATOR_COMMAND.recorded} that do not rise")
     return RecordedCommands(times, np.array(velocities))
+
+
+def paper_model(setup: Setup) -> ThreadModelSettings:
+    """Return the thread model of a setup with the number of segments of the paper's figure."""
+    return replace(setup.model, segments=PAPER_SEGMENTS)
 
 
 def start_centreline(setup: Setup) -> np.ndarray:

@@ -13,7 +13,13 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.obstacles import Polygon
-from magnetosuture_thread.reproduce.hernia.replay import read_steering, replay_hernia, start_centreline
+from magnetosuture_thread.reproduce.hernia.replay import (
+    PAPER_SEGMENTS,
+    paper_model,
+    read_steering,
+    replay_hernia,
+    start_centreline,
+)
 from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, point_filter, replay_steering
 from magnetosuture_thread.setups import read_setup
 
@@ -26,7 +32,7 @@ def run() -> HerniaRun:
     """The steering that ships, replayed."""
     setup = read_setup("hernia_ring")
     needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
-    return replay_steering(setup.model, start_centreline(setup), read_steering(Bag(STEERING)), needle)
+    return replay_steering(paper_model(setup), start_centreline(setup), read_steering(Bag(STEERING)), needle)
 
 
 def instants(run: HerniaRun) -> list[dict[str, Any]]:
@@ -35,7 +41,7 @@ def instants(run: HerniaRun) -> list[dict[str, Any]]:
 
 
 def test_the_thread_is_the_papers_and_lies_in_the_dish(run: HerniaRun):
-    assert run.settings.segments == 40
+    assert run.settings.segments == PAPER_SEGMENTS
     assert len(run.scene.shapes) == 3
     radius = run.scene.dish.radius
     assert max(float(np.linalg.norm(i.prediction.positions, axis=1).max()) for i in run.instants) < radius
@@ -84,10 +90,11 @@ def test_no_node_is_ever_in_an_obstacle_and_no_segment_stretched(run: HerniaRun)
 
 
 def test_the_job_leaves_figures_and_a_picture(tmp_path: Path):
-    summary = replay_hernia(STEERING, tmp_path / "out", setup_name="hernia_ring")
+    summary = replay_hernia(STEERING, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["hernia.json", "hernia.png"]
     figures = json.loads((tmp_path / "out" / "hernia.json").read_text())
     assert figures["most_friction"] == summary.most_friction > 15
+    assert figures["nodes"] == PAPER_SEGMENTS != read_setup("hernia_ring").model.segments
     assert figures["simulated"]
 
 
