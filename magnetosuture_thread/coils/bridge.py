@@ -141,7 +141,7 @@ class CoilBridge:
         self._losses = 0
         self._previous = self._coils.zero()
         self._velocity = np.zeros(2)
-        self._last_step, self._was_armed = -math.inf, False
+        self._last_step, self._elapsed, self._was_armed = -math.inf, 0.0, False
         self._stopped: float | None = None
         self._blocked, self._blocked_reason = -math.inf, ""
         self.set_scene(scene)
@@ -255,7 +255,7 @@ class CoilBridge:
         self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
             self._clear()  # the driver has gone to zero by itself
-        elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
+        elapsed = self._elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
         # An input that becomes stale before the next step has reached the boards is stale now.
         then = (now + LOOKAHEAD_PERIODS * period, arrival + LOOKAHEAD_PERIODS * period)
         selected = self._select_input(*then)
@@ -359,6 +359,8 @@ class CoilBridge:
         if self._stopped is None:
             self._stopped = arrival
         self._clear()
+        if self._observer is not None:
+            self._observer.rest(self._elapsed)
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
         publish = arrival - self._stopped <= self._settings.zero_hold
         slowdown = filtered.slowdown if filtered is not None else 1.0

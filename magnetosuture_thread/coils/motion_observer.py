@@ -14,6 +14,7 @@ Vector = NDArray[np.float64]
 
 GAIN = 8.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
+MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
 MAX_SPEED = 0.006  # m/s; compensated at most
 
 
@@ -69,7 +70,8 @@ class MotionObserver:
         applied = self._applied / self._duration if self._duration > 0.0 else np.zeros(2)
         self._applied, self._duration = np.zeros(2), 0.0
         if last is None or not 0.0 < stamp - last[0] <= MAX_INTERVAL:
-            self._velocity = np.zeros(2)
+            if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
+                self._velocity = np.zeros(2)
             return
         interval, moved = stamp - last[0], middle - last[1]
         self._velocity += min(1.0, GAIN * interval) * (moved / interval - applied - self._velocity)
@@ -85,6 +87,10 @@ class MotionObserver:
         """
         e = self._needle.chord_direction(heading)
         self._applied += duration * np.array([along * e[0] - drift * e[1], along * e[1] + drift * e[0]])
+        self._duration += duration
+
+    def rest(self, duration: float) -> None:
+        """Register that the currents are zero for a time [s]."""
         self._duration += duration
 
     def disturbance(self, heading: Vector) -> MotionDisturbance:

@@ -44,6 +44,7 @@ MAX_REPLANS = 6  # of one goal, after which it is given up
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
 PROGRESS = 2e-3  # m; on a new path, after which those before count no more
 WRAPPED = 0.02  # rad; of a wrap may be left
+MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
 
 
@@ -136,7 +137,8 @@ class ProcedureExecutor:
     A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
     known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
     that rests for `REST_TIME` while it is commanded backs off, and its goal is planned anew; one that is off its path
-    by more than `OFF_PATH` too. After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest.
+    by more than `OFF_PATH` too. After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest;
+    so is a procedure that has waited for the thread for too long.
 
     Pure: time comes in with the poses.
 
@@ -144,10 +146,17 @@ class ProcedureExecutor:
         procedure: what to do.
         planner: of paths in the scene.
         submit: begins to plan a path; by default that is done at once, while the caller waits.
+        max_wait: for a thread that is not known; then the procedure is given up [s].
     """
 
-    def __init__(self, procedure: Procedure, planner: NeedlePlanner, submit: PathSubmitter = plan_now) -> None:
-        self.procedure, self.planner, self._submit = procedure, planner, submit
+    def __init__(
+        self,
+        procedure: Procedure,
+        planner: NeedlePlanner,
+        submit: PathSubmitter = plan_now,
+        max_wait: float = MAX_WAIT,
+    ) -> None:
+        self.procedure, self.planner, self._submit, self._max_wait = procedure, planner, submit, max_wait
         self.state, self.reason, self.goal = ProcedureState.READY, "", 0
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
@@ -164,6 +173,7 @@ class ProcedureExecutor:
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
         self._unsure = False  # paused by itself, which goes on by itself once the thread is known again
+        self._waits_since = 0.0  # for the thread, since this stamp [s]
 
     @property
     def is_commanding(self) -> bool:
@@ -227,9 +237,13 @@ class ProcedureExecutor:
             self._begin = middle
         if self.state is ProcedureState.RUNNING and thread.problem:
             self.pause(thread.problem)
-            self._unsure = True
+            self._unsure, self._waits_since = True, stamp
         elif self._unsure and not thread.problem:
             self.state, self.reason, self._unsure = ProcedureState.RUNNING, "", False  # on the path of before
+        elif self._unsure and not thread.may_hold:
+            self._waits_since = stamp  # for something else than the thread
+        elif self._unsure and stamp - self._waits_since > self._max_wait:
+            self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
         if self.state is not ProcedureState.RUNNING:
             self._rest = _Rest()
             if self.path is None or not (self._unsure and thread.may_hold):

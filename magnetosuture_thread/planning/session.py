@@ -135,7 +135,7 @@ class ProcedureSession:
             raise InvalidInputError("procedure", procedure.name, "a scene first, as a parameter or on its topic")
         if self._pose is None or not self.known.has_pose(now):
             raise InvalidInputError("procedure", procedure.name, "a needle that is tracked")
-        executor = ProcedureExecutor(procedure, self._planner, self._submit)
+        executor = ProcedureExecutor(procedure, self._planner, self._submit, self._settings.thread_wait)
         paths = executor.plan(*self._pose[1:])
         self._planned, self.planned_duration, index = [], 0.0, 0
         for path in paths:

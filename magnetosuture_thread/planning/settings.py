@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.geometry.needle_arc import check_needle
+from magnetosuture_thread.planning.executor import MAX_WAIT
 from magnetosuture_thread.planning.planner import NeedlePlanner
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.scene import Scene
@@ -48,6 +49,13 @@ class NeedlePlannerSettings(Configuration):
         unit="s",
         minimum=0.1,
         maximum=60.0,
+    )
+    thread_wait: float = quantity(
+        MAX_WAIT,
+        "a procedure that is paused because the thread is not known is given up after this long",
+        unit="s",
+        minimum=1.0,
+        maximum=3600.0,
     )
     settle: float = quantity(
         0.5,

@@ -61,6 +61,24 @@ def test_after_a_gap_between_poses_nothing_is_known():
     assert observer.disturbance(direction(0.3)) == (0.0, 0.0)
 
 
+def test_over_a_few_lost_poses_what_was_measured_is_kept():
+    observer = observed(0.0, 0.0, 1e-3, (0.0, 0.0))
+    observer.update(np.zeros(2), direction(0.3), 3.2)  # 0.25 s after the last one, and somewhere else
+    assert observer.disturbance(direction(0.3)).drift == pytest.approx(1e-3, rel=0.01)
+
+
+def test_a_time_with_zero_currents_counts():
+    """The needle goes by its currents for 0.05 s, and rests for 0.05 s."""
+    observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
+    tail = np.zeros(2)
+    for k in range(40):
+        observer.update(tail, e, 1.0 + 0.1 * k)
+        observer.apply(e, 2e-3, 0.0, 0.05)
+        observer.rest(0.05)
+        tail = tail + 0.05 * 2e-3 * e
+    assert np.abs(observer.disturbance(e)).max() < 1e-9
+
+
 class MagneticNeedle:
     """A needle that lies along the field of coils that are not as calibrated, and is pulled aside all the time."""
 

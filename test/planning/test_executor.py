@@ -31,10 +31,12 @@ POST = SceneShape("post", "instrument", Disc((0.003, 0.0), 0.002))
 KNOWN = ThreadCondition()
 
 
-def executor(*goals: dict[str, Any], submit: PathSubmitter = plan_now, **limits: Any) -> ProcedureExecutor:
+def executor(
+    *goals: dict[str, Any], submit: PathSubmitter = plan_now, max_wait: float = 30.0, **limits: Any
+) -> ProcedureExecutor:
     """Return a procedure of some goals beside a post."""
     procedure = parse_procedure({"goals": list(goals), "limits": limits}, "test")
-    return ProcedureExecutor(procedure, NeedlePlanner(Scene(Dish(), (POST,)), NEEDLE, 2.5e-4, 0.05), submit)
+    return ProcedureExecutor(procedure, NeedlePlanner(Scene(Dish(), (POST,)), NEEDLE, 2.5e-4, 0.05), submit, max_wait)
 
 
 class Needle:
@@ -124,6 +126,23 @@ def test_a_needle_that_is_pulled_is_kept_in_place_while_the_thread_is_not_known(
     needle.run(run, 1.0, lambda: replace(KNOWN, problem="nobody holds the page", may_hold=False))
     assert (run.state, run.is_commanding) == (ProcedureState.PAUSED, False)
     assert math.dist(needle.tail, at) > 3e-4
+
+
+def test_a_wait_for_the_thread_ends_after_the_longest_that_is_allowed_and_one_for_a_person_does_not():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, max_wait=3.0), Needle()
+    run.start()
+    needle.run(run, 1.0)
+    unmeasured = replace(KNOWN, problem="the thread has not been measured for 1.0 s")
+    needle.run(run, 2.9, lambda: unmeasured)
+    assert run.state is ProcedureState.PAUSED
+    needle.run(run, 10.0, lambda: replace(KNOWN, problem="nobody holds the page", may_hold=False))
+    needle.run(run, 2.9, lambda: unmeasured)  # the wait begins anew
+    assert run.state is ProcedureState.PAUSED
+    needle.run(run, 0.3, lambda: unmeasured)
+    way = needle.way
+    needle.run(run, 5.0)
+    assert (run.state, run.is_commanding, needle.way) == (ProcedureState.FAILED, False, way)
+    assert run.reason == "given up after a wait of 3 s: the thread has not been measured for 1.0 s"
 
 
 class Planning:
