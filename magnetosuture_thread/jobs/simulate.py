@@ -86,8 +86,8 @@ def simulate(
 ) -> LoopSummary:
     """Run rig, tracker, model, bridge and path follower as processes of their own, and evaluate the loop.
 
-    With a procedure the needle planner executes it in place of the path follower, `thread/forecast` is published, and
-    the figures, with what came of the procedure, are in the folder too, as `summary.json`.
+    With a procedure the needle planner executes it in place of the path follower, and the figures, with what came of
+    the procedure, are in the folder too, as `summary.json`.
 
     `output` becomes a bag of every topic, including ground truth, with the nodes' `logs/` beside it; its
     notes hold the setup and say that it is simulated, and `replay` takes it. It is made at the end, also
@@ -166,7 +166,7 @@ def _run(
     """Run the graph and record it; return what went wrong, so that the bag stays."""
     arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
     if execution is not None:
-        arguments += [*execution.scene_arguments, *execution.forecast_arguments]
+        arguments += execution.scene_arguments
     if rate is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
     notes = {

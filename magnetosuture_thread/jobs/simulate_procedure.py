@@ -18,7 +18,6 @@ from magnetosuture_thread.setups import Setup
 MAX_TIME = 600.0  # s of simulated time for a procedure, as in a campaign
 BEGIN_TIMEOUT = 240.0  # s for the planner to begin; the first start on a machine compiles
 FINAL_TIME = 0.5  # s that are recorded after the end
-FORECAST_HORIZON = 3.0  # s that thread/forecast looks ahead meanwhile
 POLL_PERIOD = 0.02  # s between two looks at planner and nodes
 
 
@@ -52,12 +51,6 @@ class ProcedureRun:
             "goals": self._goals,
             "min_clearance_m": None,
         }
-
-    @property
-    def forecast_arguments(self) -> tuple[str, ...]:
-        """Arguments for `thread_model`, after `--ros-args`: it forecasts with every estimate, as it does not alone."""
-        values = {"forecast_horizon": FORECAST_HORIZON, "forecast_keep_out": self._keep_out}
-        return tuple(part for name, value in values.items() for part in ("-p", f"thread_model:{name}:={value!r}"))
 
     @property
     def arguments(self) -> tuple[str, ...]:
