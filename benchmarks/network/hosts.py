@@ -67,11 +67,11 @@ class TwoHosts:
 
     def pull(self) -> None:
         """Pull the cable at the desk, whose host sees that; the rig's sees nothing but silence."""
-        self._tell("pull")
+        self._execute("pull")
 
     def plug(self) -> None:
         """Put it back."""
-        self._tell("plug")
+        self._execute("plug")
 
     def impair(self, delay: float, loss: float) -> None:
         """Delay and lose packets, in either direction.
@@ -80,16 +80,16 @@ class TwoHosts:
             delay: of each packet [s].
             loss: share of packets that is lost, 0 to 1; with 0 and no delay the cable is as before.
         """
-        self._tell(f"impair {delay} {loss}")
+        self._execute(f"impair {delay} {loss}")
 
     def traffic(self) -> tuple[int, int]:
         """Return the bytes from the rig to the desk and back, so far."""
-        there, back = self._tell("traffic").split()
+        there, back = self._execute("traffic").split()
         return int(there), int(back)
 
-    def _tell(self, command: str) -> str:
+    def _execute(self, command: str) -> str:
         assert self._cable is not None
-        return self._cable.tell(command)
+        return self._cable.execute(command)
 
     def _remove(self) -> None:
         if self._cable is not None:
@@ -107,8 +107,8 @@ class _Cable:
         if self._answer() != "ready":
             raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
 
-    def tell(self, command: str) -> str:
-        """Give it a command; return the answer."""
+    def execute(self, command: str) -> str:
+        """Execute a command; return the answer."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{command}\n")
         self._process.stdin.flush()

@@ -44,7 +44,8 @@ PULLED_TIME = (0.3, 4.0)  # s for which the cable is out, at random
 STOP_EVERY = 10  # cuts of which in one the emergency stop is pressed at the rig while the cable is out
 STILL_TIME = 2.0  # s for which a stopped bridge must stay at zero after the cable is back
 TRAFFIC_TIME = 10.0  # s
-TIMEOUT = 60.0  # s for anything to happen
+TIMEOUT = 60.0  # s for anything to happen ...
+START_TIMEOUT = 300.0  # ... but for the first start on a machine, which compiles
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -137,17 +138,19 @@ class RigWatch:
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=min(left, 0.02))
 
-    def wait(self, condition: Callable[[], bool], what: str, check: Callable[[], None]) -> None:
+    def wait(
+        self, condition: Callable[[], bool], what: str, check: Callable[[], None], timeout: float = TIMEOUT
+    ) -> None:
         """Take what comes until a condition holds.
 
         Raises:
-            GraphError: it does not within `TIMEOUT`.
+            GraphError: it does not within the timeout [s].
         """
-        end = time.monotonic() + TIMEOUT
+        end = time.monotonic() + timeout
         while not condition():
             check()
             if time.monotonic() > end:
-                raise GraphError(f"after {TIMEOUT:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
+                raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
             self._executor.spin_once(timeout_sec=0.02)
 
     def is_driven(self) -> bool:
@@ -182,7 +185,7 @@ class TwoHostBench:
     def pull_cable(self, report: CutReport, cuts: int) -> Iterator[None]:
         """Pull the cable at random moments; yield after each."""
         self._hosts.impair(report.delay, report.loss)
-        self._watch.wait(self._watch.is_driven, "the coils are not driven", self._check)
+        self._watch.wait(self._watch.is_driven, "the coils are not driven", self._check, START_TIMEOUT)
         report.driven, report.megabits = self._measure_traffic()
         for number in range(cuts):
             stops = number % STOP_EVERY == STOP_EVERY - 1

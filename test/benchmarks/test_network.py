@@ -33,8 +33,8 @@ class PluggedCable:
         self._thread = threading.Thread(target=cable.run, args=(reading, self._on_answer))
         self._thread.start()
 
-    def tell(self, command: str) -> str:
-        """Give a command; return the answer."""
+    def execute(self, command: str) -> str:
+        """Execute a command; return the answer."""
         with self._answered:
             count = len(self.answers)
             os.write(self._writing, f"{command}\n".encode())
@@ -73,24 +73,24 @@ def test_frames_pass_either_way_and_are_counted(cable: PluggedCable):
     cable.hosts[1].send(b"b" * 30)
     assert cable.receive(1) == b"a" * 100
     assert cable.receive(0) == b"b" * 30
-    assert cable.tell("traffic") == "100 30"
+    assert cable.execute("traffic") == "100 30"
 
 
 def test_what_is_sent_while_it_is_pulled_is_lost_and_the_desk_sees_no_carrier(cable: PluggedCable):
-    cable.tell("pull")
+    cable.execute("pull")
     cable.hosts[0].send(b"lost")
-    assert cable.tell("traffic") == "0 0"
-    cable.tell("plug")
+    assert cable.execute("traffic") == "0 0"
+    cable.execute("plug")
     cable.hosts[0].send(b"found")
     assert cable.receive(1) == b"found"
     assert cable.carrier == [False, True]
 
 
 def test_frames_are_delayed_in_their_order(cable: PluggedCable):
-    cable.tell("impair 0.2 0.0")
+    cable.execute("impair 0.2 0.0")
     for number in range(3):
         cable.hosts[1].send(bytes([number]))
-    while cable.tell("traffic") != "0 3":
+    while cable.execute("traffic") != "0 3":
         pass
     with pytest.raises(BlockingIOError):
         cable.hosts[0].recv(10)
@@ -98,10 +98,10 @@ def test_frames_are_delayed_in_their_order(cable: PluggedCable):
 
 
 def test_a_share_of_frames_is_lost(cable: PluggedCable):
-    cable.tell("impair 0.0 1.0")
+    cable.execute("impair 0.0 1.0")
     cable.hosts[0].send(b"lost")
-    cable.tell("traffic")
-    cable.tell("impair 0.0 0.0")
+    cable.execute("traffic")
+    cable.execute("impair 0.0 0.0")
     cable.hosts[0].send(b"found")
     assert cable.receive(1) == b"found"
 

@@ -210,13 +210,17 @@ def test_the_offset_of_another_hosts_clock_is_measured_and_its_commands_refused(
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
 
+    def age_of(topic: str) -> float:
+        values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
+        return float(values.get(f"minimum age of {topic} [ms]", "inf"))
+
     def minimum_age() -> float:
         graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(shifted(graph.now(), offset_ms), EAST))
-        values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
-        return float(values.get("minimum age of needle/servo_cv [ms]", "nan"))
+        return age_of("needle/servo_cv")
 
     # The age has the transport in it, which on a busy machine takes its time.
     graph.wait(lambda: -offset_ms <= minimum_age() < 250 - offset_ms, "the offset")
+    assert math.isnan(age_of("operator/servo_cv"))  # nobody commands there
     assert not driven(node)
 
 

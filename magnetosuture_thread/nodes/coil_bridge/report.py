@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +15,7 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import MagnetosutureError
-from magnetosuture_thread.coils.bridge import BridgeOutput
+from magnetosuture_thread.coils.bridge import INPUTS, BridgeOutput
 from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
@@ -67,7 +68,9 @@ SCHEDULING = "scheduling"
 JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 
 
-AGE_KEY = "minimum age of {topic} [ms]"  # of the last seconds; negative where the sender's clock is ahead
+# Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
+AGE_KEY = "minimum age of {topic} [ms]"
+AGED_TOPICS = (*INPUTS.values(), topics.NEEDLE_POSE.name)
 
 
 STATE_PERIOD = 0.1  # s between two messages of an unchanged state
@@ -159,7 +162,7 @@ class CoilReport:
         jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)
         self._health.note(**{key: round(value, 3) for key, value in jitter})
         ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
-        self._health.note(**{AGE_KEY.format(topic=topic): round(1e3 * age, 1) for topic, age in ages.items()})
+        self._health.note(**{AGE_KEY.format(topic=t): round(1e3 * ages.get(t, math.nan), 1) for t in AGED_TOPICS})
         self._health.note(
             driver=system.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
         )
