@@ -122,8 +122,9 @@ class CoilBridge:
         self.watchdogs = {name: CommandWatchdog(settings.command_timeout, topic) for name, topic in INPUTS.items()}
         # The coils certainly hold a current for this long.
         self._hold = min(settings.command_timeout, settings.driver_timeout)
+        kinematics = settings.needle().kinematics
         self.extrapolator = PoseExtrapolator(
-            settings.needle().kinematics,
+            kinematics,
             settings.pose_timeout,
             settings.reach,
             max_speed=settings.max_speed,
@@ -133,7 +134,7 @@ class CoilBridge:
         )
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
         self.feedforward = settings.feedforward()
-        self._observer = MotionObserver(settings.needle().kinematics) if settings.motion_compensation else None
+        self._observer = MotionObserver(kinematics, self._hold) if settings.motion_compensation else None
         self._settings = settings
         self._gains = settings.gain_estimator()
         self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
@@ -141,7 +142,7 @@ class CoilBridge:
         self._losses = 0
         self._previous = self._coils.zero()
         self._velocity = np.zeros(2)
-        self._last_step, self._elapsed, self._was_armed = -math.inf, 0.0, False
+        self._last_step, self._was_armed = -math.inf, False
         self._stopped: float | None = None
         self._blocked, self._blocked_reason = -math.inf, ""
         self.set_scene(scene)
@@ -255,7 +256,7 @@ class CoilBridge:
         self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
             self._clear()  # the driver has gone to zero by itself
-        elapsed = self._elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
+        elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
         # An input that becomes stale before the next step has reached the boards is stale now.
         then = (now + LOOKAHEAD_PERIODS * period, arrival + LOOKAHEAD_PERIODS * period)
         selected = self._select_input(*then)
@@ -307,7 +308,7 @@ class CoilBridge:
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
         self.extrapolator.apply_velocity(expected, now, arrival)
         if self._observer is not None:
-            self._observer.apply(pose.heading, float(e @ allocation.velocity), allocation.drift, elapsed)
+            self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift)
             self._gains.apply(now, allocation.currents)
         return self._output(selected, (), True, active, filtered.slowdown, drift)
 
@@ -360,7 +361,7 @@ class CoilBridge:
             self._stopped = arrival
         self._clear()
         if self._observer is not None:
-            self._observer.rest(self._elapsed)
+            self._observer.rest(now)
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
         publish = arrival - self._stopped <= self._settings.zero_hold
         slowdown = filtered.slowdown if filtered is not None else 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,10 @@ from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
 
-GAIN = 8.0  # 1/s; of the velocities, well below the rate and the delay of a camera's poses
+GAIN = 12.0  # 1/s; of the velocities, below the rate of a camera's poses
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
-MAX_SPEED = 0.006  # m/s; compensated at most
+MAX_SPEED = 0.012  # m/s; compensated at most
 
 
 class MotionDisturbance(NamedTuple):
@@ -38,23 +39,27 @@ class MotionObserver:
     """Estimates the needle's motion that its currents, by the bridge's model of coils and needle, do not explain.
 
     A thread that trails at an angle pulls the needle aside, and a longer one slows it. With the velocity m of the
-    needle's middle along and across its chord, measured by two poses, and that of the applied currents c, the estimate
-    d follows by
+    needle's middle along and across its chord, measured by two poses, and the mean c of the velocity by the currents
+    between the times of these poses, the estimate d follows by
 
         d' = g (m - c - d)
+
+    The coils compensate d: with a commanded velocity u, c = u - d. Of a needle that moves at k c, d converges for any
+    lateness of the poses as long as |k - 1| < 1.
 
     Source: disturbance observers of first order, Ohnishi, Shibata and Murakami 1996. Deviation: of velocities, not of
     forces, as inertia has no part. Pure: times come in, in seconds.
 
     Args:
         needle: its kinematics.
+        max_hold: the coils hold their currents for this long at the most [s].
     """
 
-    def __init__(self, needle: NeedleKinematics) -> None:
-        self._needle = needle
+    def __init__(self, needle: NeedleKinematics, max_hold: float = math.inf) -> None:
+        self._needle, self._max_hold = needle, max_hold
         self._velocity = np.zeros(2)
-        self._last: tuple[float, Vector, Vector] | None = None
-        self._applied, self._duration = np.zeros(2), 0.0
+        self._last: tuple[float, Vector] | None = None
+        self._applied: deque[tuple[float, Vector]] = deque()  # velocities by the currents, each with its start
 
     def update(self, tail: Vector, heading: Vector, stamp: float) -> None:
         """Take a measured pose.
@@ -64,34 +69,48 @@ class MotionObserver:
             heading: unit vector at the tail, shape (2,).
             stamp: when it was measured [s].
         """
-        e = self._needle.chord_direction(heading)
-        middle = tail + 0.5 * self._needle.chord * e
-        last, self._last = self._last, (stamp, middle, e)
-        applied = self._applied / self._duration if self._duration > 0.0 else np.zeros(2)
-        self._applied, self._duration = np.zeros(2), 0.0
+        middle = tail + 0.5 * self._needle.chord * self._needle.chord_direction(heading)
+        last, self._last = self._last, (stamp, middle)
         if last is None or not 0.0 < stamp - last[0] <= MAX_INTERVAL:
             if last is None or not 0.0 < stamp - last[0] <= MAX_GAP:
                 self._velocity = np.zeros(2)
             return
-        interval, moved = stamp - last[0], middle - last[1]
-        self._velocity += min(1.0, GAIN * interval) * (moved / interval - applied - self._velocity)
+        interval = stamp - last[0]
+        unexplained = (middle - last[1]) / interval - self._mean_applied(last[0], stamp)
+        self._velocity += min(1.0, GAIN * interval) * (unexplained - self._velocity)
 
-    def apply(self, heading: Vector, along: float, drift: float, duration: float) -> None:
-        """Register what currents are set for.
+    def apply(self, now: float, heading: Vector, along: float, drift: float) -> None:
+        """Register what currents are set for from a time on.
 
         Args:
+            now: time of the stamps' clock [s].
             heading: that the field is set for, at the tail, shape (2,).
             along: velocity along the chord that the currents give, by the bridge's model [m/s].
             drift: the same across it, to the left [m/s].
-            duration: since the last currents [s].
         """
         e = self._needle.chord_direction(heading)
-        self._applied += duration * np.array([along * e[0] - drift * e[1], along * e[1] + drift * e[0]])
-        self._duration += duration
+        self._register(now, np.array([along * e[0] - drift * e[1], along * e[1] + drift * e[0]]))
 
-    def rest(self, duration: float) -> None:
-        """Register that the currents are zero for a time [s]."""
-        self._duration += duration
+    def rest(self, now: float) -> None:
+        """Register that the currents are zero from a time of the stamps' clock on [s]."""
+        self._register(now, np.zeros(2))
+
+    def _register(self, now: float, velocity: Vector) -> None:
+        if self._applied and now < self._applied[-1][0]:
+            self._applied.clear()  # time was set back
+        self._applied.append((now, velocity))
+        while len(self._applied) > 1 and self._applied[1][0] < now - MAX_GAP:
+            self._applied.popleft()
+
+    def _mean_applied(self, start: float, end: float) -> Vector:
+        """Return the mean velocity by the currents between two times, shape (2,) [m/s]."""
+        total, until = np.zeros(2), end
+        for since, velocity in reversed(self._applied):
+            total += max(0.0, min(until, since + self._max_hold) - max(since, start)) * velocity
+            until = min(until, since)
+            if since <= start:
+                break
+        return total / (end - start)
 
     def disturbance(self, heading: Vector) -> MotionDisturbance:
         """Return what to compensate.

@@ -24,6 +24,7 @@ from magnetosuture_thread.shared_parameters import shared_parameter
 REACH_RATIO = 0.9  # of the reach to the coils' distance
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
+MAX_MOBILITY_RATIO = 2.0  # of a needle to that by its model, for a motion observer that is stable at any delay
 MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hold time
 
 
@@ -143,7 +144,8 @@ class CoilBridgeSettings(Configuration):
     )
     thread_drag: float = quantity(
         0.0,
-        "part of needle_drag that a straight thread behind the needle adds, for thread_feedforward",
+        "part of needle_drag that a straight thread behind the needle adds; thread_feedforward and motion_compensation "
+        "go by it",
         unit="N s/m",
         minimum=0.0,
         maximum=10.0,
@@ -181,12 +183,20 @@ class CoilBridgeSettings(Configuration):
         return REACH_RATIO * min(coil.distance for coil in self.coils_properties())
 
     def needle(self) -> NeedleMechanics:
-        """Return the needle's mechanics."""
+        """Return the needle's mechanics.
+
+        A slack thread does not slow the needle down as a straight one does. Where the motion is compensated, the drag
+        is therefore at most `MAX_MOBILITY_RATIO` times that of the needle without a thread: the needle then moves at
+        most so many times as fast as by the model, and `MotionObserver` converges however late its poses are.
+        """
+        drag = self.needle_drag
+        if self.motion_compensation:
+            drag = min(drag, MAX_MOBILITY_RATIO * (drag - self.thread_drag))
         return NeedleMechanics(
             self.needle_length,
             self.needle_curvature,
             self.needle_moment,
-            self.needle_drag,
+            drag,
             self.needle_drag_across,
             self.needle_turning_drag,
         )
@@ -235,7 +245,9 @@ class CoilBridgeSettings(Configuration):
         """Return what compensates the thread's pull; None if nothing shall."""
         if not self.thread_feedforward:
             return None
-        return ThreadFeedforward(self.needle(), self.thread_drag, self.prediction_timeout)
+        needle = self.needle()
+        added = self.thread_drag - (self.needle_drag - needle.drag)  # as much of the thread's as the model holds
+        return ThreadFeedforward(needle, added, self.prediction_timeout)
 
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
         """Return the safety filter for the wall and the shapes of a scene.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, Image
+from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera, Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, find_collision
@@ -27,13 +27,16 @@ class RigFrame:
 
     Attributes:
         time: since the start [s].
-        image: BGR, shape (height, width, 3); None if the frame got lost, or was not wanted.
+        image: BGR, shape (height, width, 3); None if the frame got lost, or is not rendered.
         lateness: how long it is held back before anybody gets it [s].
         tail: the needle's true tail, shape (2,) [m].
         heading: its true angle at the tail [rad].
         thread: the thread's true centreline from the tail on, shape (n + 1, 2) [m].
         pull: force of the thread upon the needle at its tail, shape (2,) [N].
         moment: of the thread upon the needle about its tail, counter-clockwise [N m].
+        lost: whether it gets lost on the way from the camera.
+        covers: what is between the dish and the camera.
+        gain: of its exposure, 1 as usual.
     """
 
     time: float
@@ -44,6 +47,9 @@ class RigFrame:
     thread: Vector
     pull: Vector
     moment: float
+    lost: bool = False
+    covers: tuple[Cover, ...] = ()
+    gain: float = 1.0
 
 
 class Rig:
@@ -237,9 +243,18 @@ class Rig:
         faults, dynamics, running = self.faults, self._dynamics, self.running
         away = faults.lifted(running)
         tail, thread = dynamics.tail + away, dynamics.thread + away
-        image = None
-        if not faults.drops(running, float(self._random.uniform())) and rendered:
-            covers = faults.covers(running, tail, dynamics.tip + away)
-            image = self.camera.render(tail, dynamics.heading, thread, covers, faults.gain(running))
+        lost = faults.drops(running, float(self._random.uniform()))
+        covers = faults.covers(running, tail, dynamics.tip + away)
         truth = tail, dynamics.heading, thread, dynamics.thread_pull, dynamics.thread_moment
-        return RigFrame(self.time, image, faults.lateness(running), *truth)
+        frame = RigFrame(self.time, None, faults.lateness(running), *truth, lost, covers, faults.gain(running))
+        return self.render(frame) if rendered else frame
+
+    def render(self, frame: RigFrame) -> RigFrame:
+        """Return a frame with its picture, where it does not get lost.
+
+        It may be called in another thread than the rest, by one at a time.
+        """
+        if frame.lost:
+            return frame
+        image = self.camera.render(frame.tail, frame.heading, frame.thread, frame.covers, frame.gain)
+        return replace(frame, image=image)

@@ -32,7 +32,7 @@ def observed(turn_rate: float, along: float, drift: float, applied: tuple[float,
     for k in range(400):
         angle = 0.3 + turn_rate * k * PERIOD
         e = direction(angle)
-        observer.apply(e, *applied, PERIOD)
+        observer.apply(1.0 + k * PERIOD, e, *applied)
         if k % 10 == 0:
             observer.update(middle - lever * e, e, 1.0 + k * PERIOD)
         middle = middle + PERIOD * (along * e + drift * np.array([-e[1], e[0]]))
@@ -73,10 +73,52 @@ def test_a_time_with_zero_currents_counts():
     tail = np.zeros(2)
     for k in range(40):
         observer.update(tail, e, 1.0 + 0.1 * k)
-        observer.apply(e, 2e-3, 0.0, 0.05)
-        observer.rest(0.05)
+        observer.apply(1.0 + 0.1 * k, e, 2e-3, 0.0)
+        observer.rest(1.05 + 0.1 * k)
         tail = tail + 0.05 * 2e-3 * e
     assert np.abs(observer.disturbance(e)).max() < 1e-9
+
+
+def test_a_pose_is_compared_with_the_currents_of_its_time_however_late_it_comes():
+    """The currents change all the time, and poses come 0.15 s late: all of the motion is explained by them."""
+    observer, e, tail, waiting = MotionObserver(NEEDLE.kinematics), direction(0.3), np.zeros(2), []
+    for k in range(800):
+        now = 1.0 + k * PERIOD
+        speed = 4e-3 * math.sin(20.0 * k * PERIOD)
+        if k % 10 == 0:
+            waiting.append((tail, now))
+            if len(waiting) > 3:
+                observer.update(waiting[-4][0], e, waiting[-4][1])
+        observer.apply(now, e, speed, 0.0)
+        tail = tail + PERIOD * speed * e
+    assert np.abs(observer.disturbance(e)).max() < 1e-9
+
+
+def test_after_time_was_set_back_currents_of_the_former_time_do_not_count():
+    observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
+    observer.apply(9.0, e, 5e-3, 0.0)
+    observer.rest(1.0)
+    for k in range(40):
+        observer.update(np.zeros(2), e, 1.0 + 0.05 * k)
+    assert np.abs(observer.disturbance(e)).max() < 1e-9
+
+
+@pytest.mark.parametrize("late", [0, 1, 2, 4, 8])
+@pytest.mark.parametrize("mobility", [0.5, 1.0, 1.9])
+def test_what_is_compensated_converges_however_late_poses_are(mobility: float, late: int):
+    """The needle moves at `mobility` times the velocity that the model expects of its currents, and is pulled."""
+    observer, e, tail, waiting = MotionObserver(NEEDLE.kinematics), direction(0.3), np.zeros(2), []
+    wanted, pull, before = 2e-3, -1e-3, np.zeros(2)
+    for k in range(4000):
+        now = 1.0 + k * PERIOD
+        if k % 10 == 0:
+            waiting.append((tail, now))
+            if len(waiting) > late:
+                observer.update(waiting[-1 - late][0], e, waiting[-1 - late][1])
+        applied = wanted - observer.disturbance(e).along
+        observer.apply(now, e, applied, 0.0)
+        before, tail = tail, tail + PERIOD * (mobility * applied + pull) * e
+    assert (tail - before) @ e / PERIOD == pytest.approx(wanted, rel=0.02)
 
 
 class MagneticNeedle:
@@ -127,3 +169,27 @@ def test_a_needle_that_is_pulled_aside_by_weak_and_strong_coils_goes_where_it_is
             assert needle.middle @ e == pytest.approx(4e-3, rel=0.12)  # until it is learned
     assert off[True] < 0.4 * off[False]
     assert turned[True] < 0.5 * turned[False]
+
+
+@pytest.mark.parametrize("stopped", ["by zero commands", "by a stall of the loop"])
+def test_the_bridge_counts_no_motion_while_its_currents_are_zero(stopped: str):
+    """A needle without a pull that is driven for 0.05 s of each 0.15 s: its currents explain all of its motion."""
+    e, lever, middle = direction(0.5), 0.5 * NEEDLE.chord, np.zeros(2)
+    bridge = CoilBridge(replace(SETTINGS, driver_timeout=0.05, command_timeout=0.2), ArmingLatch(), Scene())
+    bridge.latch.activate()
+    bridge.arm(DriverState(True))
+    for k in range(360):
+        now, phase = 1.0 + k * PERIOD, k % 30
+        if phase == 0:
+            bridge.on_pose(middle - lever * e, e, now, k + 1, now, now)
+        driven = phase < 10
+        if driven or stopped == "by zero commands":
+            bridge.command("needle", 2e-3 * e if driven else np.zeros(2), now, k + 1, now, now)
+            bridge.on_margins(now, True, 1.0, bridge.scene_version, now)
+            output = bridge.step(now, now, DriverState(True))
+            assert not output.reasons
+        held = driven or (stopped != "by zero commands" and phase < 19)  # the driver holds the last currents for 0.05 s
+        if held:
+            middle = middle + PERIOD * ((output.applied @ e) * e + output.allocation.drift * np.array([-e[1], e[0]]))
+    assert bridge._observer is not None
+    assert np.abs(bridge._observer.disturbance(e)).max() < 1e-5

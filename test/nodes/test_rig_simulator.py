@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import cv2
@@ -21,7 +22,7 @@ from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.replay.clock import Timeline
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
-from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes.scenes import scene_told
 
@@ -130,13 +131,49 @@ def test_currents_beyond_all_measure_end_nothing(graph):
     assert np.hypot(needles[-1].pose.position.x, needles[-1].pose.position.y) < 0.0176
 
 
+def test_currents_are_in_force_while_a_frame_is_rendered(graph, monkeypatch):
+    node = graph.add(RigSimulatorNode, **SMALL)
+    render, begun, go_on = node.rig.render, threading.Event(), threading.Event()
+
+    def slow(frame: RigFrame) -> RigFrame:
+        begun.set()
+        assert go_on.wait(30.0)
+        return render(frame)
+
+    monkeypatch.setattr(node.rig, "render", slow)
+    graph.wait(begun.is_set, "a frame")
+    graph.publish(topics.RIG_CURRENTS, currents(graph, 3, 0, 0, 0))
+    graph.wait(lambda: node.rig.currents.any(), "the currents")
+    assert node.rig.currents.tolist() == [3.0, 0.0, 0.0, 0.0]
+    frames = graph.listen(topics.COMPRESSED_IMAGE)
+    go_on.set()
+    graph.wait(lambda: len(frames) > 2, "frames")
+
+
+def test_an_error_while_a_frame_is_rendered_is_not_lost(graph, monkeypatch):
+    node = graph.add(RigSimulatorNode, **SMALL)
+
+    def fail(frame: RigFrame) -> RigFrame:
+        raise RuntimeError("no paint")
+
+    with graph.between_callbacks():
+        monkeypatch.setattr(node.rig, "render", fail)
+        node._take(node.time.elapsed())
+        assert node._rendering is not None
+        assert isinstance(node._rendering.exception(30.0), RuntimeError)
+        with pytest.raises(RuntimeError, match="no paint"):
+            node._take(node.time.elapsed())
+        monkeypatch.undo()
+        node._rendering = None
+
+
 def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monkeypatch):
     node = graph.add(RigSimulatorNode, **SMALL)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
     graph.publish(topics.RIG_CURRENTS, currents(graph, 3, 0, 0, 0))
     graph.wait(lambda: node.rig.running > 0.0, "the currents")
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise SolverError("rig", "no convergence", 1.0, 1e-8)
 
     monkeypatch.setattr(node.rig, "look", fail)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,9 @@ class RigSimulatorNode(PackageNode):
         self._phase: float | None = None
         self._last_index, self._clock_stamp = -1, 0
         self._frames = self._skipped = 0
+        # A thread of its own renders, so that currents are in force at once, as on a rig.
+        self._renderer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="renderer")
+        self._rendering: Future[None] | None = None
         self._late: deque[tuple[float, int, RigFrame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
@@ -103,7 +107,7 @@ class RigSimulatorNode(PackageNode):
         index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
         # No frame is stamped later than it is taken: the first tick may have been later than the others.
         self._phase = min(self._phase, elapsed - index / self._settings.frame_rate)
-        if index > self._last_index:
+        if index > self._last_index and (self._rendering is None or self._rendering.done()):
             self._skipped += index - self._last_index - 1
             self._last_index = index
             self._take(self._phase + index / self._settings.frame_rate)
@@ -112,7 +116,8 @@ class RigSimulatorNode(PackageNode):
             self._publisher.publish(stamp, frame)
 
     def destroy_node(self) -> None:
-        """Remove the serial lines of simulated boards."""
+        """End rendering, and remove the serial lines of simulated boards."""
+        self._renderer.shutdown()
         try:
             self.currents.close()
         finally:
@@ -137,17 +142,16 @@ class RigSimulatorNode(PackageNode):
 
     def _take(self, elapsed: float) -> None:
         try:
-            frame = self.rig.look(elapsed)
+            frame = self.rig.look(elapsed, rendered=False)
         except MagnetosutureError as error:
             self._fail(error)
             return
         finally:
             self._leave_out(elapsed - self.rig.time)
         stamp = self.time.stamp(frame.time)  # currents may have moved the rig on since the frame was due
-        if frame.lateness:
-            self._late.append((elapsed + frame.lateness, stamp, frame))
-        else:
-            self._publisher.publish(stamp, frame)
+        if self._rendering is not None:
+            self._rendering.result()  # raises what the last one raised
+        self._rendering = self._renderer.submit(self._render, elapsed, stamp, frame)
         self._frames += 1
         factor = self.time.real_time_factor(self.rig.time)
         late = factor < MIN_REAL_TIME_FACTOR
@@ -158,6 +162,14 @@ class RigSimulatorNode(PackageNode):
         level = self.health.error if self.rig.problem else moving
         values = {"taken": self._frames, "skipped": self._skipped, "real_time_factor": round(factor, 2)}
         level(text, **values, **{"lag [s]": round(self.time.lag, 3)})
+
+    def _render(self, elapsed: float, stamp: int, frame: RigFrame) -> None:
+        """Render a frame and publish it, in the renderer's thread; a late one is published when it is due."""
+        frame = self.rig.render(frame)
+        if frame.lateness:
+            self._late.append((elapsed + frame.lateness, stamp, frame))
+        else:
+            self._publisher.publish(stamp, frame)
 
     def _fail(self, error: MagnetosutureError) -> None:
         """Switch the coils off where the simulation does not find its next state, and say so."""
