@@ -25,6 +25,9 @@ class CertifiedAllocation:
     the velocity is taken as is, while the currents against the disturbance stay, as far as they are certified without
     it. Where nothing is known of a disturbance, all currents are scaled by the certified share.
 
+    A needle cannot turn away from what it lies along, as its other end would come closer. Where a disturbance is
+    measured, the currents therefore take it off sideways by their force across it, see `NeedleSafetyFilter.sidestep`.
+
     Args:
         coils: allocate the currents.
         max_speed: of the tip by the currents [m/s].
@@ -73,17 +76,22 @@ class CertifiedAllocation:
             pull: predicted velocity of the tip by the thread's pull, which they compensate too, shape (2,) [m/s]; both
                 motions are certified, with it and without.
         """
-        beside = np.zeros(2)
+        beside = compensated = np.zeros(2)
+        countered = disturbance
         if disturbance is not None:
-            beside = disturbance.velocity(self._coils.chord_direction(pose.heading))
-        velocity = self._within_limit(velocity - pull) - beside
+            e = self._coils.chord_direction(pose.heading)
+            beside = disturbance.velocity(e)
+            # The opposite of this is what the currents are for, besides the velocity.
+            countered = disturbance._replace(drift=disturbance.drift - safety.sidestep(pose.tail, pose.heading))
+            compensated = countered.velocity(e)
+        velocity = self._within_limit(velocity - pull) - compensated
 
         def certified(found: Allocation, added: Vector) -> tuple[float, str]:
             drift = 0.0 if disturbance is None else found.drift + disturbance.drift
             return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
 
         def allocated(wanted: Vector) -> Allocation:
-            return self._coils.allocate(wanted, pose.tail, pose.heading, previous.currents, max_change, disturbance)
+            return self._coils.allocate(wanted, pose.tail, pose.heading, previous.currents, max_change, countered)
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         for _ in range(1 + MAX_CORRECTIONS):
@@ -93,7 +101,7 @@ class CertifiedAllocation:
                 share, name = min((share, name), certified(found, beside + pull))
             kept = found.scaled(share)
             if share < 1.0 and disturbance is not None:
-                kept = allocated(-beside).towards(found, share)
+                kept = allocated(-compensated).towards(found, share)
                 own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
                 kept = kept.scaled(own)
             error = float(np.linalg.norm(kept.velocity - velocity))

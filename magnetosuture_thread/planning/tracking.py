@@ -30,6 +30,11 @@ ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as
 PULL_DECAY = 1.0  # s; in which the peak of a pull falls to 1 / e
 TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, from which on the needle tacks
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
+CROSSING_TIME = (
+    0.3  # s; after the course has changed to the other side of an axis, in which the needle is turned faster
+)
+CROSSING_GAIN, MAX_CROSSING_RATIO = 12.0, 4.0  # 1/s, and of the allowed speed: in place of TURN_GAIN, MAX_TURN_RATIO
+MIN_TACK_TIME = 1.0  # s; after a crossing, in which the needle does not tack
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
 
@@ -68,11 +73,12 @@ class PathTracker:
     Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off the axes by
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
-    crosses, or while the needle is far off its path to the wrong side, as a ship tacks. All of theta - theta_p stays
-    within what half of the path's leeway allows. Where d is more than the coils compensate at the needle's direction,
-    or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down to `MIN_SPEED_SHARE`: a thread in a
-    liquid pulls less when it is pulled slowly. Corrections of the direction are raised by as much as the bridge slows
-    them, within the same limits.
+    crosses, or while the needle is far off its path to the wrong side, as a ship tacks, but not within `MIN_TACK_TIME`
+    of a crossing. In a crossing the needle is turned faster, as nothing compensates the pull meanwhile. All of
+    theta - theta_p stays within what half of the path's leeway allows. Where d is more than the coils compensate at
+    the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down to
+    `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction are raised
+    by as much as the bridge slows them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -93,6 +99,7 @@ class PathTracker:
         self._integral = 0.0
         self._pull = 0.0  # across the needle, as a velocity: its peak, which is forgotten slowly [m/s]
         self._tack = 0.0  # error across the path for which the needle lies on the other side [m]; 0 if it does not
+        self._crossed = -math.inf  # stamp at which the course has changed to the other side of an axis [s]
         self._side = 0.0  # of the nearest axis, on which the needle lies; 0 before the first pose
 
     @property
@@ -142,7 +149,7 @@ class PathTracker:
         course = min(allowed, max(-allowed, course))
         # Close to an axis less of the pull is measured, so its peak is remembered for a while.
         self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_DECAY))
-        off_axis = min(allowed, max(-allowed, self._off_axes(direction, course, across)))
+        off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, across)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
         waits = hold or abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
@@ -163,11 +170,13 @@ class PathTracker:
         limit = MAX_ALONG_RATIO * speed
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
         v = self.path.lever * self._speed * turning
-        limit = MAX_TURN_RATIO * speed
-        v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
+        crosses = stamp - self._crossed < CROSSING_TIME
+        gain, ratio = (CROSSING_GAIN, MAX_CROSSING_RATIO) if crosses else (TURN_GAIN, MAX_TURN_RATIO)
+        limit = ratio * speed
+        v += min(limit, max(-limit, raised * gain * self.path.lever * turn))
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
-    def _off_axes(self, direction: float, course: float, across: float) -> float:
+    def _off_axes(self, stamp: float, direction: float, course: float, across: float) -> float:
         """Return the course with which the needle stays off the coils' axes, on the side of the planned direction.
 
         A needle that is far off its path on one side tacks: it stays on the other side of the axis until it is back.
@@ -179,10 +188,13 @@ class PathTracker:
         if abs(planned) >= kept or across * self._tack <= 0.0:
             self._tack = 0.0
         is_off = abs(across) > min(MAX_TACK_ERROR, TACK_SHARE * self.leeway)
-        if is_off and not self._tack and abs(planned) < kept and course * self._side < 0.0:
-            self._side, self._tack = -self._side, across
-        if not self._tack and (not self._side or planned * self._side <= -AXIS_CROSSED):
+        side, may_tack = self._side, stamp - self._crossed > MIN_TACK_TIME
+        if is_off and may_tack and not self._tack and abs(planned) < kept and course * side < 0.0:
+            self._side, self._tack = -side, across
+        if not self._tack and (not side or planned * side <= -AXIS_CROSSED):
             self._side = math.copysign(1.0, planned)
+        if side and self._side != side and abs(planned) < kept:
+            self._crossed = stamp
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
 
     def _compensated_share(self, angle: float) -> float:

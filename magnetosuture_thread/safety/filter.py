@@ -15,6 +15,7 @@ from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.limits import checked_speed, limit_norm, rate_limit
 from magnetosuture_thread.safety.motion import BodyData, FilterData
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
@@ -26,6 +27,8 @@ MAX_POINTS = 129
 BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
 MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
 STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
+SIDESTEP_MARGIN = 1e-4  # m; beyond keep_out, within which the needle is taken off sideways
+SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
 CHECKS = 8  # instants of a hold at which an added barrier is checked
 BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
 ROUNDING = 1e-12  # by which an added barrier may decrease
@@ -189,7 +192,7 @@ class NeedleSafetyFilter:
         if not 0.0 <= slowdown <= 1.0:
             raise InvalidInputError("slowdown", slowdown, "a factor from 0 to 1")
         self._time = time
-        speed = _speed(commanded)
+        speed = checked_speed(commanded)
         if speed == 0.0:
             return FilteredCommand(commanded, np.zeros(2), slowdown)
         active = [FRICTION] if slowdown < 1.0 else []
@@ -220,7 +223,7 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        speed = _speed(velocity)
+        speed = checked_speed(velocity)
         needle = self._at(tail, heading)
         if speed == 0.0:
             return velocity, []
@@ -258,7 +261,7 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        _speed(velocity)
+        checked_speed(velocity)
         x, y = float(velocity[0]), float(velocity[1])
         time, what, _ = safe_time(x, y, self._at(tail, heading), self._packed, drift)
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
@@ -328,6 +331,31 @@ class NeedleSafetyFilter:
         wall = self.scene.dish.radius - float(np.hypot(needle.points[:, 0], needle.points[:, 1]).max())
         return min(wall, float(needle.distances.min(initial=math.inf)))
 
+    def sidestep(self, tail: Vector, heading: Vector) -> float:
+        """Return the velocity across the chord, to its left, that takes the needle off what it is close to [m/s].
+
+        With the distances d of the needle's points from wall and shapes, their gradients g, and n across the chord,
+
+            r (max w + min w)    of    w = max(0, keep_out + SIDESTEP_MARGIN - d) g . n,    r = SIDESTEP_RATE
+
+        It is 0 for a needle that is close to nothing, or in the middle of a gap.
+
+        Raises:
+            InvalidInputError: something is not finite.
+        """
+        needle = self._at(tail, heading)
+        bound = self.keep_out + SIDESTEP_MARGIN
+        radii = np.hypot(needle.points[:, 0], needle.points[:, 1])
+        walls = self.scene.dish.radius - radii
+        if walls.min() >= bound and needle.distances.min(initial=math.inf) >= bound:
+            return 0.0
+        n = np.array([-needle.chord_y, needle.chord_x])
+        from_wall = np.maximum(0.0, bound - walls) * (needle.points @ n) / -np.maximum(radii, 1e-12)
+        from_shapes = np.maximum(0.0, bound - needle.distances) * (needle.normal @ n)
+        found = np.concatenate([from_wall, from_shapes.ravel()])
+        step = SIDESTEP_RATE * float(found.max(initial=0.0) + found.min(initial=0.0))
+        return min(MAX_SIDESTEP, max(-MAX_SIDESTEP, step))
+
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
         key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
@@ -361,34 +389,6 @@ class NeedleSafetyFilter:
         return needle
 
 
-def limit_norm(vector: Vector, max_norm: float) -> Vector:
-    """Return a vector scaled down to a maximum norm; its direction is kept.
-
-    >>> limit_norm(np.array([3.0, 4.0]), 1.0)
-    array([0.6, 0.8])
-    """
-    # Scaled by the largest component first: the squares of a hostile command may overflow.
-    greatest = float(np.max(np.abs(vector)))
-    if greatest == 0.0:
-        return np.zeros_like(vector)
-    direction = vector / greatest
-    norm = float(np.linalg.norm(direction))
-    return vector if greatest * norm <= max_norm else direction * (max_norm / norm)
-
-
-def rate_limit(previous: Vector, target: Vector, max_change: float) -> Vector:
-    """Return the vector closest to the target within a maximum change from the previous one."""
-    return previous + limit_norm(target - previous, max_change)
-
-
 def rest_reason(names: list[str]) -> str:
     """Return the reason of a needle that rests at constraints."""
     return f"stopped by {', '.join(dict.fromkeys(names))}"
-
-
-def _speed(velocity: Vector) -> float:
-    """Return the size of a velocity, once it is known to have one."""
-    x, y = float(velocity[0]), float(velocity[1])
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InvalidInputError("velocity", [x, y], "finite numbers [m/s]")
-    return math.hypot(x, y)

@@ -16,6 +16,7 @@ from magnetosuture_thread.planning.tracking import (
     MAX_ALONG_RATIO,
     MAX_AXIS_ANGLE,
     MIN_SPEED_SHARE,
+    MIN_TACK_TIME,
     TACK_SHARE,
     PathTracker,
 )
@@ -88,6 +89,27 @@ def test_it_crosses_the_axis_on_a_bend_at_once():
     near = [np.count_nonzero(np.abs(found) < 0.5 * MAX_AXIS_ANGLE) / RATE for found in (without, off)]
     assert near[1] < 0.4 * near[0]
     assert np.count_nonzero(np.diff(np.sign(off))) == 1
+
+
+def test_a_needle_that_is_thrown_aside_in_a_crossing_stays_on_its_side_of_the_axis():
+    """It is off its path by more than the leeway then, for which it would tack."""
+    tracker = PathTracker(path(np.linspace(math.radians(30.0), math.radians(-12.0), 80)), COIL_ANGLES)
+    middle, angle = tracker.path.at(0.0)
+    after: list[float] = []
+    for k in range(200):
+        command = tracker.compute_command(k / RATE, middle, angle, 0.002, 1.0, 2e-3)
+        e = np.array([math.cos(angle), math.sin(angle)])
+        across = float(e[0] * command.velocity[1] - e[1] * command.velocity[0])
+        before, angle = angle, angle + across / tracker.path.lever / RATE
+        middle = middle + command.velocity @ e * e / RATE
+        if not after and before > 0.0 >= angle:
+            middle = middle - 8e-4 * np.array([-e[1], e[0]])
+        if after or before > 0.0 >= angle:
+            after.append(angle)
+        if len(after) >= 0.8 * MIN_TACK_TIME * RATE:
+            break
+    assert len(after) >= 0.8 * MIN_TACK_TIME * RATE
+    assert max(after[2:]) < -0.5 * MAX_AXIS_ANGLE
 
 
 def test_headings_beside_the_axes_are_as_planned_however_the_needle_is_pulled():

@@ -12,7 +12,7 @@ from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import BAND
+from magnetosuture_thread.safety.filter import BAND, MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -108,6 +108,40 @@ def test_between_two_walls_too_near_a_needle_can_still_leave_along_them():
     ]
     found = needle_filter(*walls).filter(np.array([0.004, 0.003]), np.array([-0.0035, 0.0]), EAST)
     np.testing.assert_allclose(found.filtered, [0.004, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("depth", [1e-5, 8e-5, 1.8e-4])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_needle_along_a_block_is_taken_off_sideways(depth: float, turned: bool):
+    """The block is on the left of a needle to the east, and on the right of one to the west."""
+    y = -(KEEP + SIDESTEP_MARGIN - depth)
+    tail, heading = (np.array([0.5 * LENGTH, y]), -EAST) if turned else (np.array([-0.5 * LENGTH, y]), EAST)
+    step = needle_filter(BLOCK).sidestep(tail, heading)
+    assert step == pytest.approx((1.0 if turned else -1.0) * min(MAX_SIDESTEP, SIDESTEP_RATE * depth), rel=1e-6)
+
+
+def test_a_needle_that_points_to_a_block_is_not_taken_off_sideways_by_it():
+    step = needle_filter(BLOCK).sidestep(np.array([0.0, -LENGTH - KEEP]), NORTH)
+    assert abs(step) < 1e-12
+
+
+def test_a_needle_along_the_wall_is_taken_off_towards_the_middle():
+    tail = np.array([-0.5 * LENGTH, -0.0175 + KEEP + 1e-4])
+    assert needle_filter().sidestep(tail, EAST) > 1e-4
+    assert needle_filter().sidestep(tail + LENGTH * EAST, -EAST) < -1e-4
+
+
+def test_far_from_everything_and_in_the_middle_of_a_gap_there_is_no_step_sideways():
+    assert needle_filter(BLOCK).sidestep(np.array([-0.5 * LENGTH, -2e-3]), EAST) == 0.0
+    walls = [
+        SceneShape(
+            f"wall_{k}", "wall", Polygon(((-0.01, s * 4e-4), (0.01, s * 4e-4), (0.01, s * 2e-3), (-0.01, s * 2e-3)))
+        )
+        for k, s in enumerate((1.0, -1.0))
+    ]
+    gap = needle_filter(*walls)
+    assert abs(gap.sidestep(np.array([-0.5 * LENGTH, 0.0]), EAST)) < 1e-9
+    assert gap.sidestep(np.array([-0.5 * LENGTH, 1e-4]), EAST) == pytest.approx(-SIDESTEP_RATE * 2e-4, rel=1e-6)
 
 
 def test_a_curved_needle_is_kept_clear_with_its_belly():

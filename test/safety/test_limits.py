@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.safety.filter import limit_norm, rate_limit
+from magnetosuture_thread.safety.limits import limit_norm, rate_limit
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0), (1e-320, 0.0), (3.0, -4.0), (1e308, 1e308), (-1e-5, 2e-5)])

@@ -1,0 +1,44 @@
+"""Limits on the size of a velocity and on its change."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import InvalidInputError
+
+Vector = NDArray[np.float64]
+
+
+def limit_norm(vector: Vector, max_norm: float) -> Vector:
+    """Return a vector scaled down to a maximum norm; its direction is kept.
+
+    >>> limit_norm(np.array([3.0, 4.0]), 1.0)
+    array([0.6, 0.8])
+    """
+    # Scaled by the largest component first: the squares of a hostile command may overflow.
+    greatest = float(np.max(np.abs(vector)))
+    if greatest == 0.0:
+        return np.zeros_like(vector)
+    direction = vector / greatest
+    norm = float(np.linalg.norm(direction))
+    return vector if greatest * norm <= max_norm else direction * (max_norm / norm)
+
+
+def rate_limit(previous: Vector, target: Vector, max_change: float) -> Vector:
+    """Return the vector closest to the target within a maximum change from the previous one."""
+    return previous + limit_norm(target - previous, max_change)
+
+
+def checked_speed(velocity: Vector) -> float:
+    """Return the size of a velocity [m/s].
+
+    Raises:
+        InvalidInputError: it is not finite.
+    """
+    x, y = float(velocity[0]), float(velocity[1])
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise InvalidInputError("velocity", [x, y], "finite numbers [m/s]")
+    return math.hypot(x, y)
