@@ -70,7 +70,7 @@ class NeedleSafetyFilter:
     velocity than the one filtered, as coil currents do, multiplies it by its own share.
 
     A needle that is closer already may leave or slide along, and gets no closer; zero is always allowed, and nothing
-    but a command moves the needle, no faster than it was commanded.
+    but a command moves the needle, no faster than it was commanded. `sidestep` is for whoever can push it sideways.
 
     The axis is represented by at most 129 points, a distance s apart. None of them gets closer to a shape than
     sqrt(keep_out^2 + (1 + |c| keep_out) s^2 / 4), nor to the wall than keep_out + |c| s^2 / 8, with the needle's
