@@ -12,7 +12,7 @@ from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.motion_observer import MotionObserver
+from magnetosuture_thread.coils.motion_observer import MotionDisturbance, MotionObserver
 from magnetosuture_thread.coils.pose_extrapolator import TOPIC, PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor, StampAges
@@ -268,9 +268,11 @@ class CoilBridge:
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
         if not selected.velocity.any():
-            output = replace(self._zero_output(now, arrival, selected, ()), publish=True)
-            self._stopped = None
+            output, self._stopped = replace(self._zero_output(now, arrival, selected, ()), publish=True), None
             return output
+        max_speed = min(
+            self._settings.max_speed, self._settings.speed_without_prediction if no_prediction else math.inf
+        )
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
         slowed = selected.source == OPERATOR or self._settings.friction_feedback == "all"
         filtered = self._filter.filter(
@@ -278,7 +280,7 @@ class CoilBridge:
             pose.tail,
             pose.heading,
             slowdown=self.prediction_monitor.slowdown if slowed and not no_prediction else 1.0,
-            max_speed=self._settings.speed_without_prediction if no_prediction else math.inf,
+            max_speed=max_speed,
             previous=self._velocity,
             elapsed=elapsed,
             time=now,
@@ -288,17 +290,17 @@ class CoilBridge:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
         max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
         disturbance = None if self._observer is None else self._observer.disturbance(pose.heading)
-        drift = 0.0 if disturbance is None else disturbance.drift
         if self.feedforward is not None and not no_prediction:
             pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
+        sidestep = min(filtered.slowdown * math.hypot(*selected.velocity), max_speed - math.hypot(*filtered.filtered))
         allocation, limiting = self._coils.allocate(
-            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, pull
+            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, pull, sidestep
         )
-        active += tuple(
-            name for name in (limiting, CURRENT_LIMIT if allocation.saturated else "") if name and name not in active
-        )
-        e = self._coils.chord_direction(pose.heading)
-        expected = allocation.velocity if disturbance is None else allocation.velocity + disturbance.velocity(e)
+        e, limits = self._coils.chord_direction(pose.heading), (limiting, CURRENT_LIMIT if allocation.saturated else "")
+        active += tuple(name for name in limits if name and name not in active)
+        measured = MotionDisturbance() if disturbance is None else disturbance
+        expected = allocation.velocity + measured.velocity(e)
+        drift = 0.0 if disturbance is None else allocation.drift + measured.drift
         is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
         # A needle that is pulled is held by currents where it may not go on.
         if (is_stuck and self._observer is None) or np.abs(allocation.currents).max() < NO_CURRENT:
@@ -306,11 +308,11 @@ class CoilBridge:
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
-        self.extrapolator.apply_velocity(expected, now, arrival)
+        self.extrapolator.apply_velocity(expected, now, arrival, drift)
         if self._observer is not None:
             self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift)
             self._gains.apply(now, allocation.currents)
-        return self._output(selected, (), True, active, filtered.slowdown, drift)
+        return self._output(selected, (), True, active, filtered.slowdown, measured.drift)
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""
@@ -395,5 +397,4 @@ class CoilBridge:
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""
         self._previous, self._velocity = self._coils.zero(), np.zeros(2)
-        if self._observer is not None:
-            self._gains.stop()
+        self._gains.stop()

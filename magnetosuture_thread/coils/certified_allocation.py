@@ -63,6 +63,7 @@ class CertifiedAllocation:
         max_change: float,
         disturbance: MotionDisturbance | None,
         pull: Vector,
+        max_sidestep: float = 0.0,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
@@ -75,33 +76,60 @@ class CertifiedAllocation:
             disturbance: measured, which the currents compensate; None where nothing is measured.
             pull: predicted velocity of the tip by the thread's pull, which they compensate too, shape (2,) [m/s]; both
                 motions are certified, with it and without.
+            max_sidestep: at which the needle may be taken off sideways; never where nothing is measured [m/s].
         """
-        beside = compensated = np.zeros(2)
-        countered = disturbance
+        wanted = self._within_limit(velocity - pull)
+        if disturbance is None:
+            return self._allocate(wanted, pose, safety, previous, max_change, None, pull, 0.0)
+        sidestep = min(max_sidestep, max(-max_sidestep, safety.sidestep(pose.tail, pose.heading)))
+        disturbed = disturbance.velocity(self._coils.chord_direction(pose.heading))
+        best, max_share = (self._coils.zero(), ""), -1.0
+        for step in (sidestep, 0.0) if sidestep else (0.0,):
+            found = self._allocate(wanted, pose, safety, previous, max_change, disturbance, pull, step)
+            motion, drift = found[0].velocity + disturbed, found[0].drift + disturbance.drift
+            share, _ = safety.safe_share(motion, pose.tail, pose.heading, drift)
+            if share > max_share:
+                best, max_share = found, share
+            if share >= MIN_SHARE:
+                break  # else it may be the step that brings the needle too close to something else
+        return best
+
+    def _allocate(
+        self,
+        wanted: Vector,
+        pose: Pose,
+        safety: NeedleSafetyFilter,
+        previous: Allocation,
+        max_change: float,
+        disturbance: MotionDisturbance | None,
+        pull: Vector,
+        sidestep: float,
+    ) -> tuple[Allocation, str]:
+        """Return currents for a velocity of the tip, and of the whole needle across its chord; see `allocate`."""
+        disturbed = aside = np.zeros(2)
+        to_compensate = disturbance
         if disturbance is not None:
             e = self._coils.chord_direction(pose.heading)
-            beside = disturbance.velocity(e)
-            # The opposite of this is what the currents are for, besides the velocity.
-            countered = disturbance._replace(drift=disturbance.drift - safety.sidestep(pose.tail, pose.heading))
-            compensated = countered.velocity(e)
-        velocity = self._within_limit(velocity - pull) - compensated
+            disturbed, aside = disturbance.velocity(e), sidestep * np.array([-e[1], e[0]])
+            to_compensate = disturbance._replace(drift=disturbance.drift - sidestep)
+        velocity = wanted + aside - disturbed
 
         def certified(found: Allocation, added: Vector) -> tuple[float, str]:
             drift = 0.0 if disturbance is None else found.drift + disturbance.drift
             return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
 
-        def allocated(wanted: Vector) -> Allocation:
-            return self._coils.allocate(wanted, pose.tail, pose.heading, previous.currents, max_change, countered)
+        def allocated(target: Vector) -> Allocation:
+            return self._coils.allocate(target, pose.tail, pose.heading, previous.currents, max_change, to_compensate)
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         for _ in range(1 + MAX_CORRECTIONS):
             found = allocated(target)
-            share, name = certified(found, beside)
+            share, name = certified(found, disturbed)
             if pull.any():
-                share, name = min((share, name), certified(found, beside + pull))
+                share, name = min((share, name), certified(found, disturbed + pull))
             kept = found.scaled(share)
             if share < 1.0 and disturbance is not None:
-                kept = allocated(-compensated).towards(found, share)
+                kept = allocated(aside - disturbed).towards(found, share)
                 own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
                 kept = kept.scaled(own)
             error = float(np.linalg.norm(kept.velocity - velocity))
@@ -109,8 +137,9 @@ class CertifiedAllocation:
                 best, min_error, limiting = kept, error, name
             if share >= MIN_SHARE:
                 break
-            clear, _ = safety.nearest_clear(found.velocity + beside, pose.tail, pose.heading)
-            target = target - (found.velocity + beside - clear)
+            turning = found.velocity + disturbed - aside
+            clear, _ = safety.nearest_clear(turning, pose.tail, pose.heading)
+            target = target - (turning - clear)
         return best, limiting
 
     def _within_limit(self, velocity: Vector) -> Vector:

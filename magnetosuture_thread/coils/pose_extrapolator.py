@@ -14,10 +14,10 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
-BodyVelocity = tuple[float, float]
-"""Velocity of the tip along the chord and across it [m/s]."""
+BodyVelocity = tuple[float, float, float]
+"""Velocity of the tip along the chord and across it, and as much of that as is of the whole needle [m/s]."""
 
-ZERO_VELOCITY: BodyVelocity = (0.0, 0.0)
+ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
 SIGMA_COUNT = 3.0
@@ -161,7 +161,7 @@ class PoseExtrapolator:
             return f"no needle pose for {self._timeout:g} s"
         return "no needle pose since the loop stalled" if self._extrapolated is None else ""
 
-    def apply_velocity(self, velocity: Vector, now: float, arrival: float) -> None:
+    def apply_velocity(self, velocity: Vector, now: float, arrival: float, drift: float = 0.0) -> None:
         """Register the tip velocity that the coils give from a time on.
 
         The velocity is constant in the needle's frame until the next call: force and torque move with the needle.
@@ -170,6 +170,7 @@ class PoseExtrapolator:
             velocity: shape (2,) [m/s].
             now: time of the stamps' clock [s].
             arrival: a monotonic time [s].
+            drift: part of it across the chord that the whole needle has [m/s]; the rest turns the needle.
         """
         self._check_stall(arrival)
         if self._history and now < self._history[-1][0]:
@@ -177,7 +178,7 @@ class PoseExtrapolator:
         self._extrapolate(self._velocity, now)
         self._velocity, self._applied_at = ZERO_VELOCITY, arrival
         if velocity.any() and self._extrapolated is not None:
-            self._velocity = self._needle.body_velocity(self._extrapolated.heading, velocity)
+            self._velocity = (*self._needle.body_velocity(self._extrapolated.heading, velocity), drift)
         self._history.append((now, self._velocity))
         while len(self._history) > 1 and self._history[1][0] < now - self._timeout:
             self._history.popleft()
@@ -255,12 +256,12 @@ class PoseExtrapolator:
             self._extrapolated = None
 
     def _extrapolate(self, velocity: BodyVelocity, now: float) -> None:
-        """Extrapolate the pose to a time, by velocities along the chord and across it [m/s]."""
+        """Extrapolate the pose to a time, by a velocity in the needle's frame."""
         ahead = now - self._until
         if self._extrapolated is None or ahead <= 0.0:
             return
         self._until = now
         if velocity != ZERO_VELOCITY:
-            self._extrapolated = Pose(
-                *self._needle.moved(self._extrapolated.tail, self._extrapolated.heading, *velocity, ahead)
-            )
+            along, across, drift = velocity
+            pose = self._extrapolated
+            self._extrapolated = Pose(*self._needle.moved(pose.tail, pose.heading, along, across, ahead, drift))

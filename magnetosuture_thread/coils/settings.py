@@ -24,7 +24,8 @@ from magnetosuture_thread.shared_parameters import shared_parameter
 REACH_RATIO = 0.9  # of the reach to the coils' distance
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
-MAX_MOBILITY_RATIO = 2.0  # of a needle to that by its model, for a motion observer that is stable at any delay
+MAX_MOBILITY_RATIO = 2.0  # of a needle to that by its model, for a motion observer that is stable with late poses
+MAX_THREAD_SHARE = 0.9  # of needle_drag, where the motion is compensated
 MAX_BLIND_DISTANCE = 0.0125  # m; maximum distance of free motion within the hold time
 
 
@@ -187,7 +188,7 @@ class CoilBridgeSettings(Configuration):
 
         A slack thread does not slow the needle down as a straight one does. Where the motion is compensated, the drag
         is therefore at most `MAX_MOBILITY_RATIO` times that of the needle without a thread: the needle then moves at
-        most so many times as fast as by the model, and `MotionObserver` converges however late its poses are.
+        most so many times as fast as by the model, and `MotionObserver` converges with poses up to 0.2 s late.
         """
         drag = self.needle_drag
         if self.motion_compensation:
@@ -289,6 +290,10 @@ class CoilBridgeSettings(Configuration):
             limit = MAX_BLIND_DISTANCE / self.hold_time
             rule = f"max_speed x (driver_timeout + 1 / rate) may be at most {MAX_BLIND_DISTANCE:g} m"
             raise self.refused("max_speed", f"at most {limit:.3g} m/s: {rule}")
+        if self.motion_compensation and self.thread_drag > MAX_THREAD_SHARE * self.needle_drag:
+            rule = "a needle has drag of its own, by which its motion is compensated"
+            limit = MAX_THREAD_SHARE * self.needle_drag
+            raise self.refused("thread_drag", f"at most {limit:g} N s/m, {MAX_THREAD_SHARE:g} of needle_drag: {rule}")
         if self.thread_drag > self.needle_drag:
             raise self.refused("thread_drag", f"at most {self.GROUP}.needle_drag, {self.needle_drag:g} N s/m")
         # One step may not use more than the whole clearance.

@@ -170,7 +170,7 @@ class PathTracker:
         limit = MAX_ALONG_RATIO * speed
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
         v = self.path.lever * self._speed * turning
-        crosses = stamp - self._crossed < CROSSING_TIME
+        crosses = 0.0 <= stamp - self._crossed < CROSSING_TIME
         gain, ratio = (CROSSING_GAIN, MAX_CROSSING_RATIO) if crosses else (TURN_GAIN, MAX_TURN_RATIO)
         limit = ratio * speed
         v += min(limit, max(-limit, raised * gain * self.path.lever * turn))
@@ -188,7 +188,7 @@ class PathTracker:
         if abs(planned) >= kept or across * self._tack <= 0.0:
             self._tack = 0.0
         is_off = abs(across) > min(MAX_TACK_ERROR, TACK_SHARE * self.leeway)
-        side, may_tack = self._side, stamp - self._crossed > MIN_TACK_TIME
+        side, may_tack = self._side, not 0.0 <= stamp - self._crossed <= MIN_TACK_TIME
         if is_off and may_tack and not self._tack and abs(planned) < kept and course * side < 0.0:
             self._side, self._tack = -side, across
         if not self._tack and (not side or planned * side <= -AXIS_CROSSED):

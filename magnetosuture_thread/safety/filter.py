@@ -29,6 +29,7 @@ MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows 
 STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
 SIDESTEP_MARGIN = 1e-4  # m; beyond keep_out, within which the needle is taken off sideways
 SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
+SIDESTEP_BALANCE = 1e-6  # m; of depth on both sides, from which on the needle is in a gap
 CHECKS = 8  # instants of a hold at which an added barrier is checked
 BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
 ROUNDING = 1e-12  # by which an added barrier may decrease
@@ -336,9 +337,9 @@ class NeedleSafetyFilter:
 
         With the distances d of the needle's points from wall and shapes, their gradients g, and n across the chord,
 
-            r (max w + min w)    of    w = max(0, keep_out + SIDESTEP_MARGIN - d) g . n,    r = SIDESTEP_RATE
+            r w    of the greatest |w| with    w = max(0, keep_out + SIDESTEP_MARGIN - d) g . n,    r = SIDESTEP_RATE
 
-        It is 0 for a needle that is close to nothing, or in the middle of a gap.
+        It is 0 for a needle that is close to nothing, or to something on both sides.
 
         Raises:
             InvalidInputError: something is not finite.
@@ -353,8 +354,10 @@ class NeedleSafetyFilter:
         from_wall = np.maximum(0.0, bound - walls) * (needle.points @ n) / -np.maximum(radii, 1e-12)
         from_shapes = np.maximum(0.0, bound - needle.distances) * (needle.normal @ n)
         found = np.concatenate([from_wall, from_shapes.ravel()])
-        step = SIDESTEP_RATE * float(found.max(initial=0.0) + found.min(initial=0.0))
-        return min(MAX_SIDESTEP, max(-MAX_SIDESTEP, step))
+        left, right = float(found.max(initial=0.0)), float(found.min(initial=0.0))
+        if left > SIDESTEP_BALANCE and right < -SIDESTEP_BALANCE:
+            return 0.0
+        return min(MAX_SIDESTEP, max(-MAX_SIDESTEP, SIDESTEP_RATE * (left + right)))
 
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""

@@ -18,10 +18,11 @@ Vector = NDArray[np.float64]
 class NeedleKinematics:
     """A needle that is driven along its chord and turned about the middle of it.
 
-        u = v . e,    omega = (v . n) / (chord / 2)
-        x_middle(t) = x_middle + u t sinc(omega t / 2) R(omega t / 2) e,    heading(t) = R(omega t) heading
+        u = v . e,    omega = (v . n - w) / (chord / 2)
+        x_middle(t) = x_middle + t sinc(omega t / 2) R(omega t / 2) (u e + w n),    heading(t) = R(omega t) heading
 
-    with the tip's velocity v when the motion begins, the unit vector e from tail to tip and n to its left. The
+    with the tip's velocity v when the motion begins, the unit vector e from tail to tip and n to its left, and the
+    velocity w at which the whole needle drifts across its chord, if it does. The
     velocity is constant as the needle has it, in the frame of its body: currents that do not change pull and turn
     the needle with it. A needle of length 0 is a point, which goes straight.
 
@@ -57,7 +58,7 @@ class NeedleKinematics:
         return float(e[0]) * x + float(e[1]) * y, float(e[0]) * y - float(e[1]) * x
 
     def moved(
-        self, tail: Vector, heading: Vector, along: float, across: float, duration: float
+        self, tail: Vector, heading: Vector, along: float, across: float, duration: float, drift: float = 0.0
     ) -> tuple[Vector, Vector]:
         """Return tail and heading after a motion.
 
@@ -67,15 +68,17 @@ class NeedleKinematics:
             along: of the tip's velocity, the part along the chord [m/s].
             across: the part across it, to its left [m/s].
             duration: of the motion [s].
+            drift: as much of that part is of the whole needle; the rest turns it [m/s].
         """
         e = self.chord_direction(heading)
         if self.length == 0.0:
             return tail + duration * np.array([along * e[0] - across * e[1], along * e[1] + across * e[0]]), heading
         lever = 0.5 * self.chord
-        half = 0.5 * across / lever * duration
-        reach = along * duration * (math.sin(half) / half if half else 1.0)
+        half = 0.5 * (across - drift) / lever * duration
+        reach = duration * (math.sin(half) / half if half else 1.0)
         c, s = math.cos(half), math.sin(half)
-        middle = tail + lever * e + reach * np.array([c * e[0] - s * e[1], s * e[0] + c * e[1]])
+        middle_e = np.array([c * e[0] - s * e[1], s * e[0] + c * e[1]])
+        middle = tail + lever * e + reach * (along * middle_e + drift * np.array([-middle_e[1], middle_e[0]]))
         turn = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]])
         turned = turn @ heading
         turned /= math.hypot(turned[0], turned[1])

@@ -19,7 +19,7 @@ from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 PERIOD = 0.005
@@ -362,7 +362,7 @@ def test_the_needle_never_comes_closer_than_it_may(
 def test_nor_does_a_needle_whose_pull_is_compensated(
     towards: tuple[float, float], obstacles: tuple[float, ...], pull: float
 ):
-    """Something pulls it to the wall or the obstacle, and it is taken off sideways there; poses are late and seldom."""
+    """Something pulls it to the wall or the obstacle; poses are late and seldom."""
     settings = CoilBridgeSettings(motion_compensation=True)
     posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
     scene = Scene(Dish(0.035), posts)
@@ -387,6 +387,35 @@ def test_nor_does_a_needle_whose_pull_is_compensated(
         least = min(least, safety.clearance(tail, heading))
     assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
+
+
+@pytest.mark.parametrize("pull", [0.0, 6e-4])
+def test_a_needle_beside_a_block_that_it_is_pulled_to_gets_free_sideways(pull: float):
+    """It cannot turn away; poses are 50 ms late, and what pulls it is not known at first."""
+    settings = CoilBridgeSettings(motion_compensation=True)
+    e, keep = np.array([math.cos(0.6), math.sin(0.6)]), settings.keep_out
+    n = np.array([-e[1], e[0]])
+    far = 0.5 * keep + 2e-3
+    corners = [a * e + b * n for a, b in ((-0.01, 0.5 * keep), (0.01, 0.5 * keep), (0.01, far), (-0.01, far))]
+    polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
+    scene = Scene(Dish(0.05), (SceneShape("block", "wall", polygon),))
+    plant = Plant(settings, scene, velocity=tuple(1e-3 * e)).ready()
+    plant.tail = None
+    needle, safety = settings.needle().kinematics, settings.safety_filter(scene)
+    tail, heading = -0.5 * needle.chord * e - 0.4 * keep * n, e
+    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
+    for number in range(1, 400):
+        poses.append((plant.time, tail, heading))
+        if number > 10 and number % 10 == 0:
+            then, old_tail, old_heading = poses[number - 11]
+            plant.bridge.on_pose(old_tail, old_heading, then, number, plant.time, plant.time)
+        found = plant.run(PERIOD)[0].allocation
+        chord = needle.chord_direction(heading)
+        left = np.array([-chord[1], chord[0]])
+        turning = float(found.velocity @ left) - found.drift
+        tail, heading = needle.moved(tail, heading, float(found.velocity @ chord), turning, PERIOD)
+        tail = tail + PERIOD * (found.drift * left + pull * n)
+    assert safety.clearance(tail, heading) > keep
 
 
 def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: pytest.MonkeyPatch):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
+from magnetosuture_thread.coils.certified_allocation import MIN_SHARE, CertifiedAllocation
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.pose_extrapolator import Pose
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -20,21 +20,25 @@ E = np.array([math.cos(HEADING), math.sin(HEADING)])
 LEFT = np.array([-E[1], E[0]])
 
 
-def block(side: float) -> Scene:
-    """Return a dish with a block beside the needle, which lies in the middle: on its left (1) or right (-1)."""
-    corners = [a * E + side * b * LEFT for a, b in ((-4e-3, 0.0), (4e-3, 0.0), (4e-3, 2e-3), (-4e-3, 2e-3))]
-    polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
-    return Scene(Dish(0.05), (SceneShape("block", "wall", polygon),))
+def blocks(*gaps: float) -> Scene:
+    """Return a dish with blocks beside the needle, which lies in the middle: at these distances to its left [m]."""
+    shapes = []
+    for k, gap in enumerate(gaps):
+        far = gap + math.copysign(2e-3, gap)
+        corners = [a * E + b * LEFT for a, b in ((-4e-3, gap), (4e-3, gap), (4e-3, far), (-4e-3, far))]
+        polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
+        shapes.append(SceneShape(f"block_{k}", "wall", polygon))
+    return Scene(Dish(0.05), tuple(shapes))
 
 
 @pytest.mark.parametrize("pull", [0.0, 8e-4])
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_needle_too_close_to_a_block_leaves_it_sideways_against_what_pulls_it(side: float, pull: float):
-    scene = block(side)
+    scene = blocks(side * 2e-4)  # 0.05 mm closer than keep_out
     safety, coils = SETTINGS.safety_filter(scene), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
-    pose = Pose(-1.25e-3 * E - side * 2e-4 * LEFT, E)  # 0.05 mm closer than keep_out
+    pose = Pose(-1.25e-3 * E, E)
     disturbance = MotionDisturbance(0.0, side * pull)
-    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2))
+    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2), 2e-3)
     assert -side * (found.drift + disturbance.drift) > 5e-4
     share, _ = safety.safe_share(
         found.velocity + disturbance.velocity(E), pose.tail, pose.heading, found.drift + disturbance.drift
@@ -43,7 +47,34 @@ def test_a_needle_too_close_to_a_block_leaves_it_sideways_against_what_pulls_it(
 
 
 def test_a_needle_that_has_enough_clearance_is_not_taken_off_sideways():
-    safety, coils = SETTINGS.safety_filter(block(1.0)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
-    pose = Pose(-1.25e-3 * E - 4e-4 * LEFT, E)
-    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), np.zeros(2))
+    safety, coils = SETTINGS.safety_filter(blocks(4e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    pose = Pose(-1.25e-3 * E, E)
+    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), np.zeros(2), 2e-3)
     assert abs(found.drift) < 1e-4
+
+
+def test_it_is_taken_off_no_faster_than_it_may():
+    safety, coils = SETTINGS.safety_filter(blocks(1e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    pose = Pose(-1.25e-3 * E, E)
+    for limit in (0.0, 1e-4, 5e-4):
+        found, _ = coils.allocate(
+            1e-4 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), np.zeros(2), limit
+        )
+        assert -found.drift == pytest.approx(limit, rel=0.1, abs=5e-5)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int):
+    """The needle is beside a block, with another on the other side, and pulled."""
+    random = np.random.default_rng(seed)
+    left, right = random.uniform(2.4e-4, 6e-4, 2)
+    safety = SETTINGS.safety_filter(blocks(left, -right))
+    coils = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    pose = Pose(-1.25e-3 * E, E)
+    disturbance = MotionDisturbance(*random.uniform(-1e-3, 1e-3, 2))
+    wanted, shares = random.uniform(-2e-3, 2e-3, 2), []
+    for limit in (0.0, 2e-3):
+        found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2), limit)
+        motion, drift = found.velocity + disturbance.velocity(E), found.drift + disturbance.drift
+        shares.append(safety.safe_share(motion, pose.tail, pose.heading, drift)[0])
+    assert shares[1] >= min(shares[0], MIN_SHARE) - 1e-9

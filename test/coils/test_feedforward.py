@@ -116,3 +116,27 @@ def test_the_currents_are_certified_with_the_pull_and_without(sign: float):
 def test_the_threads_part_of_the_drag_is_at_most_the_whole():
     with pytest.raises(ConfigurationError, match=r"at most coil_bridge\.needle_drag"):
         CoilBridgeSettings(thread_drag=0.03, needle_drag=0.0255)
+
+
+def test_where_the_motion_is_compensated_the_needle_has_drag_of_its_own():
+    with pytest.raises(ConfigurationError, match=r"0\.9 of needle_drag"):
+        CoilBridgeSettings(thread_drag=0.024, needle_drag=0.0255, motion_compensation=True)
+
+
+@pytest.mark.parametrize(("thread_drag", "drag"), [(0.0, 0.009), (0.004, 0.009), (0.0065, 0.005)])
+def test_where_the_motion_is_compensated_the_model_has_at_most_twice_the_drag_without_a_thread(
+    thread_drag: float, drag: float
+):
+    """The pull of a straight thread is in the model but for what is left, which is fed forward."""
+    settings = CoilBridgeSettings(
+        motion_compensation=True, needle_drag=0.009, thread_drag=thread_drag, thread_feedforward=True
+    )
+    assert settings.needle().drag == pytest.approx(drag)
+    assert replace(settings, motion_compensation=False).needle().drag == 0.009
+    feedforward = settings.feedforward()
+    assert feedforward is not None
+    commanded = np.array([0.002, 0.0])
+    feedforward.update(-thread_drag * commanded, 1.0, 1.0)  # as a straight thread pulls
+    pulled = (drag - (0.009 - thread_drag)) * commanded - thread_drag * commanded
+    limited = np.clip(pulled / drag, -0.5 * commanded[0], 0.5 * commanded[0])
+    np.testing.assert_allclose(feedforward.velocity(commanded, EAST, 1.0, 1.0), limited, atol=1e-12)

@@ -13,7 +13,7 @@ from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.motion_observer import MAX_SPEED, MotionObserver
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.settings import MAX_MOBILITY_RATIO, CoilBridgeSettings
 from magnetosuture_thread.scene import Scene
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True)
@@ -94,6 +94,17 @@ def test_a_pose_is_compared_with_the_currents_of_its_time_however_late_it_comes(
     assert np.abs(observer.disturbance(e)).max() < 1e-9
 
 
+def test_after_a_small_step_of_the_clock_motion_by_unknown_currents_is_no_disturbance():
+    observer, e, tail, speed = MotionObserver(NEEDLE.kinematics), direction(0.3), np.zeros(2), 8e-3
+    for k in range(400):
+        now = 1.0 + k * PERIOD - (0.004 if k >= 195 else 0.0)
+        if k % 10 == 0:
+            observer.update(tail, e, now)
+        observer.apply(now, e, speed, 0.0)
+        assert np.abs(observer.disturbance(e)).max() < 1e-3 * speed + (0.1 * speed if k >= 195 else 0.0)
+        tail = tail + PERIOD * speed * e
+
+
 def test_after_time_was_set_back_currents_of_the_former_time_do_not_count():
     observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
     observer.apply(9.0, e, 5e-3, 0.0)
@@ -103,9 +114,10 @@ def test_after_time_was_set_back_currents_of_the_former_time_do_not_count():
     assert np.abs(observer.disturbance(e)).max() < 1e-9
 
 
-@pytest.mark.parametrize("late", [0, 1, 2, 4, 8])
-@pytest.mark.parametrize("mobility", [0.5, 1.0, 1.9])
-def test_what_is_compensated_converges_however_late_poses_are(mobility: float, late: int):
+@pytest.mark.parametrize(
+    ("mobility", "late"), [*((m, n) for m in (0.5, 1.0, 1.9) for n in (0, 1, 2, 4, 8)), (MAX_MOBILITY_RATIO, 4)]
+)
+def test_what_is_compensated_converges_with_late_poses(mobility: float, late: int):
     """The needle moves at `mobility` times the velocity that the model expects of its currents, and is pulled."""
     observer, e, tail, waiting = MotionObserver(NEEDLE.kinematics), direction(0.3), np.zeros(2), []
     wanted, pull, before = 2e-3, -1e-3, np.zeros(2)

@@ -75,6 +75,28 @@ def test_a_motion_is_kept_as_the_needle_sees_it():
     np.testing.assert_allclose(again.heading, whole.heading, atol=1e-12)
 
 
+def test_a_drift_of_the_whole_needle_turns_nothing():
+    extrapolator = extrapolator_at_origin()
+    extrapolator.apply_velocity(np.array([0.0, 0.002]), 1.0, 50.0, drift=0.002)
+    pose = extrapolator.pose(1.1, 50.1)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.0, 0.0002], atol=1e-12)
+    np.testing.assert_allclose(pose.heading, EAST, atol=1e-12)
+
+
+def test_a_needle_that_drifts_and_turns_is_extrapolated_as_in_small_steps():
+    extrapolator = extrapolator_at_origin()
+    extrapolator.apply_velocity(np.array([0.004, 0.006]), 1.0, 50.0, drift=0.002)
+    pose, (tail, heading) = extrapolator.pose(1.1, 50.1), (np.zeros(2), EAST)
+    for _ in range(4000):
+        e = NEEDLE.chord_direction(heading)
+        tail, heading = NEEDLE.moved(tail, heading, 0.004, 0.004, 0.1 / 4000)
+        tail = tail + 0.002 * 0.1 / 4000 * np.array([-e[1], e[0]])
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, tail, atol=1e-7)
+    np.testing.assert_allclose(pose.heading, heading, atol=1e-9)
+
+
 def test_where_time_is_set_back_a_pose_is_carried_from_there():
     extrapolator = PoseExtrapolator(NEEDLE, 0.3, 0.045)
     extrapolator.update(np.zeros(2), EAST, 99.9, 1, 100.0, 50.0)

@@ -12,12 +12,14 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.tracking import (
     ALWAYS_OFF,
     AXIS_LOOKAHEAD,
+    CROSSING_GAIN,
     DRIFT_PER_ANGLE,
     MAX_ALONG_RATIO,
     MAX_AXIS_ANGLE,
     MIN_SPEED_SHARE,
     MIN_TACK_TIME,
     TACK_SHARE,
+    TURN_GAIN,
     PathTracker,
 )
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
@@ -110,6 +112,27 @@ def test_a_needle_that_is_thrown_aside_in_a_crossing_stays_on_its_side_of_the_ax
             break
     assert len(after) >= 0.8 * MIN_TACK_TIME * RATE
     assert max(after[2:]) < -0.5 * MAX_AXIS_ANGLE
+
+
+def commands_beside_an_axis(stamps: tuple[float, ...], side: float) -> list[np.ndarray]:
+    """Return commands, in the needle's frame, for a path just beyond an axis, of a needle that lay on a side of it."""
+    tracker = PathTracker(path(np.full(100, -0.04)), COIL_ANGLES)
+    tracker._side = side
+    middle, angle = tracker.path.at(0.0)[0], 0.03
+    turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    return [turn @ tracker.compute_command(stamp, middle, angle, 0.002, 1.0, 1e-3).velocity for stamp in stamps]
+
+
+def test_in_a_crossing_the_needle_is_turned_faster():
+    crossing, beyond = (commands_beside_an_axis((1.0, 1.05), side)[1][1] for side in (1.0, -1.0))
+    assert crossing == pytest.approx(CROSSING_GAIN / TURN_GAIN * beyond, rel=1e-3)
+    assert beyond < 0.0
+
+
+def test_after_time_was_set_back_nothing_is_left_of_a_crossing():
+    crossing, beyond = (commands_beside_an_axis((9.0, 1.0, 1.05), side) for side in (1.0, -1.0))
+    assert crossing[0][1] < 1.5 * beyond[0][1] < 0.0
+    np.testing.assert_allclose(crossing[2], beyond[2], rtol=1e-6)
 
 
 def test_headings_beside_the_axes_are_as_planned_however_the_needle_is_pulled():

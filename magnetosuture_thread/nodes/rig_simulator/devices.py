@@ -113,7 +113,7 @@ class FramePublisher:
 
     def take(self, camera: DishCamera) -> None:
         """Publish frames of another camera from now on."""
-        self._camera = MESSAGES.camera_info(Time().to_msg(), camera.size, camera.view, self._distance)
+        self._camera = camera
 
     def publish(self, nanoseconds: int, frame: RigFrame) -> None:
         """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
@@ -123,8 +123,8 @@ class FramePublisher:
             self._compressed.publish(MESSAGES.compressed_image(stamp, data))
             if self._raw.get_subscription_count():
                 self._raw.publish(MESSAGES.image(stamp, frame.image))
-            self._camera.header.stamp = stamp
-            self._info.publish(self._camera)
+            camera = self._camera
+            self._info.publish(MESSAGES.camera_info(stamp, camera.size, camera.view, self._distance))
         self._needle.publish(MESSAGES.placed(stamp, frame.tail, frame.heading))
         self._thread.publish(packed_path(time_of(nanoseconds), frame.thread))
         self._pull.publish(MESSAGES.wrench_message(stamp, frame.pull, frame.moment))

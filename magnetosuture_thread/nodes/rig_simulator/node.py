@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from magnetosuture_thread.rig.settings import RigSettings
 
 MIN_CATCH_UP, CATCH_UP_FRAMES = 0.1, 2.0  # s, or frame periods, for which the rig moves in one callback
 MIN_ITERATIONS, ITERATION_RATE = 1000.0, 1e4  # of Newton in one callback, or for a second's frames; they take 40 us
+MAX_WAITING = 2  # frames that are rendered or wait for that; the next ones are left out
 MIN_REAL_TIME_FACTOR = 0.9  # below which the status says so
 
 
@@ -62,9 +63,9 @@ class RigSimulatorNode(PackageNode):
         self._phase: float | None = None
         self._last_index, self._clock_stamp = -1, 0
         self._frames = self._skipped = 0
-        # A thread of its own renders, so that currents are in force at once, as on a rig.
+        # A thread of its own renders and publishes, so that currents are in force at once, as on a rig.
         self._renderer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="renderer")
-        self._rendering: Future[None] | None = None
+        self._rendering: deque[Future[None]] = deque()
         self._late: deque[tuple[float, int, RigFrame]] = deque()
         self._publisher = FramePublisher(self, self.rig.camera, settings)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
@@ -78,6 +79,7 @@ class RigSimulatorNode(PackageNode):
 
     def on_scene(self, scene: Scene) -> None:
         """Put another dish and other shapes around needle and thread, which stay where they are."""
+        wait(self._rendering)
         self.rig.set_scene(scene)
         self._publisher.take(self.rig.camera)
 
@@ -107,13 +109,15 @@ class RigSimulatorNode(PackageNode):
         index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
         # No frame is stamped later than it is taken: the first tick may have been later than the others.
         self._phase = min(self._phase, elapsed - index / self._settings.frame_rate)
-        if index > self._last_index and (self._rendering is None or self._rendering.done()):
+        while self._rendering and self._rendering[0].done():
+            self._rendering.popleft().result()  # raises what rendering has raised
+        if index > self._last_index and len(self._rendering) < MAX_WAITING:
             self._skipped += index - self._last_index - 1
             self._last_index = index
             self._take(self._phase + index / self._settings.frame_rate)
         while self._late and self._late[0][0] <= elapsed:
             _, stamp, frame = self._late.popleft()
-            self._publisher.publish(stamp, frame)
+            self._rendering.append(self._renderer.submit(self._publisher.publish, stamp, frame))
 
     def destroy_node(self) -> None:
         """End rendering, and remove the serial lines of simulated boards."""
@@ -149,9 +153,7 @@ class RigSimulatorNode(PackageNode):
         finally:
             self._leave_out(elapsed - self.rig.time)
         stamp = self.time.stamp(frame.time)  # currents may have moved the rig on since the frame was due
-        if self._rendering is not None:
-            self._rendering.result()  # raises what the last one raised
-        self._rendering = self._renderer.submit(self._render, elapsed, stamp, frame)
+        self._rendering.append(self._renderer.submit(self._render, elapsed, stamp, frame))
         self._frames += 1
         factor = self.time.real_time_factor(self.rig.time)
         late = factor < MIN_REAL_TIME_FACTOR
