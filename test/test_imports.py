@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -183,7 +184,8 @@ def _public() -> dict[str, str]:
 PUBLIC = _public()
 
 
-def imported(path: Path) -> set[str]:
+@cache
+def imported(path: Path) -> frozenset[str]:
     """Return the full names of all modules that a file imports, wherever in the file."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -195,7 +197,7 @@ def imported(path: Path) -> set[str]:
             names.add(node.module)
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
     public = {f"magnetosuture_thread.{name}": module for name, module in PUBLIC.items()}
-    return {public.get(name, name) for name in names}
+    return frozenset(public.get(name, name) for name in names)
 
 
 def part(path: Path) -> str:
