@@ -16,7 +16,7 @@ EXTRAS := ros dev docs colcon cluster
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo
-# Those with whole graphs among their tests: to collect all tests again would take as long as three graphs.
+# Those with whole graphs among their tests: to collect all tests again would take longer than to start a graph.
 GRAPHS = $(shell grep --recursive --files-with-matches --word-regexp --include='test_*.py' whole_graph test)
 MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 
