@@ -16,6 +16,8 @@ EXTRAS := ros dev docs colcon cluster
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo
+# Those with whole graphs among their tests: to collect all tests again would take longer than to start a graph.
+GRAPHS = $(shell grep --recursive --files-with-matches --word-regexp --include='test_*.py' whole_graph test)
 MESSAGES := $(wildcard msg_defs/*.* msg_defs/*/*)
 
 # What is imported is compiled then: the half of all modules. (pip takes this "no" for a yes.)
@@ -33,7 +35,7 @@ demo: $(READY)
 
 test: $(READY)
 	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
-	$(RUN)/python -m pytest -m whole_graph
+	$(RUN)/python -m pytest -m whole_graph $(GRAPHS)
 
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
 coverage: $(READY)

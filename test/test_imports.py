@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -181,7 +184,8 @@ def _public() -> dict[str, str]:
 PUBLIC = _public()
 
 
-def imported(path: Path) -> set[str]:
+@cache
+def imported(path: Path) -> frozenset[str]:
     """Return the full names of all modules that a file imports, wherever in the file."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
@@ -193,7 +197,7 @@ def imported(path: Path) -> set[str]:
             names.add(node.module)
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
     public = {f"magnetosuture_thread.{name}": module for name, module in PUBLIC.items()}
-    return {public.get(name, name) for name in names}
+    return frozenset(public.get(name, name) for name in names)
 
 
 def part(path: Path) -> str:
@@ -236,6 +240,18 @@ def test_third_party_packages_are_imported_by_their_owners_only(path: Path):
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_what_is_installed_needs_nothing_of_the_source_tree(path: Path):
     assert not {name.split(".")[0] for name in imported(path)} & {"benchmarks", "examples", "test"}
+
+
+LATE = {"matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}
+
+
+def test_what_few_need_delays_no_start():
+    """Each of these takes a third of a second or more to import, and a graph is many processes."""
+    modules = ["nodes.scene_server", "nodes.rig_simulator", "nodes.perception", "nodes.coil_bridge"]
+    modules += ["nodes.path_follower", "nodes.console", "jobs.simulate", "jobs.replay", "jobs.campaign"]
+    code = "import sys, " + ", ".join(f"magnetosuture_thread.{name}" for name in modules) + "; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
+    assert not LATE & set(found.stdout.split())
 
 
 def test_no_part_is_missing_from_the_rules():

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import cv2
@@ -30,6 +30,7 @@ FLOORS = {
     "blue": ((170.0, 120.0, 60.0), 0.8),
 }
 SKIN = (120.0, 150.0, 205.0)
+SATURATES = 10.0  # tanh is 1 from here on, in single precision
 GROUNDS = ("wood", "cloth", "light_box", "paper", "bench", "steel")
 
 
@@ -63,15 +64,27 @@ class _Camera:
         seen = points * (1.0, 1.0, -1.0) @ self.turn.T + (0.0, 0.0, self.distance)
         return np.asarray(self.focal * seen[:, :2] / seen[:, 2:] + self.middle)
 
-    def plane(self, height: float) -> tuple[Plane, Plane]:
-        """Return x and y of each pixel's ray at a height."""
+    @cached_property
+    def _rays(self) -> list[Plane]:
+        """Direction of each pixel's ray, by component."""
         width, rows = self.size
         u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(rows, dtype=np.float32))
         x, y = (u - self.middle[0]) / self.focal, (v - self.middle[1]) / self.focal
-        ray = [self.turn[0, i] * x + self.turn[1, i] * y + self.turn[2, i] for i in range(3)]
+        return [self.turn[0, i] * x + self.turn[1, i] * y + self.turn[2, i] for i in range(3)]
+
+    def plane(self, height: float) -> tuple[Plane, Plane]:
+        """Return x and y of each pixel's ray at a height."""
+        ray = self._rays
         begin = self.turn.T @ np.array([0.0, 0.0, -self.distance])
         length = (-height - begin[2]) / ray[2]
         return (begin[0] + length * ray[0]).astype(np.float32), (begin[1] + length * ray[1]).astype(np.float32)
+
+    def box(self, centre: NDArray[np.float64], half: float) -> tuple[slice, slice]:
+        """Return rows and columns of the pixels that see a square on the table."""
+        corners = [[centre[0] + x * half, centre[1] + y * half, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]
+        seen = self.pixels(np.array(corners))
+        low, high = np.floor(seen.min(axis=0)).astype(int), np.ceil(seen.max(axis=0)).astype(int) + 1
+        return slice(max(low[1], 0), max(high[1], 0)), slice(max(low[0], 0), max(high[0], 0))
 
 
 def _texture(random: np.random.Generator, x: Plane, y: Plane, stretch: float, size: float) -> Plane:
@@ -115,10 +128,12 @@ def _draw_use(
 ) -> None:
     """Draw what grows on a dish's floor, and a label or writing."""
     x, y = place_of
+    soft = 0.008
     for _ in range(int(random.integers(0, 60))):  # colonies
         radius, place = random.uniform(0.01, 0.06), random.uniform(-0.7, 0.7, 2)
-        blob = _step(np.hypot(x - place[0], y - place[1]), radius, 0.008)
-        picture += 0.8 * blob[..., None] * (random.uniform(90.0, 235.0) - picture)
+        box = camera.box(at + place, radius + SATURATES * soft)
+        blob = _step(np.hypot(x[box] - place[0], y[box] - place[1]), radius, soft)
+        picture[box] += 0.8 * blob[..., None] * (random.uniform(90.0, 235.0) - picture[box])
     if random.random() < 0.4:  # a label, stuck off the middle
         where, turn = random.uniform(-0.5, 0.5, 2), random.uniform(0.0, 3.0)
         along = (x - where[0]) * math.cos(turn) + (y - where[1]) * math.sin(turn)

@@ -11,13 +11,15 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.messages.building import ADD, LINE_STRIP
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 STATIC = "/tf_static"
 TOPICS = ("/tf", STATIC)
@@ -39,6 +41,8 @@ class RigidTransform:
     @staticmethod
     def identity() -> RigidTransform:
         """Return the identity."""
+        from scipy.spatial.transform import Rotation
+
         return RigidTransform(Rotation.identity(), np.zeros(3))
 
     def compose(self, first: RigidTransform) -> RigidTransform:
@@ -125,6 +129,8 @@ def transform_from_message(transform: Any) -> RigidTransform | None:
 
 def rotation_from_message(turn: Any) -> Rotation | None:
     """Return the rotation of a geometry_msgs/Quaternion; None if it is not finite or of length 0."""
+    from scipy.spatial.transform import Rotation  # late, as bags of our own graph turn nothing
+
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
     greatest = np.abs(quaternion).max()
     if not np.isfinite(greatest) or not greatest:
@@ -168,7 +174,7 @@ def path_of_marker(message: Any, time: int) -> Any:
     turn, place = message.pose.orientation, message.pose.position
     # RViz takes a quaternion of zeros, which a careless node sends, for no rotation.
     is_none = not np.any([turn.x, turn.y, turn.z, turn.w])
-    rotation = Rotation.identity() if is_none else rotation_from_message(turn)
+    rotation = RigidTransform.identity().rotation if is_none else rotation_from_message(turn)
     if rotation is None:
         raise UnfitError("an orientation that is none")
     moved = RigidTransform(rotation, np.array([place.x, place.y, place.z])).apply(points)

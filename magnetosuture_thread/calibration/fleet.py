@@ -24,8 +24,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from magnetosuture_thread.calibration.fit import Array
 from magnetosuture_thread.calibration.identifiability import CHAIN
@@ -77,10 +76,10 @@ def fleet_mean(values: Array, errors: Array) -> FleetMean:
     offset_variance = variances * (1.0 - 2.0 * weights / weights.sum()) + variance
     return FleetMean(
         mean,
-        float(student.ppf(0.975, count - 1)) * math.sqrt(variance),
+        float(stdtrit(count - 1, 0.975)) * math.sqrt(variance),
         math.sqrt(between),
         values - mean,
-        float(norm.ppf(0.975)) * np.sqrt(offset_variance),
+        float(ndtri(0.975)) * np.sqrt(offset_variance),
     )
 
 
@@ -149,7 +148,7 @@ def calibrate_fleet(results: Sequence[CalibrationResult]) -> FleetResult:
     change = STIFFNESS_OVER_DRAG.counts(settings)
     chain = np.array([CHAIN * change / max(1e-2 * found[index].effect_percent, 1e-9) for index in told])
     own = np.maximum(0.5 * (high - low) - chain, 1e-6)
-    pooled = fleet_mean(0.5 * (low + high), own / float(student.ppf(0.975, BLOCKS - 1)))
+    pooled = fleet_mean(0.5 * (low + high), own / float(stdtrit(BLOCKS - 1, 0.975)))
     half = pooled.half + float(chain.mean())
     ends = math.exp(pooled.mean - half), math.exp(pooled.mean + half)
     parameter = STIFFNESS_OVER_DRAG

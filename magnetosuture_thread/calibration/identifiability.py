@@ -44,7 +44,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from magnetosuture_thread.calibration.fit import Array, FitSolution
 from magnetosuture_thread.calibration.parameters import STIFFNESS_OVER_DRAG
@@ -106,7 +106,7 @@ def _half(inverse: Array, scores: Array) -> Array:
         return np.full(scores.shape[1], np.inf)
     middle = count / (count - 1.0) * scores.T @ scores
     variance = np.maximum(np.diag(inverse @ middle @ inverse), 0.0)
-    return np.asarray(student.ppf(0.975, count - 1) * np.sqrt(variance))
+    return np.asarray(stdtrit(count - 1, 0.975) * np.sqrt(variance))
 
 
 def _scores(

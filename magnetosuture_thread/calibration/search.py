@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from magnetosuture_thread.calibration.fit import Array, FitSolution, Objective, initial_guesses, robust_scale
 from magnetosuture_thread.calibration.identifiability import Identifiability, assess_identifiability
@@ -162,7 +162,7 @@ class _Search:
         other = next(s for s in solutions if s is not best)
         difference = self._blocks(other) - self._blocks(best)
         middle, count = float(difference.mean()), len(difference)
-        half = float(student.ppf(0.975, count - 1) * difference.std(ddof=1) / np.sqrt(count))
+        half = float(stdtrit(count - 1, 0.975) * difference.std(ddof=1) / np.sqrt(count))
         reason = ""
         if middle < max(MIN_IMPROVEMENT, half):
             reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"

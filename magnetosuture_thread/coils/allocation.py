@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import CoilModel
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
@@ -138,6 +137,8 @@ class CoilAllocation:
     """
 
     def __init__(self, coils: CoilModel, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
+        import scipy.optimize  # noqa: F401  before the first command, but not for who reads settings alone
+
         self.names = coils.names
         self._coils = coils
         self._needle = needle
@@ -240,6 +241,8 @@ def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper:
     found = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
     if np.all((found >= lower) & (found <= upper)):
         return found
+    from scipy.optimize import lsq_linear
+
     # The solver rejects equal bounds; the small gap has no effect.
     bounds = (lower, np.maximum(upper, lower + 1e-9))
     return np.clip(lsq_linear(system, target, bounds=bounds, method="bvls").x, lower, upper)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magnetosuture_thread.evaluation.frames import Array, FrameResult, TimeSeries
 from magnetosuture_thread.evaluation.silence import SILENT_PERIODS
@@ -98,7 +98,7 @@ def mean_band(count: ArrayLike) -> tuple[Array, Array]:
     5.4. Deviation: none.
     """
     given = np.asarray(count, dtype=np.float64)
-    low, high = (chi2.ppf(0.5 + side * 0.5 * BAND, given) / given for side in (-1.0, 1.0))
+    low, high = (chdtri(given, 0.5 - side * 0.5 * BAND) / given for side in (-1.0, 1.0))
     return np.asarray(low), np.asarray(high)
 
 

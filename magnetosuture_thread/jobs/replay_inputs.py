@@ -21,7 +21,6 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
-from magnetosuture_thread.evaluation.plots import draw_summary
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import (
     DISH_FRAME,
@@ -260,6 +259,8 @@ def write_results(folder: Path, given: BagInput, metrics: RunMetrics, summary: R
     if found is None:
         log("no picture: the dish is not found in any frame")
         return
+    from magnetosuture_thread.evaluation.plots import draw_summary  # late, as it imports matplotlib
+
     frame, view = found
     at = (chosen.stamp - given.recording.start) * 1e-9
     obstacles = given.setup.scene.obstacles

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.forecast import Forecast
 from magnetosuture_thread.interface import FORECAST, THREAD_MARKERS
 from magnetosuture_thread.messages.building import ADD, LINE_STRIP, TEXT, MessageBuilder
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.forecast import Forecast
 
 MAX_INSTANTS = 11  # of a message: the start, and ten after it
 GHOSTS = 3  # instants that markers show

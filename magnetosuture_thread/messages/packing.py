@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +28,12 @@ from magnetosuture_thread.messages.cdr import (
     text_codes,
     time_of,
 )
-from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.margins import FrictionState, Margins
 from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.model.estimator import ThreadEstimate
 
 _UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
 _OF_NOTHING, _OF_PREDICTION, _OF_ESTIMATE = 0, 1, 2

@@ -16,14 +16,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
 
 Vector = NDArray[np.float64]
 
@@ -276,6 +278,8 @@ def as_quadratic_program(program: ChainProgram, wide: WideRows | None = None) ->
     A slack is scaled by the root of its weight, s = sqrt(c) s', so that its own entry in P is 1: with the
     weights themselves, 1 beside 1e5, a first-order method does not converge.
     """
+    import scipy.sparse as sp  # late, as most who import this module solve nothing
+
     nodes, dimension = program.linear.shape
     coordinates = np.arange(nodes * dimension).reshape(nodes, dimension)
     triangle = np.triu_indices(dimension)
@@ -316,6 +320,8 @@ def as_quadratic_program(program: ChainProgram, wide: WideRows | None = None) ->
 
 def _with_limits(full: QuadraticProgram, rows: NDArray[np.intp], limits: Vector) -> QuadraticProgram:
     """Return a program in which some rows may miss their bounds by e = e+ - e-, at a price of F (e+ + e-)."""
+    import scipy.sparse as sp
+
     count = len(rows)
     miss = sp.csc_matrix((np.ones(count), (rows, np.arange(count))), shape=(len(full.lower), count))
     variables, bounds = full.A.shape[1], sp.eye(2 * count)
@@ -334,6 +340,8 @@ def _with_limits(full: QuadraticProgram, rows: NDArray[np.intp], limits: Vector)
 def _matrix(
     entries: list[Vector], rows: list[NDArray[np.intp]], columns: list[NDArray[np.intp]], shape: tuple[int, int]
 ) -> sp.csc_matrix:
+    import scipy.sparse as sp
+
     return sp.csc_matrix(
         (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=shape, dtype=np.float64
     )

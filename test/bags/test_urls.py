@@ -11,7 +11,6 @@ import fsspec
 import numpy as np
 import pytest
 import s3fs
-from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import make_server
 
 from magnetosuture_thread import cli
@@ -49,6 +48,9 @@ class CountingServer:
     """
 
     def __init__(self) -> None:
+        # Here, as it takes seconds to import, and every worker imports this module.
+        from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+
         self._app = DomainDispatcherApplication(create_backend_app)
         self.served: dict[str, list[int]] = {}
         self.whole: set[str] = set()

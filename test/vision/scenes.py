@@ -90,7 +90,9 @@ def render(
 ) -> np.ndarray:
     """Draw a frame."""
     what = CameraScene(needle_curvature=pose.curvature, **scene)
-    camera = camera_for(seed, lighting, what)
+    still = CameraScene(dish_diameter=what.dish_diameter, obstacles=what.obstacles, looks=what.looks)
+    camera = camera_for(seed, lighting, still)
+    camera._scene = what  # needle and thread are drawn in each frame anew
     camera._random = np.random.default_rng(seed)  # a frame is the same whatever was drawn before it
     return camera.render(pose.tail, pose.heading, thread, covers, gain)
 
