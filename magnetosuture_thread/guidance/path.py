@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +32,13 @@ class SmoothPath:
         knots = np.concatenate([[0.0], np.cumsum(steps)])
         if not np.all(np.isfinite(waypoints)) or not np.all(np.diff(knots) > 0.0):
             raise InvalidInputError("waypoints", waypoints.tolist(), "at least two that differ, finite [m]")
-        second = _second_derivatives(knots, waypoints, direction)
+        from scipy.interpolate import CubicSpline  # here, as it takes a third of a second to import
+
+        free: tuple[Literal[1, 2], NDArray[np.float64]] = (2, np.zeros(2))
+        curve = CubicSpline(knots, waypoints, bc_type=(free if direction is None else (1, direction), free))
         at = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_SPAN) for a, b in pairwise(knots)]))
-        self._points, self._tangents = _evaluate(knots, waypoints, second, at)
+        self._points = np.asarray(curve(at))
+        self._tangents = np.asarray(curve(at, 1))
         self._tangents /= np.linalg.norm(self._tangents, axis=1)[:, None]
         self._lengths = arc_lengths(self._points)
 
@@ -52,40 +57,6 @@ class SmoothPath:
         return np.asarray(tangent / np.linalg.norm(tangent))
 
 
-def _second_derivatives(knots: Points, values: Points, slope: NDArray[np.float64] | None) -> Points:
-    """Return the second derivatives M of a cubic spline at its knots, shape (m, d).
-
-        h_{i-1} M_{i-1} + 2 (h_{i-1} + h_i) M_i + h_i M_{i+1} = 6 (s_i - s_{i-1}),    s_i = (y_{i+1} - y_i) / h_i
-
-    with M = 0 at the end and at a start with a free slope; for a given one 2 h_0 M_0 + h_0 M_1 = 6 (s_0 - slope).
-    By elimination; scipy.interpolate takes 0.3 s to import, a third of what it takes a node to start.
-
-    Source: C. de Boor, "A Practical Guide to Splines", 1978, IV. Deviation: none.
-    """
-    steps = np.diff(knots)
-    slopes = np.diff(values, axis=0) / steps[:, None]
-    second, diagonal = np.zeros(values.shape), np.ones(len(knots))
-    upper = np.append(steps, 0.0)
-    if slope is None:
-        upper[0] = 0.0
-    else:
-        second[0], diagonal[0] = 6.0 * (slopes[0] - slope), 2.0 * steps[0]
-    for i in range(1, len(knots) - 1):
-        factor = steps[i - 1] / diagonal[i - 1]
-        diagonal[i] = 2.0 * (steps[i - 1] + steps[i]) - factor * upper[i - 1]
-        second[i] = 6.0 * (slopes[i] - slopes[i - 1]) - factor * second[i - 1]
-    for i in range(len(knots) - 2, -1, -1):
-        second[i] = (second[i] - upper[i] * second[i + 1]) / diagonal[i]
-    return second
-
-
-def _evaluate(knots: Points, values: Points, second: Points, at: NDArray[np.float64]) -> tuple[Points, Points]:
-    """Return a cubic spline and its first derivative, shapes (n, d)."""
-    span = np.clip(np.searchsorted(knots, at, "right") - 1, 0, len(knots) - 2)
-    step = np.diff(knots)[span, None]
-    right = (at - knots[span])[:, None] / step
-    left = 1.0 - right
-    (y0, y1), (m0, m1) = ((given[span], given[span + 1]) for given in (values, second))
-    points = left * y0 + right * y1 + step**2 / 6.0 * ((left**3 - left) * m0 + (right**3 - right) * m1)
-    slopes = (y1 - y0) / step + step / 6.0 * ((1.0 - 3.0 * left**2) * m0 + (3.0 * right**2 - 1.0) * m1)
-    return points, slopes
+def warm_up() -> None:
+    """Import what the first path needs, which would delay whoever waits for that."""
+    SmoothPath(np.array([[0.0, 0.0], [1e-3, 0.0]]))

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import Literal
-
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.guidance.path import SAMPLES_PER_SPAN, SmoothPath
+from magnetosuture_thread.guidance.path import SmoothPath
 
 CORNERS = np.array([[0.0, 0.0], [0.01, 0.002], [0.012, 0.01], [0.0, 0.012]])
 
@@ -37,23 +33,6 @@ def test_arc_length_is_clamped_to_the_path():
     path = SmoothPath(CORNERS)
     np.testing.assert_allclose(path.point(-1.0), CORNERS[0])
     np.testing.assert_allclose(path.point(path.length + 1.0), CORNERS[-1], atol=1e-12)
-
-
-@pytest.mark.parametrize("direction", [None, np.array([0.6, -0.8])])
-@pytest.mark.parametrize("count", [2, 3, 4, 30])
-def test_path_is_the_cubic_spline_of_scipy(count: int, direction: np.ndarray | None):
-    corners = np.random.default_rng(count).uniform(-0.015, 0.015, (count, 2))
-    knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    start: tuple[Literal[1, 2], np.ndarray] = (2, np.zeros(2)) if direction is None else (1, direction)
-    spline = CubicSpline(knots, corners, bc_type=(start, (2, np.zeros(2))))
-    path, length = SmoothPath(corners, direction), 0.0
-    for begin, end in pairwise(knots):
-        at = np.linspace(begin, end, SAMPLES_PER_SPAN)
-        points, tangents = spline(at), spline(at, 1)
-        length += np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-        np.testing.assert_allclose(path.point(length), points[-1], atol=1e-12)
-        np.testing.assert_allclose(path.tangent(length), tangents[-1] / np.linalg.norm(tangents[-1]), atol=1e-9)
-    assert path.length == pytest.approx(length, rel=1e-12)
 
 
 @pytest.mark.parametrize(
