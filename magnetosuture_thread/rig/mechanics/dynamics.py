@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
-from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
+from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, find_poles
 from magnetosuture_thread.rig.mechanics.newton import MAX_ITERATIONS, advance, make_buffers
 from magnetosuture_thread.rig.mechanics.rod import Rod
 from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
@@ -260,8 +260,7 @@ class RigDynamics:
         """Take one step; return whether it converged, and change nothing if not."""
         ratio = h / self._last_dt if self._last_dt > 0.0 else 0.0
         if currents is not None and self.field is not None:
-            ahead = self._q[:3] + ratio * (self._q[:3] - self._before[:3])
-            self._poles[0, :2], self._poles[1, :2] = ahead[1:], self._tip_of(ahead)
+            find_poles(self._q, self._before, ratio, self.needle.tip, self._poles)
             self._flux[:] = (currents @ self.field.per_current(self._poles).reshape(-1, 6)).reshape(2, 3)[:, :2]
         start = self._q.copy()
         iterations, self._move, residual = advance(
