@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from magnetosuture_thread.coils.field import CoilModel
-from magnetosuture_thread.coils.least_squares import least_squares
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
+from magnetosuture_thread.coils.reflections import solve_by_reflections
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
@@ -238,7 +238,7 @@ class CoilAllocation:
 def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
     """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
     # Most solutions are inside the bounds, where the unconstrained one is optimal.
-    found = least_squares(system, target)
+    found = solve_by_reflections(system, target)
     if ((found >= lower) & (found <= upper)).all():
         return found
     # The solver rejects equal bounds; the small gap has no effect.

@@ -28,7 +28,7 @@ from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, c
 MAX_ITERATIONS = 60
 PAIRS_PER_NODE = 16  # rows of contact with itself
 MIN_LINE_SEARCH = 1e-6
-LEAST_PART, GREATEST_PART = 2e-3, 0.5  # of a trial of the line search, for the next one
+MIN_PART, MAX_PART = 2e-3, 0.5  # of a trial of the line search, for the next one
 DESCENT = 1e-4  # of the decrease that the slope promises
 ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
 MIN_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
@@ -143,10 +143,10 @@ def _shorter(part: float, slope: float, new_slope: float, rise: float) -> float:
     middle = slope + new_slope - 3.0 * rise / part
     square = middle * middle - slope * new_slope
     if not square >= 0.0:
-        return GREATEST_PART * part
+        return MAX_PART * part
     root = math.sqrt(square)
     share = 1.0 - (new_slope + root - middle) / (new_slope - slope + 2.0 * root)
-    return part * min(max(share, LEAST_PART), GREATEST_PART)
+    return part * min(max(share, MIN_PART), MAX_PART)
 
 
 @compiled

@@ -12,7 +12,7 @@ from magnetosuture_thread.compiled import compiled
 Vector = NDArray[np.float64]
 
 
-def least_squares(system: Vector, target: Vector) -> Vector:
+def solve_by_reflections(system: Vector, target: Vector) -> Vector:
     """Return the x of least |system x - target|, by Householder's reflections; not finite if the columns are dependent.
 
     Args:
