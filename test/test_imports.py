@@ -38,7 +38,7 @@ ALLOWED = {
     "vision": {*BASE, "compiled", "geometry", "scene", "shared_parameters", "thread_observation"},
     "safety": {*BASE, "barrier", "compiled", "geometry", "scene"},
     "forecast": {"compiled", "errors", "geometry", "model", "safety", "scene"},
-    "coils": {*BASE, "barrier", "geometry", "safety", "scene", "shared_parameters"},
+    "coils": {*BASE, "barrier", "compiled", "geometry", "safety", "scene", "shared_parameters"},
     "guidance": {*BASE, "geometry", "scene", "shared_parameters"},
     "planning": {*BASE, "compiled", "geometry", "safety", "scene"},
     "campaign": {

@@ -1,7 +1,8 @@
 """Time forecasts, and compare them with what then happened on the simulated rig in closed loop.
 
 Times: one forecast of 3 s in steps at 66 Hz of a thread of 81 segments among three posts, on one core; the same by
-stepping filter and predictor from Python; and a batch of 64 of 40 segments, on all cores. Errors: of forecasts from
+stepping filter and predictor from Python; a batch of 64 of 40 segments, on all cores; and both in steps at 33 Hz, with
+how far the threads end from those in steps at 66 Hz, over the batch. Errors: of forecasts from
 random moments of the loop of path follower, coil bridge and rig, under the commands that were then sent, in per cent of
 the thread's length; most of it is the needle, which does not follow the filtered velocity exactly.
 """
@@ -41,9 +42,13 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         ("single_ms", "one forecast, n = 81, one core"),
         ("by_hand_ms", "the same stepped from Python"),
         ("batch_ms", f"{times['batch_size']} forecasts, n = 40, {times['cores']} cores"),
+        ("coarse_single_ms", "one forecast at 33 Hz, n = 81, one core"),
+        ("coarse_batch_ms", f"{times['batch_size']} forecasts at 33 Hz, n = 40, {times['cores']} cores"),
     ):
         table.add_row(text, *(f"{times[key][name]:.1f}" for name in ("median", "minimum", "processor")))
     console.print(table)
+    mean, largest = times["coarse_apart_mean_percent"], times["coarse_apart_max_percent"]
+    log(f"at 33 Hz the threads end {mean:.3f} % of the length from those at 66 Hz in the mean, {largest:.3f} % at most")
     loops = []
     for name in options.setups:
         log(f"the loop of {name}, and {options.forecasts} forecasts from it")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import CoilModel
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
+from magnetosuture_thread.coils.reflections import solve_by_reflections
 from magnetosuture_thread.safety import NeedleKinematics
 
 Vector = NDArray[np.float64]
@@ -221,8 +222,8 @@ class CoilAllocation:
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
-            lower = np.clip(previous - max_change, -limit, limit)
-            upper = np.clip(previous + max_change, -limit, limit)
+            lower = np.minimum(np.maximum(previous - max_change, -limit), limit)
+            upper = np.minimum(np.maximum(previous + max_change, -limit), limit)
         currents = _bounded_least_squares(system, target, lower, upper)
         if disturbance is not None and e @ mean @ currents < MIN_ALIGNING_SHARE * self._field:
             # A constraint that the optimum violates is active in the constrained optimum.
@@ -230,7 +231,7 @@ class CoilAllocation:
             target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
             currents = _bounded_least_squares(system, target, lower, upper)
         reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
-        inaccurate = float(np.linalg.norm(reached - velocity)) > SATURATION_TOLERANCE * float(np.linalg.norm(velocity))
+        inaccurate = math.hypot(*(reached - velocity)) > SATURATION_TOLERANCE * math.hypot(*velocity)
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
         return Allocation(currents, reached, saturated, float(drifting @ currents))
 
@@ -238,8 +239,8 @@ class CoilAllocation:
 def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
     """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
     # Most solutions are inside the bounds, where the unconstrained one is optimal.
-    found = np.asarray(np.linalg.lstsq(system, target, rcond=None)[0], dtype=np.float64)
-    if np.all((found >= lower) & (found <= upper)):
+    found = solve_by_reflections(system, target)
+    if ((found >= lower) & (found <= upper)).all():
         return found
     from scipy.optimize import lsq_linear
 

@@ -132,7 +132,7 @@ class CertifiedAllocation:
                 kept = allocated(aside - disturbed).towards(found, share)
                 own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
                 kept = kept.scaled(own)
-            error = float(np.linalg.norm(kept.velocity - velocity))
+            error = math.hypot(*(kept.velocity - velocity))
             if error < min_error:
                 best, min_error, limiting = kept, error, name
             if share >= MIN_SHARE:

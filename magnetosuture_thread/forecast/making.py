@@ -15,6 +15,9 @@ def make_forecaster(
 ) -> ThreadForecaster:
     """Return a forecaster of the thread of a thread model, with its friction law.
 
+    The thread takes one step in each of the forecast, however long: what shorter ones change is small beside what the
+    needle does otherwise than forecast.
+
     Args:
         settings: of the thread model.
         scene: dish and shapes.
@@ -31,15 +34,16 @@ def make_forecaster(
             needle_length=settings.needle_length,
             needle_curvature=settings.needle_curvature,
         )
+    step = options.get("step", settings.forecast_step)
     chosen: dict[str, Any] = {
         "law": settings.friction_law(),
         "friction_averaging": settings.friction_averaging,
         "attachment_offset": settings.attachment_offset,
-        "step": settings.forecast_step,
+        "step": step,
         "margin_range": settings.margin_range,
         "contact_tolerance": settings.contact_tolerance,
         "residual_tolerance": settings.residual_tolerance,
-        "max_step": settings.max_step,
+        "max_step": max(settings.max_step, 1.001 * step),  # against rounding
         "fixed_nodes": settings.fixed_nodes,
     }
     return ThreadForecaster(settings.thread(), scene, safety, **{**chosen, **options})

@@ -50,6 +50,13 @@ class LatticeGoal(NamedTuple):
 
 
 @compiled
+def _nearness(room: float, required: float, preferred: float) -> float:
+    """Return the factor on the cost of a way, by the clearance of the body on it."""
+    share = min(1.0, max(0.0, (preferred - room) / max(preferred - required, 1e-12)))
+    return 1.0 + (NEAR_COST - 1.0) * share
+
+
+@compiled
 def _way_to(
     last: int, parent: NDArray[np.int32], size: int, origin: float, step: float, directions: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -161,10 +168,6 @@ def search_lattice(
             room = clear[key]
             if room < required:
                 continue
-            if choice < 2:
-                room = min(room, body_clearance(0.5 * (x + nx), 0.5 * (y + ny), directions[nd], body, near))
-                if room < required:
-                    continue
             if sheets > 1 and choice < 2:
                 there = math.atan2(ny - goal.centre[1], nx - goal.centre[0])
                 way = (there - angle + math.pi) % (2.0 * math.pi) - math.pi
@@ -173,9 +176,14 @@ def search_lattice(
                 nsheet = sheet + round(turns)
                 if nsheet < 0 or nsheet >= sheets:
                     continue
-            share = min(1.0, max(0.0, (preferred - room) / max(preferred - required, 1e-12)))
-            onward = cost[state] + length * (1.0 + (NEAR_COST - 1.0) * share)
             following = nsheet * cells + key
+            onward = cost[state] + length * _nearness(room, required, preferred)
+            if choice < 2 and onward < cost[following]:
+                # Most ways are no better than one that is known, whatever is halfway.
+                halfway = body_clearance(0.5 * (x + nx), 0.5 * (y + ny), directions[nd], body, near)
+                if halfway < required:
+                    continue
+                onward = cost[state] + length * _nearness(min(room, halfway), required, preferred)
             if onward < cost[following]:
                 cost[following] = onward
                 parent[following] = state

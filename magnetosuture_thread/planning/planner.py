@@ -33,6 +33,7 @@ Vector = NDArray[np.float64]
 MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
 VIEW_SAMPLES = 24
 MAX_STATES = 20_000_000
+MAX_WAYS = 32  # that are kept
 HEADING_TOLERANCE = 0.3  # rad
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
 GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
@@ -87,6 +88,7 @@ class NeedlePlanner:
         self.body = np.ascontiguousarray((axis - self.lever * along) @ turn.T)
         self._step = STRIDE * self.near.step
         self._size = CELLS // STRIDE + 1
+        self._ways: dict[tuple[object, ...], Points] = {}  # found, by what was searched
 
     def pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
         """Return middle, shape (2,) [m], and angle of the chord [rad] of a needle with this tail and heading."""
@@ -248,18 +250,24 @@ class NeedlePlanner:
 
     def _search(self, goal: LatticeGoal, kept: float, start: NDArray[np.int64]) -> Points:
         """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none."""
-        return search_lattice(
-            start,
-            self.body,
-            self.lever,
-            kept,
-            kept + PREFERRED,
-            goal,
-            self.near,
-            MOVES,
-            DIRECTIONS,
-            MAX_STATES,
-        )
+        # A procedure is planned as a whole, and then goal by goal from the same points of the lattice.
+        key = (start.tobytes(), kept, *(np.asarray(part).tobytes() for part in goal))
+        if key not in self._ways:
+            if len(self._ways) >= MAX_WAYS:
+                self._ways.clear()
+            self._ways[key] = search_lattice(
+                start,
+                self.body,
+                self.lever,
+                kept,
+                kept + PREFERRED,
+                goal,
+                self.near,
+                MOVES,
+                DIRECTIONS,
+                MAX_STATES,
+            )
+        return self._ways[key]
 
     def _state_of(self, state: Vector) -> NDArray[np.int64]:
         """Return column, row and direction of a state of the lattice."""

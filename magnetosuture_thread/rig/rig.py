@@ -152,7 +152,7 @@ class Rig:
             raise InvalidInputError("rig/currents.current", currents.tolist(), expected)
         self.advance(time)
         limit = self._settings.coil_max_current
-        currents = np.clip(currents, -limit, limit)
+        currents = np.minimum(np.maximum(currents, -limit), limit)
         if self.problem:
             if not np.any(currents):
                 return

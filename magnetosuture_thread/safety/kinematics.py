@@ -35,8 +35,10 @@ class NeedleKinematics:
     curvature: float = 0.0
 
     @cached_property
-    def _chord(self) -> tuple[float, Vector]:
-        return needle_chord(self.length, self.curvature)
+    def _chord(self) -> tuple[float, float, float]:
+        """Length of the chord [m], cosine and sine of its angle against the heading."""
+        chord, turn = needle_chord(self.length, self.curvature)
+        return chord, float(turn[0, 0]), float(turn[1, 0])
 
     @property
     def chord(self) -> float:
@@ -45,7 +47,9 @@ class NeedleKinematics:
 
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        return np.asarray(self._chord[1] @ heading)
+        _, c, s = self._chord
+        x, y = float(heading[0]), float(heading[1])
+        return np.array([c * x - s * y, s * x + c * y])
 
     def tip(self, tail: Vector, heading: Vector) -> Vector:
         """Return where the tip is, shape (2,) [m]."""
@@ -70,16 +74,19 @@ class NeedleKinematics:
             duration: of the motion [s].
             drift: as much of that part is of the whole needle; the rest turns it [m/s].
         """
-        e = self.chord_direction(heading)
+        ex, ey = self.chord_direction(heading).tolist()
         if self.length == 0.0:
-            return tail + duration * np.array([along * e[0] - across * e[1], along * e[1] + across * e[0]]), heading
+            return tail + duration * np.array([along * ex - across * ey, along * ey + across * ex]), heading
         lever = 0.5 * self.chord
         half = 0.5 * (across - drift) / lever * duration
         reach = duration * (math.sin(half) / half if half else 1.0)
         c, s = math.cos(half), math.sin(half)
-        middle_e = np.array([c * e[0] - s * e[1], s * e[0] + c * e[1]])
-        middle = tail + lever * e + reach * (along * middle_e + drift * np.array([-middle_e[1], middle_e[0]]))
-        turn = np.array([[c * c - s * s, -2.0 * c * s], [2.0 * c * s, c * c - s * s]])
-        turned = turn @ heading
-        turned /= math.hypot(turned[0], turned[1])
-        return middle - lever * self.chord_direction(turned), turned
+        half_x, half_y = c * ex - s * ey, s * ex + c * ey  # the chord's direction halfway
+        middle_x = float(tail[0]) + lever * ex + reach * (along * half_x - drift * half_y)
+        middle_y = float(tail[1]) + lever * ey + reach * (along * half_y + drift * half_x)
+        c, s = c * c - s * s, 2.0 * c * s
+        x, y = c * float(heading[0]) - s * float(heading[1]), s * float(heading[0]) + c * float(heading[1])
+        size = math.hypot(x, y)
+        turned = np.array([x / size, y / size])
+        ex, ey = self.chord_direction(turned).tolist()
+        return np.array([middle_x - lever * ex, middle_y - lever * ey]), turned

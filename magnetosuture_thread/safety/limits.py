@@ -19,11 +19,11 @@ def limit_norm(vector: Vector, max_norm: float) -> Vector:
     array([0.6, 0.8])
     """
     # Scaled by the largest component first: the squares of a hostile command may overflow.
-    greatest = float(np.max(np.abs(vector)))
+    greatest = float(np.abs(vector).max())
     if greatest == 0.0:
         return np.zeros_like(vector)
     direction = vector / greatest
-    norm = float(np.linalg.norm(direction))
+    norm = math.sqrt(float(direction @ direction))
     return vector if greatest * norm <= max_norm else direction * (max_norm / norm)
 
 

@@ -360,14 +360,17 @@ def segment_contacts(
     )
     columns, corners = shapes.clearances.shape[1], shapes.corners
     starts, content = shapes.sharp.starts, shapes.sharp.content
+    ex, ey, square = bx - ax, by - ay, size * size
     for row in range(first_row, last_row + 1):
         for column in range(first, last + 1):
             cell = row * columns + column
             for k in range(starts[cell], starts[cell + 1]):
                 i = content[k]
-                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
-                if not (0.0 < s < 1.0 and gap < deepest):
+                dx, dy = corners[i, 0] - ax, corners[i, 1] - ay
+                # Most corners are beside the segment or far from its line, which takes no division to see.
+                if not 0.0 < dx * ex + dy * ey < square or abs(dx * ey - dy * ex) >= deepest * size:
                     continue
+                gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
                 if _is_behind(ax + s * (bx - ax), ay + s * (by - ay), gap, shapes, i):
                     gap, nx, ny = -gap, -nx, -ny
                 if gap < radius and count < rows.shape[0]:

@@ -15,8 +15,8 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, S
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.field import CoilField
-from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody
-from magnetosuture_thread.rig.mechanics.newton import MAX_FULL_STEPS, MAX_ITERATIONS, advance, make_buffers
+from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, find_poles
+from magnetosuture_thread.rig.mechanics.newton import MAX_ITERATIONS, advance, make_buffers
 from magnetosuture_thread.rig.mechanics.rod import Rod
 from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
 
@@ -25,7 +25,6 @@ __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
-FAILED_ITERATIONS = MAX_FULL_STEPS + MAX_ITERATIONS  # of a step that does not converge
 GREATEST_GROWTH = 2.0  # of a step; the formula is stable up to 1 + sqrt(2)
 MAX_CONTACTS = 48  # points of the needle's outline
 
@@ -237,7 +236,7 @@ class RigDynamics:
         begin = self._q[:3].copy()
         while (left := dt - done) > 1e-12 * dt:
             # At least one step is taken, or fails for good: nothing is tried again and again in call after call.
-            if done and self.iterations + FAILED_ITERATIONS * self.halvings >= max_iterations:
+            if done and self.iterations + MAX_ITERATIONS * self.halvings >= max_iterations:
                 return done
             if self._last_dt > 0.0:
                 h = min(h, GREATEST_GROWTH * self._last_dt)
@@ -261,8 +260,7 @@ class RigDynamics:
         """Take one step; return whether it converged, and change nothing if not."""
         ratio = h / self._last_dt if self._last_dt > 0.0 else 0.0
         if currents is not None and self.field is not None:
-            ahead = self._q[:3] + ratio * (self._q[:3] - self._before[:3])
-            self._poles[0, :2], self._poles[1, :2] = ahead[1:], self._tip_of(ahead)
+            find_poles(self._q, self._before, ratio, self.needle.tip, self._poles)
             self._flux[:] = (currents @ self.field.per_current(self._poles).reshape(-1, 6)).reshape(2, 3)[:, :2]
         start = self._q.copy()
         iterations, self._move, residual = advance(

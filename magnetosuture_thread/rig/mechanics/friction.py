@@ -74,21 +74,22 @@ def add_friction(
     band: NDArray[np.float64],
 ) -> float:
     """Add the friction of a step from `start` to q; `slip` is e [m]."""
-    energy, w = 0.0, np.empty(4)
+    energy = 0.0
     for row in range(friction.shape[0]):
         limit = friction[row, 4]
         if limit == 0.0:
             break
         a, s, tx, ty = int(friction[row, 0]), friction[row, 1], friction[row, 2], friction[row, 3]
-        w[0], w[1], w[2], w[3] = (1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty
+        w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
         count = 2 if s == 0.0 else 4
         along = 0.0
         for r in range(count):
             along += w[r] * (q[a + r] - start[a + r])
         root = math.sqrt(along * along + slip * slip)
         energy += limit * (root - slip)
+        force, second = limit * along / root, limit * slip * slip / root**3
         for r in range(count):
-            gradient[a + r] += limit * along / root * w[r]
+            gradient[a + r] += force * w[r]
             for c in range(r + 1):
-                band[a + r, r - c] += limit * slip * slip / root**3 * w[r] * w[c]
+                band[a + r, r - c] += second * w[r] * w[c]
     return energy

@@ -164,6 +164,29 @@ class Needle(NamedTuple):
 
 
 @compiled
+def find_poles(
+    q: NDArray[np.float64],
+    before: NDArray[np.float64],
+    ratio: float,
+    tip: NDArray[np.float64],
+    poles: NDArray[np.float64],
+) -> None:
+    """Write x and y of tail and tip after a step, as the step before goes on, shape (2, 3) [m].
+
+    Args:
+        q: state, its first three are heading, x and y of the tail [rad, m].
+        before: the state one step earlier.
+        ratio: of the step to the one before.
+        tip: in the needle's frame, shape (2,) [m].
+        poles: written.
+    """
+    heading = q[0] + ratio * (q[0] - before[0])
+    c, s = math.cos(heading), math.sin(heading)
+    poles[0, 0], poles[0, 1] = q[1] + ratio * (q[1] - before[1]), q[2] + ratio * (q[2] - before[2])
+    poles[1, 0], poles[1, 1] = poles[0, 0] + c * tip[0] - s * tip[1], poles[0, 1] + s * tip[0] + c * tip[1]
+
+
+@compiled
 def turn_resistance(needle: Needle, heading: float, scale: float, turned: NDArray[np.float64]) -> None:
     """Write the resistance to (omega, v_x, v_y) in the dish's frame, times a factor, shape (3, 3)."""
     c, s = math.cos(heading), math.sin(heading)

@@ -27,25 +27,23 @@ from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, c
 
 MAX_ITERATIONS = 60
 PAIRS_PER_NODE = 16  # rows of contact with itself
-MAX_FULL_STEPS = 12  # without a line search
 MIN_LINE_SEARCH = 1e-6
+MIN_PART, MAX_PART = 2e-3, 0.5  # of a trial of the line search, for the next one
 DESCENT = 1e-4  # of the decrease that the slope promises
 ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
 MIN_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
-FALSE_RISE = 1e-6  # of the energy, by which whole steps have gone somewhere else
 
 
 class NewtonBuffers(NamedTuple):
     """What a step works in, N = 2n + 3 unknowns.
 
-    Trial state, that of the least energy so far, step, right side, bands, drag, contact rows.
+    Trial state, step, right side, bands, drag, contact rows.
 
     Of friction: what rubs, the state that slip is measured from, and the slip that smooths it. Of the thread's contact
     with itself: the rows of `find_pairs`, their second derivatives, and how many there are.
     """
 
     trial: NDArray[np.float64]
-    lowest: NDArray[np.float64]
     step: NDArray[np.float64]
     gradient: NDArray[np.float64]
     band: NDArray[np.float64]
@@ -67,7 +65,6 @@ def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
     size = 2 * segments + 3
     return NewtonBuffers(
         trial=np.zeros(size),
-        lowest=np.zeros(size),
         step=np.zeros(size),
         gradient=np.zeros(size),
         band=np.zeros((size, WIDTH)),
@@ -135,8 +132,25 @@ def _largest(gradient: NDArray[np.float64], arm: float) -> float:
 
 
 @compiled
+def _shorter(part: float, slope: float, new_slope: float, rise: float) -> float:
+    """Return the next part of a step to try: where the cubic through values and slopes at 0 and `part` is least.
+
+    With slope and new_slope by the part, and rise from 0 to `part`. A new contact begins after a small part of a step,
+    which the cubic finds at once.
+
+    Source: Nocedal and Wright, Numerical Optimization, equation 3.59. Deviation: bounds.
+    """
+    middle = slope + new_slope - 3.0 * rise / part
+    square = middle * middle - slope * new_slope
+    if not square >= 0.0:
+        return MAX_PART * part
+    root = math.sqrt(square)
+    share = 1.0 - (new_slope + root - middle) / (new_slope - slope + 2.0 * root)
+    return part * min(max(share, MIN_PART), MAX_PART)
+
+
+@compiled
 def _minimise(
-    start: NDArray[np.float64],
     field: NDArray[np.float64],
     needle: Needle,
     rod: Rod,
@@ -144,22 +158,17 @@ def _minimise(
     buffers: NewtonBuffers,
     driven: bool,
     tolerance: float,
-    search: bool,
 ) -> tuple[int, float, float]:
-    """Find in `memory.trial` where a step's value is least; see `advance`.
+    """Find in `buffers.trial`, from what is there, where a step's value is least; see `advance`.
 
-    Newton, with the convex part of the second derivatives where they are not positive definite. Without a line
-    search a contact is found in one or two steps; with one, steps end short of every new contact. So the first way is
-    given few steps of at most half a segment, must not rise twice in a row, and must end below where it started. The
-    other way goes on from where the value was least.
+    Newton with a line search, and with the convex part of the second derivatives where they are not positive definite.
     """
-    trial, size = buffers.trial, start.shape[0]
+    trial, step, gradient, size = buffers.trial, buffers.step, buffers.gradient, buffers.trial.shape[0]
     arm = math.sqrt(needle.tip[0] ** 2 + needle.tip[1] ** 2)
-    current = start.copy()
-    buffers.lowest[:] = start
-    first = lowest = energy = assemble_energy(start, field, needle, rod, shapes, buffers, driven, False)
-    move, force, rises = np.inf, _largest(buffers.gradient, arm), 0
-    for iteration in range(1, (MAX_ITERATIONS if search else MAX_FULL_STEPS) + 1):
+    current = trial.copy()
+    energy = assemble_energy(trial, field, needle, rod, shapes, buffers, driven, False)
+    move, force = np.inf, _largest(gradient, arm)
+    for iteration in range(1, MAX_ITERATIONS + 1):
         buffers.chol[:, :] = buffers.band
         if not factor(buffers.chol):
             assemble_energy(current, field, needle, rod, shapes, buffers, driven, True)
@@ -167,40 +176,37 @@ def _minimise(
             if not factor(buffers.chol):
                 return -1, np.inf, force
         for i in range(size):
-            buffers.step[i] = -buffers.gradient[i]
-        back_substitute(buffers.chol, buffers.step)
+            step[i] = -gradient[i]
+        back_substitute(buffers.chol, step)
         if buffers.paired[0] > 0:
             pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
-            couple(buffers.chol, pairs, second, 3 if driven else 0, buffers.step)
+            couple(buffers.chol, pairs, second, 3 if driven else 0, step)
         slope = 0.0
-        move = abs(buffers.step[0]) * arm
+        move = abs(step[0]) * arm
         for i in range(size):
-            slope += buffers.gradient[i] * buffers.step[i]
+            slope += gradient[i] * step[i]
             if i > 0:
-                move = max(move, abs(buffers.step[i]))
-        if not move < (np.inf if search else 0.5 * rod.segment):
+                move = max(move, abs(step[i]))
+        if not move < np.inf:
             return -1, move, force
         part = 1.0
         while True:
+            new_slope = 0.0
             for i in range(size):
-                trial[i] = current[i] + part * buffers.step[i]
+                trial[i] = current[i] + part * step[i]
             new = assemble_energy(trial, field, needle, rod, shapes, buffers, driven, False)
-            force = _largest(buffers.gradient, arm)
+            force = _largest(gradient, arm)
             if move <= tolerance:
-                lower = search or new <= first + FALSE_RISE * abs(first) + MIN_ENERGY
-                return iteration if lower else -1, move, force
-            if not search or new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
+                return iteration, move, force
+            if new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
                 break
-            part *= 0.5
+            for i in range(size):
+                new_slope += gradient[i] * step[i]
+            part = _shorter(part, slope, new_slope, new - energy)
             if part < MIN_LINE_SEARCH:
                 return -1, move, force
         current[:] = trial
         energy = new
-        rises = rises + 1 if new > lowest else 0
-        if new < lowest:
-            lowest, buffers.lowest[:] = new, trial
-        if rises > 1 and not search:
-            return -1, move, force
     return -1, move, force
 
 
@@ -223,12 +229,11 @@ def advance(
         Z(q*) (q - rest) / (beta dt) + dE/dq = 0,    w = dt / dt_before
         rest = ((1 + w)^2 q_0 - w^2 q_-1) / (1 + 2 w),    beta = (1 + w) / (1 + 2 w),    q* = q_0 + w (q_0 - q_-1)
 
-    which is where E + (q - rest)' Z (q - rest) / (2 beta dt) is least. Newton's whole steps find it fast, also where
-    contacts begin and end. Where they do not, the search starts again with a line search.
+    which is where E + (q - rest)' Z (q - rest) / (2 beta dt) is least.
 
     Args:
         q: state at the start, shape (N,); replaced by the state at the end. Of a driven needle its first three
-            values are in `memory.trial` [rad, m].
+            values are in `buffers.trial` [rad, m].
         before: the state one step earlier.
         dt: step [s].
         ratio: w, 0 for a first step, which is backward Euler.
@@ -258,11 +263,7 @@ def advance(
     buffers.paired[0] = find_pairs(q, rod, shapes, buffers.pairs) if shapes.self_contact else 0
     if buffers.paired[0] < 0:
         return -1, np.inf, np.inf
-    start = trial.copy()
-    done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, False)
-    if done < 0:
-        start[:] = buffers.lowest
-        done, move, force = _minimise(start, field, needle, rod, shapes, buffers, driven, tolerance, True)
+    done, move, force = _minimise(field, needle, rod, shapes, buffers, driven, tolerance)
     if done > 0 and shapes.self_contact and crosses_anew(q, trial):
         done = -1
     if done > 0:

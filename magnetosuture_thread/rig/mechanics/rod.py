@@ -186,9 +186,6 @@ def add_contact(
     """
     energy = 0.0
     k = shapes.stiffness
-    w = np.empty(4)
-    v = np.empty(4)
-    z = np.empty(4)
     grid, clearances = shapes.grid, shapes.clearances
     for a in range(3, q.shape[0] - 1, 2):
         if clear(q[a], q[a + 1], rod.radius, grid, clearances):
@@ -214,16 +211,16 @@ def add_contact(
         for row in range(count):
             depth, nx, ny, gap, s = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
             energy += 0.5 * k * depth * depth
-            w[0], w[1], w[2], w[3] = (1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny
-            v[0], v[1], v[2], v[3] = -nx, -ny, nx, ny
-            tx, ty = ex / size, ey / size
-            z[0], z[1], z[2], z[3] = (1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty
+            w = ((1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny)
+            # Of the second derivative: turning, of the normal and of the place s.
+            tx, ty, turn = ex / (size * size), ey / (size * size), 0.0 if convex else 1.0
+            v = (-nx, -ny, nx, ny)
+            z = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
+            bend = gap / (size * size)
             for r in range(4):
                 gradient[a + r] -= k * depth * w[r]
                 for c in range(r + 1):
-                    second = 0.0
-                    if not convex:
-                        second = (z[r] * v[c] + v[r] * z[c]) / size + gap * v[r] * v[c] / (size * size)
+                    second = turn * (z[r] * v[c] + v[r] * z[c] + bend * v[r] * v[c])
                     band[a + r, r - c] += k * (w[r] * w[c] + depth * second)
     return energy
 
@@ -236,8 +233,7 @@ def factor(band: NDArray[np.float64]) -> bool:
         for j in range(low, i + 1):
             total = band[i, i - j]
             for k in range(low, j):
-                if j - k < WIDTH:
-                    total -= band[i, i - k] * band[j, j - k]
+                total -= band[i, i - k] * band[j, j - k]
             if j < i:
                 band[i, i - j] = total / band[j, 0]
             elif total > 0.0:
