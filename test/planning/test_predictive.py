@@ -46,7 +46,14 @@ def controller(forecaster: ThreadForecaster, seed: int = 0) -> PredictiveControl
 
 
 class Run:
-    """An ideal needle behind the safety filter that follows a straight path past the post, by a controller or by the tracker alone."""
+    """An ideal needle behind its safety filter that follows a straight path past the post.
+
+    Args:
+        forecaster: of needle and thread.
+        control: the controller; None for the path tracker alone.
+        begin: of the path along the x axis [m].
+        limits: of the goal.
+    """
 
     def __init__(
         self, forecaster: ThreadForecaster, control: PredictiveController | None, begin: float = BEGIN, **limits: Any
