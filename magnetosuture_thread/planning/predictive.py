@@ -34,7 +34,7 @@ TURN_TIME = 0.25  # s; in which a candidate turns
 ERROR_SCALE, CLEARANCE_RANGE = 1.5e-4, 1.5e-4  # m; error of weight 1, and clearance beyond the limit that costs nothing
 LIMIT_RANGE = 0.3  # of a limit, in which it begins to cost
 ERROR_WEIGHT, CLEARANCE_WEIGHT, LIMIT_WEIGHT = 0.1, 1.0, 4.0  # against all of the progress that is allowed
-PREFERENCE = 0.02  # of cost, by which another candidate has to be better than the tracker's command
+PREFERENCE = 0.2  # of cost, by which another candidate has to be better than the tracker's command
 DISTURBANCE_TIME, MAX_DISTURBANCE = 0.3, 2e-3  # s and m/s; of the filter of what forecasts miss, and its bound
 UNLIMITED = 10_000  # friction nodes; a limit that is none
 

@@ -193,6 +193,7 @@ def test_forecasts_without_a_solution_leave_the_trackers_command(
 def test_a_pull_that_is_not_compensated_is_learnt_from_the_poses(
     forecaster: ThreadForecaster, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(predictive, "PREFERENCE", 0.02)  # the less it takes, the more a wrong forecast does
     found = []
     for time in (1e9, DISTURBANCE_TIME):  # never, and as it is
         monkeypatch.setattr(predictive, "DISTURBANCE_TIME", time)
