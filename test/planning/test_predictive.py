@@ -11,6 +11,7 @@ import pytest
 
 from magnetosuture_thread.forecast import Forecast, ThreadForecaster
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.model.margins import FrictionLaw
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.planning import predictive
@@ -42,7 +43,7 @@ def forecaster() -> ThreadForecaster:
 
 def controller(forecaster: ThreadForecaster, seed: int = 0) -> PredictiveController:
     """Return a controller of the needle."""
-    return PredictiveController(NeedlePlanner(SCENE, NEEDLE, KEEP_OUT, 0.012), forecaster, seed=seed)
+    return PredictiveController(NeedlePlanner(forecaster.scene, NEEDLE, KEEP_OUT, 0.012), forecaster, seed=seed)
 
 
 class Run:
@@ -121,6 +122,23 @@ def test_a_thread_near_its_tension_limit_slows_the_needle(forecaster: ThreadFore
     assert slowed.speeds[-20:].mean() < 0.85 * SPEED
     # The setpoint has waited for the needle.
     assert slowed.tracker.travel - slowed.tail[0] - 0.5 * NEEDLE.chord + BEGIN < 2e-4
+
+
+def test_a_limit_of_nodes_under_friction_slows_the_needle(forecaster: ThreadForecaster):
+    other = SceneShape("other", "instrument", Disc((0.0, 0.0015 + BESIDE), 0.0015))  # a thread between two is rubbed
+    scene = Scene(Dish(0.05), (POST, other))
+    safety = NeedleSafetyFilter(scene, keep_out=KEEP_OUT, needle_length=NEEDLE.length, max_speed=0.01)
+    rubbed = ThreadForecaster(
+        forecaster.thread,
+        scene,
+        safety,
+        law=FrictionLaw(threshold=6e-4, beta=0.9, stuck_speed=1e-5),
+        step=FORECAST_STEP,
+        max_step=FORECAST_STEP,
+        workers=1,
+    )
+    free, limited = (Run(rubbed, controller(rubbed), friction_nodes=nodes).follow(5.0) for nodes in (9_999, 1))
+    assert limited.tracker.travel < free.tracker.travel - 5e-4
 
 
 @pytest.mark.parametrize("limits", [{"clearance": 6e-4}, {"tension": 1e-6}, {"friction_nodes": 0}])
