@@ -70,9 +70,9 @@ class PredictiveController:
             + w_l mean phi((1 - T / T_max) / r) + w_l mean phi((1 - m / m_max) / r),    phi(x) = max(0, 1 - x)^2
 
     with the progress p along the path and p_max that at the allowed speed [m], the error e of the body from the path,
-    sqrt(|dx|^2 + (l / 2)^2 dangle^2) [m], the clearance c of the body [m], the peak tension T of the thread [N], and
-    the number m of its nodes under friction; c_min, T_max and m_max are the limits of the goal. The means are over the
-    horizon.
+    sqrt(|dx|^2 + (l / 2)^2 dangle^2) [m] with the chord l, the clearance c of the body [m], the peak tension T of the
+    thread [N], and the number m of its nodes under friction; c_min, T_max and m_max are the limits of the goal. The
+    means are over the horizon.
 
     What the forecast does not know of, as a pull that the coils do not compensate, is added to the needle's motion: the
     difference between the last forecast and the pose that followed, low-passed. The search draws `SAMPLES` candidates
