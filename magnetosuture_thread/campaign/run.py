@@ -14,6 +14,7 @@ from magnetosuture_thread.campaign.limits import RunFigures, RunLimits
 from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.campaign.variation import Variation
 from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.executor import (
     PendingPath,
     ProcedureExecutor,
@@ -23,11 +24,13 @@ from magnetosuture_thread.planning.executor import (
 )
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
+from magnetosuture_thread.planning.predictive import FORECAST_STEP, PredictiveController
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s; of a run
+TRACKING, PREDICTIVE = LOCAL_CONTROLLERS = ("tracking", "predictive")
 PLANNING_TIME = 0.2  # s; in which a path is planned: 0.01 in the open, 0.5 through a gap and around a shape
 
 
@@ -70,6 +73,7 @@ def run_procedure(
     *,
     camera: bool = False,
     follower: bool = False,
+    local: str = TRACKING,
     recorder: LoopRecorder | None = None,
 ) -> RunResult:
     """Run a procedure, or the path follower of the setup for comparison, until it ends; return what came of it.
@@ -80,6 +84,7 @@ def run_procedure(
         variation: the truth.
         camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
         follower: whether the setup's path follower commands in place of the procedure.
+        local: how the paths of the procedure are followed, one of `LOCAL_CONTROLLERS`.
         recorder: gets what the nodes would publish; None for nobody.
 
     Raises:
@@ -88,7 +93,8 @@ def run_procedure(
     kinematics, keep_out = setup.coils.needle().kinematics, setup.coils.keep_out
     planner = NeedlePlanner(setup.scene, kinematics, keep_out, setup.model.thread_length, setup.coils.coil_angles)
     planner.check(procedure)
-    pilot = _Pilot(procedure, planner)
+    predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
+    pilot = _Pilot(procedure, planner, predictive)
     executor = pilot.executor
     rig = Rig(variation.setup.rig, setup.scene)
     loop = ClosedLoop(
@@ -175,8 +181,8 @@ class _PlannedPath:
 class _Pilot:
     """Executes a procedure as the needle planner does: paths are ready `PLANNING_TIME` after they are asked for."""
 
-    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
-        self.executor = ProcedureExecutor(procedure, planner, self._submit)
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner, local: PredictiveController | None) -> None:
+        self.executor = ProcedureExecutor(procedure, planner, self._submit, local=local)
         self._now = 0.0
 
     def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
@@ -194,3 +200,13 @@ class _Pilot:
 def _follow(setup: Setup) -> Controller:
     follower = setup.follower.follower()
     return lambda stamp, tail, heading, thread: follower.compute_command(stamp, tail, heading).velocity
+
+
+def _predictive(setup: Setup, planner: NeedlePlanner, seed: int) -> PredictiveController:
+    """Return the predictive controller of what the nodes believe."""
+    safety = setup.coils.safety_filter(setup.scene)
+    # A single worker: runs are what processes are for.
+    options = {"step": FORECAST_STEP, "max_step": FORECAST_STEP, "workers": 1}
+    forecaster = make_forecaster(setup.model, setup.scene, safety, **options)
+    slowed = setup.coils.friction_feedback == "all"
+    return PredictiveController(planner, forecaster, seed=seed, slowed=slowed)

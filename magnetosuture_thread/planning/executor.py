@@ -9,7 +9,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
 from magnetosuture_thread.planning.tracking import PathTracker
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.planning.predictive import PredictiveController
 
 Vector = NDArray[np.float64]
 
@@ -147,6 +150,7 @@ class ProcedureExecutor:
         planner: of paths in the scene.
         submit: begins to plan a path; by default that is done at once, while the caller waits.
         max_wait: for a thread that is not known; then the procedure is given up [s].
+        local: tracks the paths by forecasts of the thread; None for the path tracker alone.
     """
 
     def __init__(
@@ -155,8 +159,10 @@ class ProcedureExecutor:
         planner: NeedlePlanner,
         submit: PathSubmitter = plan_now,
         max_wait: float = MAX_WAIT,
+        local: PredictiveController | None = None,
     ) -> None:
-        self.procedure, self.planner, self._submit, self._max_wait = procedure, planner, submit, max_wait
+        self.procedure, self.planner, self._submit = procedure, planner, submit
+        self._max_wait, self._local = max_wait, local
         self.state, self.reason, self.goal = ProcedureState.READY, "", 0
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
@@ -165,8 +171,7 @@ class ProcedureExecutor:
         self._begin: Vector | None = None
         self._rest = _Rest()
         self._replans = 0
-        self._back_off_until = -math.inf
-        self._back_off = np.zeros(2)
+        self._back_off, self._back_off_until = np.zeros(2), -math.inf
         self._swept = 0.0  # of the goal's wrap, so far [rad]
         self._bearing: float | None = None
         self._speed = math.inf
@@ -271,8 +276,11 @@ class ProcedureExecutor:
             return self._next_goal()
         if self._tracker.travel > PROGRESS:
             self._replans = 0
-        speed = self._allowed_speed(thread)
-        command = self._tracker.compute_command(stamp, middle, angle, speed, thread.slowdown, thread.drift)
+        at = stamp, middle, angle, self._allowed_speed(thread)
+        if self._local is None:
+            command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
+        else:
+            command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
         if command.done:
             return self._at_end(stamp, goal, middle, angle)
         assert self.path is not None
@@ -302,9 +310,8 @@ class ProcedureExecutor:
             assert self._begin is not None
             left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
             limits = self.procedure.limits[self.goal]
-            self._pending = self._submit(
-                partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
-            )
+            task = partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
+            self._pending = self._submit(task)
         if not self._pending.done():
             return False
         pending, self._pending = self._pending, None
@@ -322,10 +329,8 @@ class ProcedureExecutor:
         if self._holder is None:
             path = self.planner.standing_path(middle, angle, limits)
             self._holder = PathTracker(path, self.planner.coil_angles)
-        command = self._holder.compute_command(
-            stamp, middle, angle, limits.speed, thread.slowdown, thread.drift, hold=True
-        )
-        return self._output(command.velocity)
+        at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
+        return self._output(self._holder.compute_command(*at, hold=True).velocity)
 
     def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
