@@ -97,7 +97,7 @@ class PredictiveController:
     ) -> None:
         self._planner, self._forecaster, self._slowed = planner, forecaster, slowed
         self._random = np.random.default_rng(seed)
-        self._to_chord = planner.needle.chord_direction(np.eye(2))
+        self._to_chord = np.column_stack([planner.needle.chord_direction(axis) for axis in np.eye(2)])
         self._last: tuple[float, _Candidate] | None = None  # with its stamp [s]
         self._disturbance = np.zeros(3)  # along the chord, across it, and of the turning tip [m/s]
 
