@@ -28,6 +28,8 @@ MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
 DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
+HEADING_ERROR = 0.015  # rad; of the needle, whose pose is extrapolated
+HEADING_STEP = 0.01  # rad; for the derivative by the heading
 COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
@@ -121,8 +123,10 @@ class CoilAllocation:
     compensates the needle's slip; and little current. The needle turns
     against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
 
-    Where a slip is compensated, omega alone follows the command, not the sum of both terms, so that the needle turns as
-    commanded also where it slips; and the field along it may fall to `MIN_ALIGNING_SHARE` B_0, not below.
+    Where a slip is compensated, what errors of the coils (`COIL_ERROR`) and of the heading (`HEADING_ERROR`) would do
+    to drift and direction counts too. Then omega alone follows the command, not the sum of both terms, so that the
+    needle turns as commanded also where it slips; and the field along it may fall to `MIN_ALIGNING_SHARE` B_0, not
+    below.
 
     Source: none.
 
@@ -196,13 +200,15 @@ class CoilAllocation:
         sideways = across if disturbance is None else across + disturbance.drift
         sideways = min(max_turn_speed, max(-max_turn_speed, sideways))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
-        effort = np.full(len(self.names), CURRENT_WEIGHT / self._max_current)
+        effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
         align_weight, turn_weight = ALIGN_WEIGHT, TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
         if disturbance is not None:
             align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
             turned = lever / CORRECTION_TIME * (n @ mean) / (MIN_ALIGNING_SHARE * self._field)
+            # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
+            misaligned = HEADING_ERROR / HEADING_STEP * (self._drifting(tail, heading, HEADING_STEP) - drifting)
             effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
         system = np.vstack(
             [
@@ -210,6 +216,7 @@ class CoilAllocation:
                 turn_weight * to_turn,
                 align_weight / self._field * (e @ mean),
                 DRIFT_WEIGHT / reference_speed * drifting,
+                DRIFT_WEIGHT / reference_speed * misaligned,
                 np.diag(effort),
             ]
         )
@@ -234,6 +241,15 @@ class CoilAllocation:
         inaccurate = math.hypot(*(reached - velocity)) > SATURATION_TOLERANCE * math.hypot(*velocity)
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
         return Allocation(currents, reached, saturated, float(drifting @ currents))
+
+    def _drifting(self, tail: Vector, heading: Vector, turned: float) -> Vector:
+        """Return the drift by each coil's ampere of the needle turned about its middle, shape (m,) [m/s]."""
+        needle, c, s = self._needle, math.cos(turned), math.sin(turned)
+        x, y = needle.chord_direction(heading).tolist()
+        e, n = np.array([c * x - s * y, s * x + c * y]), np.array([-s * x - c * y, c * x - s * y])
+        middle, lever = tail + 0.5 * needle.chord * np.array([x, y]), 0.5 * needle.chord
+        at_ends = self._coils.per_current(middle + lever * e) - self._coils.per_current(middle - lever * e)
+        return np.asarray(n @ (needle.pole * self.gains * at_ends) / needle.drag_across)
 
 
 def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:

@@ -57,6 +57,6 @@ class SmoothPath:
         return np.asarray(tangent / np.linalg.norm(tangent))
 
 
-def warm_up() -> None:
+def prepare_paths() -> None:
     """Import what the first path needs, which would delay whoever waits for that."""
     SmoothPath(np.array([[0.0, 0.0], [1e-3, 0.0]]))

@@ -8,7 +8,7 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.guidance.path import warm_up
+from magnetosuture_thread.guidance.path import prepare_paths
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
@@ -27,7 +27,7 @@ class PathFollowerNode(PackageNode):
         super().__init__("path_follower", **node_options("path_follower", options))
         settings = declare(self, PathFollowerSettings)
         self._settings, self._follower = settings, settings.follower()
-        warm_up()
+        prepare_paths()
         scene = initial_scene(settings.scene)
         if scene is not None:
             settings.check_path(scene)

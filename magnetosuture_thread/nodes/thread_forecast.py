@@ -19,7 +19,7 @@ from magnetosuture_thread import (
 )
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.guidance.path import warm_up
+from magnetosuture_thread.guidance.path import prepare_paths
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
@@ -130,7 +130,7 @@ class ThreadForecasts:
         if scene is not None:
             forecaster = make_forecaster(settings, scene, workers=1)
             forecaster.warm_up()
-            warm_up()
+            prepare_paths()
         self._made = settings, scene, forecaster
         return forecaster
 

@@ -47,7 +47,7 @@ def test_a_needle_too_close_to_a_block_leaves_it_sideways_against_what_pulls_it(
 
 
 def test_a_needle_that_has_enough_clearance_is_not_taken_off_sideways():
-    safety, coils = SETTINGS.safety_filter(blocks(4e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    safety, coils = SETTINGS.safety_filter(blocks(6e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
     pose = Pose(-1.25e-3 * E, E)
     found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), np.zeros(2), 2e-3)
     assert abs(found.drift) < 1e-4
