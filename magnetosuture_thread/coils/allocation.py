@@ -142,8 +142,10 @@ class CoilAllocation:
     """
 
     def __init__(self, coils: CoilModel, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
-        import scipy.optimize  # noqa: F401  before the first command, but not for who reads settings alone
+        # Here, so that it delays no command, and nobody who reads settings alone.
+        from scipy.optimize import lsq_linear
 
+        self._solve_bounded = lsq_linear
         self.names = coils.names
         self._coils = coils
         self._needle = needle
@@ -231,12 +233,12 @@ class CoilAllocation:
         if previous is not None:
             lower = np.minimum(np.maximum(previous - max_change, -limit), limit)
             upper = np.minimum(np.maximum(previous + max_change, -limit), limit)
-        currents = _bounded_least_squares(system, target, lower, upper)
+        currents = self._bounded_least_squares(system, target, lower, upper)
         if disturbance is not None and e @ mean @ currents < MIN_ALIGNING_SHARE * self._field:
             # A constraint that the optimum violates is active in the constrained optimum.
             system[2] = CONSTRAINT_WEIGHT / self._field * (e @ mean)
             target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
-            currents = _bounded_least_squares(system, target, lower, upper)
+            currents = self._bounded_least_squares(system, target, lower, upper)
         reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
         inaccurate = math.hypot(*(reached - velocity)) > SATURATION_TOLERANCE * math.hypot(*velocity)
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
@@ -251,15 +253,12 @@ class CoilAllocation:
         at_ends = self._coils.per_current(middle + lever * e) - self._coils.per_current(middle - lever * e)
         return np.asarray(n @ (needle.pole * self.gains * at_ends) / needle.drag_across)
 
-
-def _bounded_least_squares(system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
-    # Most solutions are inside the bounds, where the unconstrained one is optimal.
-    found = solve_by_reflections(system, target)
-    if ((found >= lower) & (found <= upper)).all():
-        return found
-    from scipy.optimize import lsq_linear
-
-    # The solver rejects equal bounds; the small gap has no effect.
-    bounds = (lower, np.maximum(upper, lower + 1e-9))
-    return np.clip(lsq_linear(system, target, bounds=bounds, method="bvls").x, lower, upper)
+    def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
+        """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
+        # Most solutions are inside the bounds, where the unconstrained one is optimal.
+        found = solve_by_reflections(system, target)
+        if ((found >= lower) & (found <= upper)).all():
+            return found
+        # The solver rejects equal bounds; the small gap has no effect.
+        bounds = (lower, np.maximum(upper, lower + 1e-9))
+        return np.clip(self._solve_bounded(system, target, bounds=bounds, method="bvls").x, lower, upper)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -356,6 +356,27 @@ def test_the_needle_never_comes_closer_than_it_may(
     assert least < 0.003  # it did get there
 
 
+def compensated_motion(
+    plant: Plant, tail: NDArray[np.float64], heading: NDArray[np.float64], pull: NDArray[np.float64], steps: int
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the needle's tail and heading after each step: it is pulled, and its poses come late and seldom."""
+    plant.tail = None
+    needle = plant.bridge._settings.needle().kinematics
+    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
+    for number in range(1, steps):
+        poses.append((plant.time, tail, heading))
+        if number > 10 and number % 10 == 0:
+            then, old_tail, old_heading = poses[number - 11]
+            plant.bridge.on_pose(old_tail, old_heading, then, number, plant.time, plant.time)
+        found = plant.run(PERIOD)[0].allocation
+        e = needle.chord_direction(heading)
+        n = np.array([-e[1], e[0]])
+        turning = float(found.velocity @ n) - found.drift
+        tail, heading = needle.moved(tail, heading, float(found.velocity @ e), turning, PERIOD)
+        tail = tail + PERIOD * (found.drift * n + pull)
+        yield tail, heading
+
+
 @pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0), (0.3, -0.9)])
 @pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
 @pytest.mark.parametrize("pull", [0.0, 1e-3])
@@ -367,24 +388,9 @@ def test_nor_does_a_needle_whose_pull_is_compensated(
     posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
     scene = Scene(Dish(0.035), posts)
     plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
-    plant.tail = None
-    tail, heading = TAIL - np.array([0.004, 0.0]), EAST
-    needle, safety = settings.needle().kinematics, settings.safety_filter(scene)
-    least, drag = np.inf, pull * np.array(towards) / math.hypot(*towards)
-    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
-    for number in range(1, 1200):
-        poses.append((plant.time, tail, heading))
-        if number > 10 and number % 10 == 0:
-            then, old_tail, old_heading = poses[number - 11]
-            plant.bridge.on_pose(old_tail, old_heading, then, number, plant.time, plant.time)
-        found = plant.run(PERIOD)[0].allocation
-        e = needle.chord_direction(heading)
-        n = np.array([-e[1], e[0]])
-        tail, heading = needle.moved(
-            tail, heading, float(found.velocity @ e), float(found.velocity @ n) - found.drift, PERIOD
-        )
-        tail = tail + PERIOD * (found.drift * n + drag)
-        least = min(least, safety.clearance(tail, heading))
+    safety, drag = settings.safety_filter(scene), pull * np.array(towards) / math.hypot(*towards)
+    motion = compensated_motion(plant, TAIL - np.array([0.004, 0.0]), EAST, drag, 1200)
+    least = min(safety.clearance(tail, heading) for tail, heading in motion)
     assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
 
@@ -400,22 +406,9 @@ def test_a_needle_beside_a_block_that_it_is_pulled_to_gets_free_sideways(pull: f
     polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
     scene = Scene(Dish(0.05), (SceneShape("block", "wall", polygon),))
     plant = Plant(settings, scene, velocity=tuple(1e-3 * e)).ready()
-    plant.tail = None
-    needle, safety = settings.needle().kinematics, settings.safety_filter(scene)
-    tail, heading = -0.5 * needle.chord * e - 0.4 * keep * n, e
-    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
-    for number in range(1, 400):
-        poses.append((plant.time, tail, heading))
-        if number > 10 and number % 10 == 0:
-            then, old_tail, old_heading = poses[number - 11]
-            plant.bridge.on_pose(old_tail, old_heading, then, number, plant.time, plant.time)
-        found = plant.run(PERIOD)[0].allocation
-        chord = needle.chord_direction(heading)
-        left = np.array([-chord[1], chord[0]])
-        turning = float(found.velocity @ left) - found.drift
-        tail, heading = needle.moved(tail, heading, float(found.velocity @ chord), turning, PERIOD)
-        tail = tail + PERIOD * (found.drift * left + pull * n)
-    assert safety.clearance(tail, heading) > keep
+    tail = -0.5 * settings.needle().chord * e - 0.4 * keep * n
+    *_, (tail, heading) = compensated_motion(plant, tail, e, pull * n, 400)
+    assert settings.safety_filter(scene).clearance(tail, heading) > keep
 
 
 def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: pytest.MonkeyPatch):
