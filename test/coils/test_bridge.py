@@ -722,3 +722,11 @@ def test_a_needle_at_the_wall_without_currents_has_the_wall_as_its_reason():
         assert still(output)
         assert output.reasons[0].startswith("stopped by wall"), output.reasons
         now += PERIOD
+
+
+def test_it_does_not_arm_while_the_driver_is_not_ready():
+    plant = Plant()
+    plant.bridge.latch.activate()
+    with pytest.raises(InvalidInputError, match=r"not ready \(no answer\)"):
+        plant.bridge.arm(DriverState(False, "no answer"))
+    assert all(still(output) for output in plant.run(0.1))

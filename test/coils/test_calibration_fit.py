@@ -178,3 +178,11 @@ def test_the_reading_that_differs_most_is_named():
     field = GOOD.field.copy()
     field[37] += 3e-4
     assert fit_calibration(dataclasses.replace(GOOD, field=field)).worst[0] == GOOD.lines[37]
+
+
+def test_an_angle_that_is_unknown_by_more_than_its_limit_is_poorly_determined():
+    """A noise of 0.2 mT leaves the angles of some coils unknown by more than 0.02 rad, and those of others by less."""
+    fit = fit_calibration(measured(make_coils("loops", UNLIKE).per_current, 2e-4, lattice(0.015, 5)))
+    poor = ["angle" in names for names in fit.poor]
+    assert poor == (fit.deviations[:, 0] > 0.02).tolist()
+    assert sorted(set(poor)) == [False, True]

@@ -78,3 +78,42 @@ def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int)
         motion, drift = found.velocity + disturbance.velocity(E), found.drift + disturbance.drift
         shares.append(safety.safe_share(motion, pose.tail, pose.heading, drift)[0])
     assert shares[1] >= min(shares[0], MIN_SHARE) - 1e-9
+
+
+@pytest.mark.parametrize("pull", [5e-4, -5e-4])
+def test_what_pulls_a_needle_to_a_block_or_off_it_is_compensated_though_its_turn_is_limited(pull: float):
+    safety = SETTINGS.safety_filter(blocks(2.6e-4))  # 0.01 mm more than keep_out, to the left
+    coils, pose = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
+    disturbance = MotionDisturbance(0.0, pull)
+    found, _ = coils.allocate(1e-3 * LEFT, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2))
+    assert found.drift + disturbance.drift == pytest.approx(0.0, abs=2e-5)
+    assert 0.0 < (found.velocity + disturbance.velocity(E)) @ LEFT < 5e-5
+
+
+@pytest.mark.parametrize(("pull", "limit"), [(1e-3, "block"), (-1e-3, "block"), (0.0, "")])
+def test_currents_are_certified_with_the_predicted_pull_and_without_it(pull: float, limit: str):
+    """Towards a block ahead 1 mm/s is certified, and 2 mm/s, by currents alone or with the pull, is not."""
+    near = 1.25e-3 + SETTINGS.keep_out + 1.5e-3 * SETTINGS.hold_time
+    corners = [a * E + b * LEFT for a, b in ((near, -4e-3), (near + 2e-3, -4e-3), (near + 2e-3, 4e-3), (near, 4e-3))]
+    block = SceneShape("block", "wall", Polygon(tuple((float(x), float(y)) for x, y in corners)))
+    safety = SETTINGS.safety_filter(Scene(Dish(0.05), (block,)))
+    coils, pose = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
+    wanted = 1e-3 + max(0.0, pull)
+    found, name = coils.allocate(wanted * E, pose, safety, coils.zero(), math.inf, None, pull * E)
+    assert name == limit
+    assert found.velocity @ E == pytest.approx((0.75 if limit else 1.0) * (wanted - pull), rel=0.04)
+
+
+@pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])
+def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to_the_wall(place: float, gap: float):
+    """Their drift cannot be avoided close to a coil's axis: the needle turns away from the wall by as much."""
+    settings = CoilBridgeSettings()
+    safety, needle = settings.safety_filter(Scene(Dish(0.035))), settings.needle()
+    out, e = np.array([math.cos(place), math.sin(place)]), np.array([-math.sin(place), math.cos(place)])
+    reach = math.sqrt((0.0175 - settings.keep_out - gap) ** 2 - 0.25 * needle.chord**2)
+    pose = Pose(reach * out - 0.5 * needle.chord * e, e)
+    wanted = safety.filter(0.005 * e + 0.003 * out, pose.tail, pose.heading).filtered
+    coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
+    found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, None, np.zeros(2))
+    assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
+    assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999

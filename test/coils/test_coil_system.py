@@ -13,7 +13,7 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import RecordingDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.stop_record import StopRecord
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 
 
@@ -65,3 +65,21 @@ def test_where_arming_cannot_be_recorded_it_does_not_arm(system, tmp_path: Path)
     system.arm_when_ready()
     system.step(500.0, 100.0)
     assert "stop_file" in system.latch.fault
+
+
+def test_it_does_not_arm_unless_it_was_asked_to(system):
+    system.latch.activate()
+    for asked in (False, True):
+        if asked:
+            system.arm_when_ready()
+        system.step(500.0, 100.0)
+        assert system.latch.armed == asked
+
+
+def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_taken(system):
+    named, imported, neither = "not_installed_yet:Bound", "magnetosuture_thread.barrier:Barrier", "antigravity:Bound"
+    system.import_barriers([named])
+    system.check_barriers([named, imported])
+    for name in (neither, "not_installed_yet:Another"):
+        with pytest.raises(ConfigurationError, match="named when the node started"):
+            system.check_barriers([named, name])

@@ -66,3 +66,8 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path):
     (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\xfe")
     with pytest.raises(InvalidInputError, match="not text"):
         read_measurements(tmp_path / "picture.csv")
+
+
+def test_a_number_of_four_digits_is_the_name_of_a_coil(tmp_path: Path):
+    rows = "".join(f"{name},1,0,0,0,0\n" for name in ("4711", "1234"))
+    assert read_measurements(written(tmp_path, HEADER + rows)).names == ("4711", "1234")

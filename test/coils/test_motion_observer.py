@@ -205,3 +205,13 @@ def test_the_bridge_counts_no_motion_while_its_currents_are_zero(stopped: str):
             middle = middle + PERIOD * ((output.applied @ e) * e + output.allocation.drift * np.array([-e[1], e[0]]))
     assert bridge._observer is not None
     assert np.abs(bridge._observer.disturbance(e)).max() < 1e-5
+
+
+@pytest.mark.parametrize(("held", "learned"), [(0.0625, True), (0.064, False), (0.12, False)])
+def test_currents_that_the_coils_may_have_switched_off_say_nothing(held: float, learned: bool):
+    """The coils hold their currents for at least 0.0625 s; the needle does not move by them at all."""
+    observer, e = MotionObserver(NEEDLE.kinematics, min_hold=0.0625), direction(0.3)
+    observer.update(np.zeros(2), e, 1.0)
+    observer.apply(1.0, e, 4e-3, 0.0)
+    observer.update(np.zeros(2), e, 1.0 + held)
+    assert (observer.disturbance(e).along < 0.0) == learned

@@ -264,3 +264,13 @@ def test_two_that_say_where_the_needle_is_are_one_too_many():
         extrapolator.update(np.array([0.01, 0.0]), EAST, 1.0, 7777, 1.0, 50.01)
     assert extrapolator.stale_reason(1.0, 50.02) == "several publishers of needle/measured_cp at once"
     assert extrapolator.pose(1.0, 50.02) is None
+
+
+def test_a_velocity_before_the_first_pose_moves_nothing():
+    extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045)
+    extrapolator.apply_velocity(np.array([0.01, 0.0]), 0.9, 49.9)
+    assert extrapolator.pose(0.95, 49.95) is None
+    extrapolator.update(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
+    pose = extrapolator.pose(1.1, 50.1)
+    assert pose is not None
+    assert pose.tail.tolist() == [0.0, 0.0]

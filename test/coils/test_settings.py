@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -49,3 +51,42 @@ def test_scene_too_narrow_for_the_needle_is_rejected():
 def test_what_does_not_fit_together_is_refused(change: dict, words: str):
     with pytest.raises(ConfigurationError, match=words):
         CoilBridgeSettings(**change)
+
+
+def test_where_its_motion_is_compensated_a_needle_has_drag_beside_that_of_the_thread():
+    CoilBridgeSettings(motion_compensation=True, needle_drag=0.02, thread_drag=0.0179)
+    with pytest.raises(ConfigurationError, match=r"thread_drag: got 0\.0181, expected at most 0\.018 N s/m, 0\.9 of"):
+        CoilBridgeSettings(motion_compensation=True, needle_drag=0.02, thread_drag=0.0181)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "command_timeout",
+        "pose_timeout",
+        "driver_timeout",
+        "roboclaw_answer_timeout",
+        "rate",
+        "max_speed",
+        "max_acceleration",
+        "max_current",
+        "max_current_slew",
+        "keep_out",
+        "approach_rate",
+        "field_per_current",
+        "coil_distance",
+        "coil_radius",
+        "coil_resistance",
+        "aligning_field",
+        "needle_length",
+        "needle_moment",
+        "needle_drag",
+        "needle_drag_across",
+        "needle_turning_drag",
+    ],
+)
+def test_sizes_are_positive(name: str):
+    for value in (0.0, -1e-3):
+        change: dict[str, Any] = {name: value}
+        with pytest.raises(ConfigurationError, match=rf"coil_bridge\.{name}: got {value}, expected .*from "):
+            CoilBridgeSettings(**change)

@@ -159,3 +159,9 @@ def test_got_what_was_not_sent_lets_no_more_through():
         outbox.put("state", str(number))
         outbox.next()
     assert outbox.next() is None
+
+
+def test_the_refusal_of_a_rate_says_which_would_do():
+    with pytest.raises(ConfigurationError, match=r"console\.rate: got 10\.0, expected at least 20 Hz, 2 commands in"):
+        ConsoleSettings(rate=10.0, hold_timeout=0.1)
+    ConsoleSettings(rate=20.0, hold_timeout=0.1)

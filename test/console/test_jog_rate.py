@@ -46,3 +46,48 @@ def test_a_held_jog_is_repeated_at_the_rate_until_nobody_holds_it(monkeypatch: p
         loop.run_next()
     assert [at for at, _ in sent] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.35])
     assert [velocity for _, velocity in sent] == [(0.001, 0.0)] * 4 + [(0.0, 0.0)]
+
+
+def test_a_disarmed_bridge_ends_a_jog_at_once_and_one_that_stays_disarmed_ends_none(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
+    sent: list[Any] = []
+    controller = JogController(sent.append, rate=10.0, timeout=0.35)
+    controller.acquire_control(1)
+    controller.set_armed(True)
+    controller.jog(1, (0.001, 0.0))
+    controller.set_armed(False)
+    assert sent[-1] == (0.0, 0.0)
+    assert controller.must_release
+    controller.end_jog(1)
+    controller.jog(1, (0.002, 0.0))
+    controller.set_armed(False)
+    assert sent[-1] == (0.002, 0.0)
+    assert not controller.must_release
+
+
+def test_another_page_neither_ends_a_jog_nor_takes_control_of_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
+    sent: list[Any] = []
+    controller = JogController(sent.append, rate=10.0, timeout=0.35)
+    controller.acquire_control(2)
+    controller.jog(2, (0.001, 0.0))
+    for other in (1, 3):
+        controller.interrupt(other)
+        controller.end_jog(other)
+        assert controller.acquire_control(other) != ""
+    assert sent == [(0.001, 0.0)]
+
+
+def test_who_takes_control_begins_with_a_needle_at_rest_and_without_the_latch_of_another(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
+    sent: list[Any] = []
+    controller = JogController(sent.append, rate=10.0, timeout=0.35)
+    controller.acquire_control(1)
+    controller.jog(1, (0.001, 0.0))
+    controller.set_visible(1, False)
+    assert sent[-1] == (0.0, 0.0)
+    assert controller.must_release
+    assert controller.acquire_control(2) == ""
+    assert not controller.must_release

@@ -434,3 +434,132 @@ def test_the_host_gets_whether_an_operator_or_a_script_jogs(is_browser: bool, au
         assert here.host.operator == operator
 
     run(test)
+
+
+def test_who_says_something_else_first_is_told_why_the_connection_ends(caplog: pytest.LogCaptureFixture):
+    async def test(here: Console) -> None:
+        socket = await here.connect()
+        await socket.send_str('{"type": "acquire_control"}')
+        ended = await socket.receive(timeout=WAIT_TIMEOUT)
+        assert (ended.data, ended.extra) == (aiohttp.WSCloseCode.POLICY_VIOLATION, "expected hello first")
+        await until(lambda: not here.server._clients)
+
+    run(test)
+    assert not caplog.records
+
+
+def test_states_come_at_the_frame_rate_and_not_faster():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        loop = asyncio.get_running_loop()
+        since, before = loop.time(), len(page.of("state"))
+        await until(lambda: len(page.of("state")) >= before + 8)
+        assert loop.time() - since > 5.0 / 20.0  # two more may have been on their way
+
+    run(test, frame_rate=20.0)
+
+
+def test_who_waits_for_the_next_second_waits_no_longer(monkeypatch: pytest.MonkeyPatch):
+    delays: list[float] = []
+    sleep = asyncio.sleep
+
+    async def remembered(delay: float, *given: Any) -> Any:
+        delays.append(delay)
+        return await sleep(0.0 if delay > 0.1 else delay, *given)
+
+    async def test(here: Console) -> None:
+        monkeypatch.setattr(asyncio, "sleep", remembered)
+        for _ in range(8):
+            async with here.session.get(here.url):
+                pass
+        assert 0.0 < max(delays) <= 1.0
+
+    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_REQUESTS", 1)
+    run(test)
+
+
+def test_stopping_the_server_gives_up_requests_that_are_not_answered():
+    async def test() -> None:
+        class Slow(RecordingHost):
+            async def set_paused(self, paused: bool) -> str:
+                await asyncio.sleep(60.0)
+                return ""
+
+        server = ConsoleServer(ConsoleSettings(port=0, token=TOKEN), RecordingGraph(), Slow())
+        url = (await server.start()).split("#")[0]
+        async with aiohttp.ClientSession() as session:
+            page = Page(await session.ws_connect(url + "socket"))
+            await page.send(type="hello", token=TOKEN)
+            page.number = (await until(lambda: page.of("welcome")))[0]["client"]
+            await page.acquire_control()
+            await page.send(type="pause", paused=True)
+            await until(lambda: server._requests._pending)
+            await asyncio.wait_for(server.stop(), WAIT_TIMEOUT)
+            await page.socket.close()
+
+    asyncio.run(test())
+
+
+def test_a_page_without_the_token_is_told_whether_it_gave_a_wrong_one():
+    async def test(here: Console) -> None:
+        for token, refusal in (("", ""), ("wrong", "the token is wrong"), (TOKEN, "")):
+            page = await here.page(token)
+            assert page.of("welcome")[0]["refusal"] == refusal
+
+    run(test)
+
+
+def test_a_ping_is_answered_and_a_flood_of_them_ends_the_connection(monkeypatch: pytest.MonkeyPatch):
+    async def test(here: Console) -> None:
+        socket = await here.connect(autoping=False)
+        await socket.send_str(json.dumps({"type": "hello", "token": TOKEN}))
+
+        async def answers_until(*ends: aiohttp.WSMsgType) -> list[bytes]:
+            answers: list[bytes] = []
+            while (message := await socket.receive(timeout=WAIT_TIMEOUT)).type not in ends:
+                answers += [bytes(message.data)] if message.type is aiohttp.WSMsgType.PONG else []
+            return [*answers, bytes(message.data or b"")]
+
+        await socket.ping(b"once")
+        assert await answers_until(aiohttp.WSMsgType.PONG) == [b"once"]
+        with contextlib.suppress(ConnectionError):
+            for _ in range(300):
+                await socket.ping(b"again")
+        assert len(await answers_until(aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR)) < 300
+
+    monkeypatch.setattr("magnetosuture_thread.console.client.MAX_MESSAGE_RATE", 20)
+    run(test)
+
+
+def test_as_many_messages_as_permitted_are_taken(monkeypatch: pytest.MonkeyPatch):
+    async def test(here: Console) -> None:
+        page = await here.page()
+        for _ in range(60):  # and 30 acknowledgements of states in a second
+            await page.send(type="visibility", visible=True)
+        await page.acquire_control()
+        assert not page.of("error")
+
+    monkeypatch.setattr("magnetosuture_thread.console.client.MAX_MESSAGE_RATE", 100)
+    run(test)
+
+
+def test_a_frame_is_sent_once_and_nothing_is_compressed():
+    async def test(here: Console) -> None:
+        page = await here.page(compress=15)
+        assert page.socket.compress == 0
+        here.graph.picture = 1, picture()
+        await page.pictures(1)
+        states = len(page.of("state"))
+        await until(lambda: len(page.of("state")) > states + 5)
+        assert len(page.frames) == 1
+
+    run(test)
+
+
+def test_it_is_served_at_the_address_that_is_set():
+    async def test(here: Console) -> None:
+        assert here.url.startswith("http://127.0.0.2:")
+        async with here.session.get(here.url) as response:
+            assert response.status == 200
+
+    run(test, address="127.0.0.2")

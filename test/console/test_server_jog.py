@@ -231,3 +231,21 @@ def test_hiding_the_page_during_a_jog_requires_a_release():
         await until(lambda: here.graph.last == EAST)
 
     run(test, hold_timeout=1.0)
+
+
+def test_a_procedure_is_held_by_the_page_with_control_alone_and_not_by_late_messages():
+    async def test(here: Console) -> None:
+        page, other = await here.page(), await here.page()
+        await page.acquire_control()
+        await other.send(type="hold", sent=100.0)
+        await other.send(type="hold", sent=99.0)
+        await until(lambda: other.of("error"))  # of the late one; both have been handled
+        assert here.graph.holds == []
+        await page.send(type="hold", sent=100.0)
+        await until(lambda: len(here.graph.holds) == 1)
+        await page.send(type="hold", sent=99.0)
+        await until(lambda: page.of("error"))
+        assert "late" in page.of("error")[0]["text"]
+        assert len(here.graph.holds) == 1
+
+    run(test)

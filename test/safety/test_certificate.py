@@ -146,3 +146,55 @@ def test_what_is_not_finite_is_refused(bad: float):
             filtered.filter(velocity, tail, heading)
         with pytest.raises(InvalidInputError, match="finite numbers"):
             filtered.safe_share(velocity, tail, heading)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 250.0])
+def test_a_needle_that_drifts_and_turns_goes_as_in_small_steps(curvature: float):
+    kinematics, heading = NeedleKinematics(0.007, curvature), np.array([math.cos(0.9), math.sin(0.9)])
+    along, across, drift, duration = 0.004, 0.011, -0.006, 0.5
+    tail = np.array([0.001, 0.002])
+    moved = kinematics.moved(tail, heading, along, across, duration, drift)
+    steps = 2000
+    for _ in range(steps):
+        e = kinematics.chord_direction(heading)
+        tail, heading = kinematics.moved(tail, heading, along, across - drift, duration / steps)
+        tail = tail + drift * duration / steps * np.array([-e[1], e[0]])
+    np.testing.assert_allclose(moved[0], tail, atol=2e-6)
+    np.testing.assert_allclose(moved[1], heading, atol=1e-9)
+
+
+def test_a_point_goes_by_its_heading():
+    tail, _ = NeedleKinematics(0.0).moved(np.zeros(2), np.array([0.6, 0.8]), 0.002, 0.001, 0.5)
+    np.testing.assert_allclose(tail, [0.5 * (0.6 * 0.002 - 0.8 * 0.001), 0.5 * (0.8 * 0.002 + 0.6 * 0.001)], rtol=1e-12)
+
+
+def test_inside_a_shape_no_point_of_a_needle_that_turns_gets_deeper():
+    """It backs out of a block whose lower side is near, tail first, and turns by up to three rad/s."""
+    block = SceneShape("block", "wall", Polygon(((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05), (-0.05, 0.05))))
+    filtered, random = safety(Scene(Dish(0.2), (block,)), 0.007), np.random.default_rng(4)
+    body, limited = filtered.compiled_data().body.points, 0
+    for _ in range(60):
+        angle = float(random.uniform(0.2, math.pi - 0.2))
+        heading, tail = np.array([math.cos(angle), math.sin(angle)]), np.array([0.0, 0.002])
+        velocity = np.array([0.0, -0.01]) + float(random.uniform(-0.01, 0.01)) * np.array([-heading[1], heading[0]])
+        share, _ = filtered.safe_share(velocity, tail, heading)
+        along, across = filtered.kinematics.body_velocity(heading, share * velocity)
+        heights = []
+        for time in np.linspace(0.0, HOLD, 61):
+            (_, y), (c, s) = filtered.kinematics.moved(tail, heading, along, across, float(time))
+            heights.append(y + s * body[:, 0] + c * body[:, 1])
+        assert (np.array(heights) <= heights[0] + 1e-9).all()
+        limited += 0.02 < share < 0.98
+    assert limited > 3
+
+
+def test_what_ends_a_motion_is_named_whichever_of_many_shapes_it_is():
+    places = [(0.006, 0.0), (0.0, 0.006), (-0.006, 0.0), (0.0, -0.006)]
+    shapes = [SceneShape(f"post_{k}", "instrument", Disc(place, 0.001)) for k, place in enumerate(places)]
+    filtered = safety(Scene(Dish(0.05), tuple(shapes)), 0.0)
+    for k, (x, y) in enumerate(places):
+        share, name = filtered.safe_share(np.array([3.0 * x, 3.0 * y]), np.zeros(2), EAST)
+        assert name == f"post_{k}"
+        assert share * HOLD * 0.018 == pytest.approx(0.0045, rel=1e-5)
+        found = filtered.filter(np.array([3.0 * x, 3.0 * y]), 0.7 * np.array([x, y]), EAST)
+        assert found.active == (f"post_{k}",)

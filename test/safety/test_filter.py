@@ -13,6 +13,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.safety.filter import BAND, MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
+from magnetosuture_thread.safety.motion import filter_velocity, moved_needle, needle_margin, pose_needle
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -190,3 +191,103 @@ def test_through_the_channel_of_the_hernia_nothing_is_taken_off():
         for speed in (0.002, 0.003):
             found = safety.filter(speed * NORTH, np.array([0.0, y]), NORTH)
             assert found.filtered.tolist() == (speed * NORTH).tolist()
+
+
+@pytest.mark.parametrize("place", [0.6, 2.0, -1.1])
+def test_along_the_wall_the_step_sideways_is_that_of_its_ends(place: float):
+    """The ends are closest; away from the wall they get by the cosine of the angle at which they see the middle."""
+    out, along = np.array([math.cos(place), math.sin(place)]), np.array([-math.sin(place), math.cos(place)])
+    middle = 0.0175 - KEEP - 4.5e-4
+    reach = math.hypot(middle, 0.5 * LENGTH)
+    step = SIDESTEP_RATE * (KEEP + SIDESTEP_MARGIN - (0.0175 - reach)) * middle / reach
+    assert 0.0 < step < MAX_SIDESTEP
+    assert needle_filter().sidestep(middle * out - 0.5 * LENGTH * along, along) == pytest.approx(step, rel=1e-6)
+
+
+def test_clearance_is_that_of_the_closest_point_from_wall_and_shapes():
+    tail, heading = np.array([0.001, 0.002]), np.array([0.6, 0.8])
+    tip = tail + LENGTH * heading
+    assert needle_filter().clearance(tail, heading) == pytest.approx(0.0175 - math.hypot(*tip))
+    beside = tail + 0.5 * LENGTH * heading + 0.003 * np.array([-0.8, 0.6])
+    post = SceneShape("post", "instrument", Disc((float(beside[0]), float(beside[1])), 0.001))
+    assert needle_filter(post).clearance(tail, heading) == pytest.approx(0.002)
+
+
+def test_a_dish_with_hardly_any_room_is_taken():
+    NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP + 1e-6)), keep_out=KEEP, needle_length=LENGTH)
+    with pytest.raises(ConfigurationError, match="room for the needle"):
+        NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP - 1e-6)), keep_out=KEEP, needle_length=LENGTH)
+
+
+def test_a_long_needle_has_129_points_and_compiled_loops_get_them():
+    data = NeedleSafetyFilter(Scene(Dish(0.3)), keep_out=1e-4, needle_length=0.08, needle_curvature=5.0).compiled_data()
+    assert len(data.body.points) == 129
+    chord = data.body.points[-1] - data.body.points[0]
+    assert chord / np.linalg.norm(chord) == pytest.approx([data.body.chord_x, data.body.chord_y])
+
+
+def test_approach_rate_limits_a_needle_that_goes_back_to_the_wall_too():
+    tail = np.array([-0.0175 + 2.0 * KEEP, 0.0])
+    found = needle_filter(approach_rate=1.0).filter(np.array([-0.02, 0.0]), tail, EAST)
+    assert found.filtered.tolist() == pytest.approx([-1.0 * KEEP, 0.0], rel=0.01)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_needle_beside_a_post_is_taken_off_away_from_it(side: float):
+    heading = np.array([0.6, 0.8])
+    beside = side * np.array([-0.8, 0.6])
+    depth, radius = 1e-4, 0.001
+    middle = radius + KEEP + SIDESTEP_MARGIN - depth
+    post = SceneShape("post", "instrument", Disc((float(middle * beside[0]), float(middle * beside[1])), radius))
+    step = needle_filter(post).sidestep(-0.5 * LENGTH * heading, heading)
+    assert step == pytest.approx(-side * SIDESTEP_RATE * depth, rel=0.01)
+
+
+@pytest.mark.parametrize("length", [LENGTH, 0.0])
+def test_compiled_loops_get_the_velocities_of_the_filter(length: float):
+    safety = needle_filter(POST, length=length, max_speed=0.02, max_acceleration=0.5)
+    data, touched = safety.compiled_data(), np.zeros(2, np.bool_)
+    random, changed = np.random.default_rng(6), 0
+    for k in range(60):
+        angle, tail = float(random.uniform(-3.0, 3.0)), random.uniform(-0.008, 0.008, 2)
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        commanded, previous = random.uniform(-0.03, 0.03, 2), random.uniform(-0.01, 0.01, 2)
+        if k % 4 == 0:
+            commanded[0] = 0.0
+        slowdown, elapsed = float(random.uniform(0.3, 1.0)), float(random.choice([0.01, math.inf]))
+        needle = pose_needle(data, *tail.tolist(), *heading.tolist())
+        found = filter_velocity(
+            data,
+            needle,
+            (float(commanded[0]), float(commanded[1])),
+            slowdown,
+            (float(previous[0]), float(previous[1])),
+            elapsed,
+            touched,
+        )
+        expected = safety.filter(commanded, tail, heading, slowdown=slowdown, previous=previous, elapsed=elapsed)
+        assert found == pytest.approx(expected.filtered.tolist(), rel=1e-9, abs=1e-12)
+        assert needle_margin(data, needle)[0] == pytest.approx(safety.clearance(tail, heading) - KEEP, abs=1e-12)
+        changed += "post" in expected.active or "wall" in expected.active
+    assert changed > 5
+
+
+@pytest.mark.parametrize("curvature", [0.0, 250.0])
+def test_compiled_loops_move_the_needle_as_the_kinematics_do(curvature: float):
+    safety = needle_filter(needle_curvature=curvature)
+    angle, along, across, drift, duration = 0.9, 0.004, 0.011, -0.006, 0.5
+    tail, heading = np.array([0.001, 0.002]), np.array([math.cos(angle), math.sin(angle)])
+    e = safety.kinematics.chord_direction(heading)
+    pose = np.array([*tail, *heading])
+    velocity, added = along * e + across * np.array([-e[1], e[0]]), np.array([0.003, drift, 0.7])
+    moved_needle(safety.compiled_data(), pose, (float(velocity[0]), float(velocity[1])), added, duration)
+    turn = 0.7 * 0.5 * safety.kinematics.chord  # velocity of the tip by that rate of turning
+    expected = safety.kinematics.moved(tail, heading, along + 0.003, across + drift + turn, duration, drift)
+    np.testing.assert_allclose(pose, np.concatenate(expected), atol=1e-12)
+
+
+def test_compiled_loops_move_a_point_straight():
+    pose = np.array([0.001, 0.002, 0.6, 0.8])
+    moved_needle(needle_filter(length=0.0).compiled_data(), pose, (0.004, 0.003), np.array([0.001, 0.002, 5.0]), 0.5)
+    expected = [0.001 + 0.5 * (0.004 + 0.6e-3 - 1.6e-3), 0.002 + 0.5 * (0.003 + 0.8e-3 + 1.2e-3), 0.6, 0.8]
+    assert pose.tolist() == pytest.approx(expected, abs=1e-15)

@@ -122,3 +122,9 @@ def test_a_file_that_is_no_calibration_is_refused_in_one_line(text: str, tmp_pat
     assert "\n" not in str(refused.value)
     with pytest.raises(InvalidInputError):
         read_lens(tmp_path)
+
+
+def test_a_lens_that_moves_a_pixel_by_more_than_half_of_the_diagonal_is_refused():
+    Lens(SIZE, "plumb_bob", (4.8, 0, 0, 0, 0), MATRIX)
+    with pytest.raises(InvalidInputError, match="that can be undone"):
+        Lens(SIZE, "plumb_bob", (5.4, 0, 0, 0, 0), MATRIX)

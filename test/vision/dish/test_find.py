@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
+from magnetosuture_thread.vision.dish.tilt import Tilt
 from magnetosuture_thread.vision.dish.watch import AGREEING, LONG_SEARCH, DishWatch
 from magnetosuture_thread.vision.look import see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -106,3 +109,11 @@ def test_a_given_view_needs_no_dish():
     watch = DishWatch(settings, 0.035)
     assert watch.look(np.zeros((480, 640), np.uint8))[0] == ""
     assert watch.view == DishView((320.0, 240.0), 8e-5, 0.1)
+
+
+@pytest.mark.parametrize("rotation", [0.0, 0.7])
+def test_the_direction_of_a_tilt_is_the_same_in_image_and_dish(rotation: float):
+    tilt, view = Tilt(0.2, 0.4, rotation), DishView((320.0, 240.0), 8e-5, rotation)
+    across = view.to_pixels(np.array([[0.0, 0.0], tilt.direction_in_dish]))
+    u, v = across[1] - across[0]
+    assert math.atan2(v, u) == pytest.approx(0.4)

@@ -19,6 +19,7 @@ from magnetosuture_thread.vision.look import Track
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.hiding import Hiding
 from magnetosuture_thread.vision.thread.order import Piece, find_order
+from magnetosuture_thread.vision.thread.strands import Strand
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 SEED = 4712
@@ -162,3 +163,10 @@ def test_hidden_outlines_surround_what_covers_the_thread():
     boxes = [(outline.min(axis=0), outline.max(axis=0)) for outline in track.observation.hidden]
     near = case.thread[len(case.thread) // 2] if np.linalg.norm(middle) > DISH_RADIUS else middle
     assert any((low <= near).all() and (near <= high).all() for low, high in boxes)
+
+
+def test_a_strand_from_its_other_end_has_its_points_strengths_and_gaps_in_that_order():
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])
+    turned = Strand(points, np.array([3.0, 4.0, 5.0]), np.array([True, True, False])).turned()
+    assert (turned.points[0].tolist(), turned.strength.tolist()) == ([2.0, 1.0], [5.0, 4.0, 3.0])
+    assert turned.visible.tolist() == [False, True, True]

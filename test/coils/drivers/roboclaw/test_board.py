@@ -436,3 +436,13 @@ def test_what_is_no_port_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot open"):
         ExchangePort(str(tmp_path / "file"), 115200, ANSWER_TIMEOUT)
+
+
+def test_a_broken_wire_of_the_second_board_has_the_number_of_its_coil(peer, patient, port):
+    there = RoboClawBoard()
+    peer.answer(simulated(there, 0.005))
+    settings = CoilBridgeSettings(driver_timeout=0.2, max_speed=0.005)
+    made = Board(port, 1, 128, "board 1", settings, lambda: False)
+    made.configure()
+    there.broken.add(1)
+    assert spoken_to(made, 4.0, -4.0) == ("coil 3: 0.00 A measured, -4.00 A commanded",)
