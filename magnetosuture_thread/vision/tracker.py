@@ -275,12 +275,14 @@ class VisionTracker:
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
             picture = picture_of(image, view, self._settings, mask, self._region(image, view, time))
             needles, _ = needles_in(picture, view, self._settings, diameter, toward, self._length)
+            needles = [self._as_before(needle, picture, view, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             if len(within) == 1:
                 self._take(_pose(within[0], picture, view, time), self._last)
                 return within[0], picture, ""
         picture = picture_of(image, view, self._settings, mask)
         needles, refused = needles_in(picture, view, self._settings, diameter, estimator=self._length)
+        needles = [self._as_before(needle, picture, view, time) for needle in needles]
         if self._last is not None and len(needles) > 1:
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
             needles = within if len(within) == 1 else needles
@@ -305,6 +307,17 @@ class VisionTracker:
         if self._last is not None:
             return None, None, "a needle farther from the last one than it can move"
         return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
+
+    def _as_before(self, needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> MeasuredNeedle:
+        """Return a needle the other way round if it lies where the last one was, and its shape does not rule that out.
+
+        Between two frames it cannot turn round, and a thread that touches the tip makes that look like a tail.
+        """
+        if self._last is None or not needle.heading_known or needle.is_clear:
+            return needle
+        other = needle.reversed()
+        fits = [self._fits(_pose(each, picture, view, time), self._last) for each in (needle, other)]
+        return other if fits == [False, True] else needle
 
     def _one_of(
         self, needles: list[MeasuredNeedle], picture: Picture, view: DishView, time: float

@@ -135,6 +135,7 @@ def _checked(
     pointed = min((one, other), key=lambda each: each.cost)
     is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
     fit = None if is_rod else _pointed_way(steel, one, other)
+    is_clear = is_rod or max(one.cost, other.cost) > CLEARLY * pointed.cost
     if fit is None:
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
@@ -172,6 +173,7 @@ def _checked(
         heading_known=is_known,
         size_measured=is_measured,
         tail_shift_px=(tail_shift(steel, fit) or 0.0) if is_known else 0.0,
+        is_clear=is_clear,
     )
 
 

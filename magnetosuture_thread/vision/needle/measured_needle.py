@@ -8,6 +8,8 @@ import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
 
+REVERSED_PX = 3.0  # deviation along the axis of a tail where a tip was fitted
+
 
 @dataclass(frozen=True)
 class MeasuredNeedle:
@@ -23,6 +25,7 @@ class MeasuredNeedle:
         heading_known: whether it is told which end is the tail.
         size_measured: whether the length was measured, and not only known before.
         tail_shift_px: how far along the axis the tail's edge lies from where the tail is drawn [px]; see `tail_shift`.
+        is_clear: whether a needle that is drawn the other way round fits much worse.
     """
 
     arc: Arc
@@ -34,10 +37,27 @@ class MeasuredNeedle:
     heading_known: bool = True
     size_measured: bool = False
     tail_shift_px: float = 0.0
+    is_clear: bool = True
 
     def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
         return replace(self, arc=replace(self.arc, start=self.arc.start + offset))
+
+    def reversed(self) -> MeasuredNeedle:
+        """Return the needle the other way round: its tip is where its tail was.
+
+        What the tail's covariance becomes there, with the length l, in the reversed directions along and aside:
+
+            T C T',    T = [[-1, 0, 0], [0, -1, -l], [0, 0, 1]]
+
+        and `REVERSED_PX` along: what made an end look like the other one has drawn the fit along the axis, too.
+        """
+        turn = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, -self.length_px], [0.0, 0.0, 1.0]])
+        covariance = self.covariance
+        if covariance is not None:
+            covariance = turn @ covariance @ turn.T + np.diag([REVERSED_PX**2, 0.0, 0.0])
+        arc = self.arc.reversed_at(self.length_px)
+        return replace(self, arc=arc, covariance=covariance, size_measured=False, tail_shift_px=0.0)
 
     @property
     def tail_px(self) -> np.ndarray:

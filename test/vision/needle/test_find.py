@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.vision.images import prepare
+from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.find import find_needles
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
@@ -124,3 +125,16 @@ def test_speckles_are_not_searched_for_long():
     for u in range(180, 460, 30):
         cv2.circle(speckled, (u, 240), 9, (30, 30, 30), -1)
     assert find(speckled) == ([], ["10 dark things"])
+
+
+def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_other_end():
+    needle = MeasuredNeedle(Arc(np.array([10.0, 20.0]), 0.5, 0.0), 30.0, 4.0, covariance=np.diag([0.01, 0.04, 0.001]))
+    other = needle.reversed()
+    np.testing.assert_allclose(other.tail_px, needle.tip_px)
+    np.testing.assert_allclose(other.tip_px, needle.tail_px)
+    np.testing.assert_allclose(other.direction_px, -needle.direction_px)
+    assert other.covariance is not None
+    assert other.covariance[1, 1] == pytest.approx(0.04 + 30.0**2 * 0.001), "the tip swings by the heading's error"
+    assert other.covariance[1, 2] == pytest.approx(-30.0 * 0.001)
+    assert other.covariance[0, 0] > 1.0, "it is not known where along the axis it ends"
+    assert other.covariance[2, 2] == 0.001
