@@ -23,7 +23,7 @@ MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle th
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and across may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
-DRIFT_PER_ANGLE = 0.012  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
+DRIFT_PER_ANGLE = 0.018  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
@@ -34,6 +34,8 @@ CROSSING_TIME = (
     0.3  # s; after the course has changed to the other side of an axis, in which the needle is turned faster
 )
 CROSSING_GAIN, MAX_CROSSING_RATIO = 12.0, 4.0  # 1/s, and of the allowed speed: in place of TURN_GAIN, MAX_TURN_RATIO
+LEAD_WAY = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side that it is thrown from
+THROWN_FOR, LEAD_SHARE = 0.1, 0.25  # s; in a crossing; of the leeway here and there, that it is kept aside at the most
 MIN_TACK_TIME = 1.0  # s; after a crossing, in which the needle does not tack
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
@@ -74,7 +76,8 @@ class PathTracker:
     the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off the axes by
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
     crosses, or while the needle is far off its path to the wrong side, as a ship tacks, but not within `MIN_TACK_TIME`
-    of a crossing. In a crossing the needle is turned faster, as nothing compensates the pull meanwhile. All of
+    of a crossing. In a crossing the needle is turned faster, as nothing compensates the pull meanwhile: it is thrown
+    aside by about d times `THROWN_FOR`. Before one, the path is followed as far to the other side. All of
     theta - theta_p stays within what half of the path's leeway allows. Where d is more than the coils compensate at
     the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down to
     `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction are raised
@@ -145,7 +148,8 @@ class PathTracker:
         # No more than what is allowed to act, or a slip to the other side would have to outlast it.
         bound = min(MAX_INTEGRAL, LOOKAHEAD * math.tan(min(allowed, 1.0)))
         self._integral = min(bound, max(-bound, self._integral))
-        course = driven * sense * math.atan((across + self._integral) / LOOKAHEAD)
+        lead = self._lead(direction, drift)
+        course = driven * sense * math.atan((across - lead + self._integral) / LOOKAHEAD)
         course = min(allowed, max(-allowed, course))
         # Close to an axis less of the pull is measured, so its peak is remembered for a while.
         self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_DECAY))
@@ -164,7 +168,7 @@ class PathTracker:
             self._stops.pop(0)
             self._integral = -self._integral  # the same slip asks for the other direction when driven back
         if not waits:
-            self._integral += INTEGRAL_GAIN * interval * driven * across
+            self._integral += INTEGRAL_GAIN * interval * driven * (across - lead)
         turn += course
         raised = 1.0 / max(slowdown, MIN_SLOWDOWN)
         limit = MAX_ALONG_RATIO * speed
@@ -196,6 +200,20 @@ class PathTracker:
         if side and self._side != side and abs(planned) < kept:
             self._crossed = stamp
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
+
+    def _lead(self, direction: float, drift: float) -> float:
+        """Return how far to the left of the path the next crossing of an axis throws the needle [m]; 0 far from one."""
+        if abs(drift) <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
+            return 0.0
+        leeway = self.leeway
+        for way in np.linspace(self.travel, min(self.path.length, self.travel + LEAD_WAY), 8)[1:]:
+            leeway = min(leeway, self.path.leeway_at(way))
+            ahead = self.path.at(way)[1]
+            for axis in self._axes:
+                first, then = math.remainder(direction - axis, math.pi), math.remainder(ahead - axis, math.pi)
+                if first * then < 0.0 and abs(first - then) < 1.0:
+                    return math.copysign(min(abs(drift) * THROWN_FOR, LEAD_SHARE * leeway), drift)
+        return 0.0
 
     def _compensated_share(self, angle: float) -> float:
         """Return the share of the pull that coils compensate with ease, at a direction and those of the path ahead."""

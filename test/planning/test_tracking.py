@@ -200,3 +200,29 @@ def test_a_needle_that_lags_is_not_driven_faster_than_half_beyond_the_allowed_sp
     velocities = [tracker.compute_command(k / RATE, middle, angle, 0.002).velocity @ e for k in range(40)]
     assert max(velocities) <= (1.0 + MAX_ALONG_RATIO) * 0.002 * (1.0 + 1e-9)
     assert max(velocities) > 0.002
+
+
+def offset_before_crossing(drift: float, bend: float) -> float:
+    """Return how far left of its path an ideal needle is at half a millimetre before the middle of a bend [m]."""
+    tracker = PathTracker(path(np.linspace(-bend, bend, 80)), COIL_ANGLES)
+    middle, angle = tracker.path.at(0.0)
+    for k in range(round(20.0 * RATE)):
+        wanted, direction = tracker.path.at(tracker.travel)
+        if tracker.travel > 0.5 * tracker.path.length - 5e-4:
+            off = middle - wanted
+            return float(math.cos(direction) * off[1] - math.sin(direction) * off[0])
+        command = tracker.compute_command(k / RATE, middle, angle, 0.002, drift=drift)
+        e = np.array([math.cos(angle), math.sin(angle)])
+        along, across = command.velocity @ e, e[0] * command.velocity[1] - e[1] * command.velocity[0]
+        middle, angle = middle + along * e / RATE, angle + across / tracker.path.lever / RATE
+    raise AssertionError("the middle of the path is not reached")
+
+
+def test_before_a_crossing_the_needle_is_kept_to_the_side_that_it_is_thrown_from():
+    """In the crossing nothing compensates the pull: it goes from one side of its path to the other, not off it."""
+    plain = offset_before_crossing(0.0, 0.6)
+    left, right = offset_before_crossing(-2.5e-3, 0.6), offset_before_crossing(2.5e-3, 0.6)
+    assert left > plain + 5e-5
+    assert right < plain - 5e-5
+    assert max(abs(left), abs(right)) < 0.7 * LEEWAY
+    assert abs(plain) < 1e-5, "what is not pulled is on its path"
