@@ -10,7 +10,7 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.coverage import Light, box_around, covered
+from magnetosuture_thread.rig.camera.coverage import Box, Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, CameraScene, Lighting, Look
 
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
@@ -60,14 +60,13 @@ class StillLife:
         for beyond, spread, depth in RIM_DEPTHS:
             light -= depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
         light += 22.0 * np.exp(-(((away - radius - 0.6e-3) / 0.15e-3) ** 2))
-        image = np.repeat(light[:, :, None], 3, axis=2) * np.asarray(lighting.tint_bgr, dtype=np.float32)
-        image = image.astype(np.float32)
+        image = np.asarray(light[:, :, None] * np.asarray(lighting.tint_bgr, dtype=np.float32), dtype=np.float32)
         looks = self._scene.looks or [SILICONE] * len(self._scene.obstacles)
         for obstacle, look in zip(self._scene.obstacles, looks, strict=True):
             self._add_obstacle(image, obstacle, look)
         self._add_glare(image)
         self._add_dust(image)
-        return np.asarray(np.clip(image, 0.0, 258.0), dtype=np.float32)
+        return np.asarray(np.clip(image, 0.0, 258.0, out=image), dtype=np.float32)
 
     def _smear(self, depth: float, size: float) -> Light:
         """Return smooth random light of a given depth and feature size [px]."""
@@ -123,31 +122,46 @@ class StillLife:
         centre = np.asarray(self._view.centre_px)
         glare = np.zeros(image.shape[:2], np.float32)
         for share, first, last, thickness in GLARE_ARCS:
-            arc = np.zeros_like(glare)
-            for angle in np.radians(np.arange(first, last, 0.5)):
-                part = (np.degrees(angle) - first) / (last - first)
-                size = max(1, round(thickness * np.sin(np.pi * part)))
-                at = centre + share * radius * np.array([np.cos(angle), -np.sin(angle)])
-                cv2.circle(arc, (round(at[0]), round(at[1])), size // 2, 1.0, -1)
-            glare = np.maximum(glare, cv2.GaussianBlur(arc, (0, 0), 2.2))
+            angles = np.radians(np.arange(first, last, 0.5))
+            parts = (np.degrees(angles) - first) / (last - first)
+            sizes = np.maximum(np.rint(thickness * np.sin(np.pi * parts)), 1.0).astype(int) // 2
+            dots = centre + share * radius * np.column_stack([np.cos(angles), -np.sin(angles)])
+            box, arc, on_canvas = self._canvas(dots)
+            for dot, size in zip(on_canvas, sizes.tolist(), strict=True):
+                cv2.circle(arc, dot, size, 1.0, -1)
+            np.maximum(glare[box], cv2.GaussianBlur(arc, (0, 0), 2.2), out=glare[box])
         for _ in range(3):
             angle, share = self._random.uniform(0.0, 2.0 * np.pi), self._random.uniform(0.2, 0.75)
-            at = centre + share * radius * np.array([np.cos(angle), np.sin(angle)])
-            spot = np.zeros_like(glare)
             axes = (int(self._random.integers(2, 5)), int(self._random.integers(2, 4)))
-            cv2.ellipse(spot, (round(at[0]), round(at[1])), axes, 0.0, 0.0, 360.0, 1.0, -1)
-            glare = np.maximum(glare, cv2.GaussianBlur(spot, (0, 0), 1.2))
-        image += self._lighting.glare * np.clip(glare, 0.0, 1.0)[:, :, None] * (265.0 - image)
+            box, spot, (at,) = self._canvas(centre + share * radius * np.array([[np.cos(angle), np.sin(angle)]]))
+            cv2.ellipse(spot, at, axes, 0.0, 0.0, 360.0, 1.0, -1)
+            np.maximum(glare[box], cv2.GaussianBlur(spot, (0, 0), 1.2), out=glare[box])
+        lit = glare > 0.0
+        image[lit] += self._lighting.glare * np.minimum(glare[lit], 1.0)[:, None] * (265.0 - image[lit])
 
     def _add_dust(self, image: Light) -> None:
         """Add faint specks and rings."""
         width, height = self._size
         for _ in range(14):
-            at = (int(self._random.integers(0, width)), int(self._random.integers(0, height)))
-            speck = np.zeros(image.shape[:2], np.float32)
+            centre = [self._random.integers(0, width), self._random.integers(0, height)]
             size, thickness = (3, 1) if self._random.random() < 0.3 else (1, -1)
+            depth = float(self._random.uniform(4.0, 16.0))
+            box, speck, (at,) = self._canvas(np.array([centre]))
             cv2.circle(speck, at, size, 1.0, thickness)
-            image -= float(self._random.uniform(4.0, 16.0)) * cv2.GaussianBlur(speck, (0, 0), 0.9)[:, :, None]
+            image[box] -= depth * cv2.GaussianBlur(speck, (0, 0), 0.9)[:, :, None]
+
+    def _canvas(self, centres: Points) -> tuple[Box, Light, list[tuple[int, int]]]:
+        """Return the part of the image that something small and its blur may reach, and a canvas with its centres.
+
+        Args:
+            centres: of what is drawn, shape (m, 2) [px]; with a radius of 5 px at most, and a blur of 2.2.
+        """
+        margin, last = 24.0, np.array(self._size) - 1  # 5 px, and twice the 9 px that the blur reaches
+        left, top = np.clip(np.floor(centres.min(axis=0) - margin), 0.0, last).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(centres.max(axis=0) + margin), 0.0, last).astype(int).tolist()
+        at = np.rint(centres).astype(int) - (left, top)
+        box = slice(top, bottom + 1), slice(left, right + 1)
+        return box, np.zeros((bottom + 1 - top, right + 1 - left), np.float32), [(x, y) for x, y in at.tolist()]
 
 
 def circle(corners: int) -> Points:
