@@ -29,6 +29,13 @@ _QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
         -1000.0,
         1000.0,
     ),
+    "keep_out": (
+        0.0005,
+        "minimum clearance of the needle's axis to wall and obstacles, half of its width included",
+        "m",
+        2.5e-5,
+        0.05,
+    ),
     "thread_length": (0.019, "rest length of the thread", "m", 0.001, 2.0),
     "viscosity": (1.0, "dynamic viscosity of the liquid; glycerin at room temperature is about 1", "Pa s", 1e-4, 100.0),
     "coil_angles": (

@@ -1,136 +1,160 @@
-"""Forecasts against what then happened: the simulated rig under coil bridge and path follower, without a graph.
+"""Forecasts against what then happened, in the closed loop without a graph.
 
-The path follower steers by the rig's own poses, without camera. At random moments a forecast starts from where the
-predictor has the thread, which follows the same poses from the start on, and is given the commands of the following
-seconds as they were sent. What is compared with it is where the rig's needle and thread then were.
+In the loop of a campaign (simulated rig, the tracker's noise, estimator, and coil bridge under a procedure or the path
+follower; the nodes know nothing of what a seed varies) forecasts start at random moments from the estimated thread and
+the tracked needle, as those of the node `thread_model` do. Each is given the commands of the following seconds as the
+bridge took them. What is compared with it is where the rig's needle and thread then were.
 """
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import ForecastStart, NeedlePose, ThreadForecaster
-from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
-from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
+from magnetosuture_thread.campaign.run import run_procedure
+from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.coils.bridge import BridgeOutput
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.model.session import PredictionResult
+from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
-EPOCH = 100.0  # s; stamps of 0 are none in ROS
-READY = DriverState(ready=True, timeout=0.2)
-MAX_DURATION = 60.0  # s
+MAX_DURATION = 60.0  # s; of the path follower
+
+Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Moment:
-    """A frame of the loop.
+@dataclass
+class LoopRecord:
+    """What a loop did, as a `LoopRecorder`.
 
     Attributes:
-        start: of a forecast, from the predictor.
-        command: that was sent upon it, shape (2,) [m/s].
-        tail: the rig's needle, shape (2,) [m].
-        thread: the rig's thread at the model's nodes, shape (n + 1, 2) [m].
+        starts: of forecasts, one for each measurement with an estimate.
+        times: of the bridge's steps [s].
+        commands: that the bridge took in each, shape (2,) [m/s].
+        frame_times: of the frames [s].
+        tails: of the rig's needle in each, shape (2,) [m].
+        threads: of the rig in each, shape (k + 1, 2) [m].
     """
 
-    start: ForecastStart
-    command: NDArray[np.float64]
-    tail: NDArray[np.float64]
-    thread: Points
+    starts: list[ForecastStart] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+    commands: list[Vector] = field(default_factory=list)
+    frame_times: list[float] = field(default_factory=list)
+    tails: list[Vector] = field(default_factory=list)
+    threads: list[Points] = field(default_factory=list)
+    _filtered: Vector = field(default_factory=lambda: np.zeros(2))
+
+    def truth(self, time: float, segments: int) -> tuple[Vector, Points]:
+        """Return the rig's needle and thread at a time, between two frames, with as many segments."""
+        times = np.array(self.frame_times)
+        k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
+        part = (time - times[k]) / (times[k + 1] - times[k])
+        tail = (1.0 - part) * self.tails[k] + part * self.tails[k + 1]
+        thread = (1.0 - part) * self.threads[k] + part * self.threads[k + 1]
+        own = np.linspace(0.0, segments, len(thread))
+        return tail, np.column_stack([np.interp(np.arange(segments + 1), own, each) for each in thread.T])
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Keep the ground truth."""
+        self.frame_times.append(now)
+        self.tails.append(frame.tail.copy())
+        self.threads.append(frame.thread.copy())
+
+    def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
+        """Keep where a forecast starts."""
+        if result.estimate is None or not result.estimate.converged:
+            return
+        pose = NeedlePose(measured.stamp, measured.tail, measured.heading)
+        self.starts.append(ForecastStart.of_estimate(result.estimate, pose, self._filtered))
+
+    def on_bridge(self, now: float, output: BridgeOutput) -> None:
+        """Keep the command."""
+        self.times.append(now)
+        self.commands.append(output.commanded)
+        self._filtered = output.filtered
 
 
 def forecaster_of(setup: Setup) -> ThreadForecaster:
-    """Return the forecaster of a setup, with a step for each of its frames."""
-    coils = setup.coils
-    drag = NeedleDrag(coils.needle_drag, coils.needle_drag_across, coils.needle_turning_drag)
-    return make_forecaster(
-        setup.model, setup.scene, coils.safety_filter(setup.scene), drag=drag, step=1.0 / setup.rig.frame_rate
-    )
+    """Return the forecaster of a setup; with the needle's drag where the bridge does not compensate the motion."""
+    coils, drag = setup.coils, None
+    if not coils.motion_compensation:
+        drag = NeedleDrag(coils.needle_drag, coils.needle_drag_across, coils.needle_turning_drag)
+    return make_forecaster(setup.model, setup.scene, coils.safety_filter(setup.scene), drag=drag)
 
 
-def run_loop(setup: Setup, duration: float) -> list[Moment]:
-    """Return every frame of a loop, from the first command on, until the path is done or the time is over [s]."""
-    scene, rig_settings, model = setup.scene, setup.rig, setup.model
-    rig, follower = Rig(rig_settings, scene), setup.follower.follower()
-    latch = ArmingLatch()
-    bridge = CoilBridge(setup.coils, latch, scene)
-    latch.activate()
-    bridge.arm(READY)
-    predictor, law, motion = model.predictor(scene), model.friction_law(), model.node_motion()
-    period, frame, at = 1.0 / setup.coils.rate, 1.0 / rig_settings.frame_rate, 0.0
-    next_frame, count, moments, velocity = 0.0, 0, list[Moment](), np.zeros(2)
-    filtered = np.zeros(2)
-    at_nodes = np.linspace(0.0, rig_settings.thread_segments, model.segments + 1)
-    while at < duration:
-        at += period
-        rig.advance(at)
-        now = EPOCH + at
-        if at >= next_frame - 1e-9:
-            next_frame, count = next_frame + frame, count + 1
-            dynamics = rig._dynamics
-            heading = np.array([math.cos(dynamics.heading), math.sin(dynamics.heading)])
-            pose, thread = NeedlePose(now, dynamics.tail, heading), dynamics.thread
-            attached = model.attachment_pose(pose)
-            prediction = predictor.step(attached) if predictor.started else predictor.start(attached, thread)
-            friction = law.classify(prediction.margins, motion.update(prediction.positions, prediction.interval))
-            before = np.minimum(at_nodes.astype(int), rig_settings.thread_segments - 1)
-            part = (at_nodes - before)[:, None]
-            nodes = (1.0 - part) * thread[before] + part * thread[before + 1]
-            command = follower.compute_command(now, pose.tail, heading)
-            if velocity.any():
-                pull = prediction.forces.needle_force if prediction.forces is not None else None
-                start = ForecastStart.of_predictor(predictor, pose, filtered, pull)
-                moments.append(Moment(start, command.velocity, pose.tail, nodes))
-            if command.progress >= 1.0:
-                break
-            velocity = command.velocity
-            with suppress(InvalidInputError):  # of a tail that jumps as the thread comes free, as the node does
-                bridge.on_pose(pose.tail, heading, now, count, now, now)
-            bridge.on_margins(now, True, friction.slowdown, scene.version, now)
-            bridge.command(NEEDLE, velocity, now, count, now, now)
-        output = bridge.step(now, now, READY)
-        filtered = output.filtered
-        rig.apply(output.allocation.currents, at)
-    return moments
+def run_loop(name: str, seed: int) -> tuple[Setup, LoopRecord]:
+    """Run a procedure, or the path follower of a setup, with what a seed varies; return the setup and what was done."""
+    record = LoopRecord()
+    try:
+        procedure = read_procedure(name)
+    except ConfigurationError:
+        setup = read_setup(name)
+        follower, variation = setup.follower.follower(), vary(setup, seed)
+        done = False
+
+        def command(stamp: float, tail: Vector, heading: Vector, _: object) -> Vector:
+            nonlocal done
+            found = follower.compute_command(stamp, tail, heading)
+            done = found.progress >= 1.0
+            return found.velocity
+
+        rig, gains = Rig(variation.setup.rig, setup.scene), variation.coil_gains
+        loop = ClosedLoop(setup, rig, command, seed, losses=variation.losses, coil_gains=gains, recorder=record)
+        while loop.now < START + MAX_DURATION and not done:
+            loop.step()
+        return setup, record
+    setup = read_procedure_setup(procedure)
+    run_procedure(procedure, setup, vary(setup, seed), recorder=record)
+    return setup, record
 
 
 def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict[str, Any]:
     """Return the errors of forecasts at random moments of one loop, in per cent of the thread's length.
 
     Args:
-        name: of the setup.
+        name: of the procedure, or of the setup whose path follower steers.
         moments: how many forecasts.
         horizon: of each [s].
-        seed: of the moments.
+        seed: of what is varied, and of the moments.
     """
-    setup = read_setup(name)
-    frames, made = run_loop(setup, MAX_DURATION), forecaster_of(setup)
-    steps = round(horizon / made.step)
-    chosen = np.random.default_rng(seed).integers(0, len(frames) - steps, moments)
-    errors, needle, held = [], [], []
-    for first in chosen:
-        commands = np.array([each.command for each in frames[first : first + steps]])
-        forecast = made.forecast(frames[first].start, commands, horizon)
-        then = frames[first + len(forecast.filtered)]
-        errors.append(float(np.linalg.norm(forecast.vertices[-1] - then.thread, axis=1).mean()))
-        needle.append(float(np.linalg.norm(forecast.tails[-1] - then.tail)))
-        held.append(float(np.linalg.norm(frames[first].thread - then.thread, axis=1).mean()))
+    setup, record = run_loop(name, seed)
+    made = forecaster_of(setup)
+    steps, slowed = round(horizon / made.step), setup.coils.friction_feedback == "all"
+    times, commands = np.array(record.times), np.array(record.commands)
+    first = times[np.argmax(commands.any(axis=1))]  # nothing moves before
+    last = record.frame_times[-1] - horizon - made.step
+    possible = [start for start in record.starts if first <= start.pose.stamp <= last]
+    errors, needle, moved = [], [], []
+    for index in np.random.default_rng(seed).integers(0, len(possible), moments):
+        start = possible[index]
+        begin = start.pose.stamp
+        middles = begin + made.step * (np.arange(steps) + 0.5)
+        taken = commands[np.searchsorted(times, middles, side="right") - 1]
+        forecast = made.forecast(start, taken, horizon, slowed=slowed)
+        tail, thread = record.truth(begin + made.step * len(forecast.filtered), setup.model.segments)
+        _, before = record.truth(begin, setup.model.segments)
+        errors.append(float(np.linalg.norm(forecast.vertices[-1] - thread, axis=1).mean()))
+        needle.append(float(np.linalg.norm(forecast.tails[-1] - tail)))
+        moved.append(float(np.linalg.norm(before - thread, axis=1).mean()))
     percent = 100.0 / setup.model.thread_length
     return {
-        "setup": name,
+        "loop": name,
         "forecasts": moments,
         "horizon_s": horizon,
-        "frames": len(frames),
+        "step_s": made.step,
+        "duration_s": float(record.frame_times[-1] - first),
         "error_mean_percent": percent * float(np.mean(errors)),
+        "error_median_percent": percent * float(np.median(errors)),
         "error_p95_percent": percent * float(np.percentile(errors, 95.0)),
         "needle_error_mean_percent": percent * float(np.mean(needle)),
-        "moved_mean_percent": percent * float(np.mean(held)),
+        "moved_mean_percent": percent * float(np.mean(moved)),
     }

@@ -77,13 +77,7 @@ class CoilBridgeSettings(Configuration):
     )
 
     scene: str = shared_parameter("scene")
-    keep_out: float = quantity(
-        0.0005,
-        "minimum clearance of the needle's axis to wall and obstacles, half of its width included",
-        unit="m",
-        minimum=2.5e-5,
-        maximum=0.05,
-    )
+    keep_out: float = shared_parameter("keep_out")
     barriers: tuple[str, ...] = quantity((), "barriers of your own for the needle, each as module:class; see Barrier")
     approach_rate: float = quantity(
         10.0,

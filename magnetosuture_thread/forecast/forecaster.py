@@ -129,6 +129,7 @@ class ThreadForecaster:
         )
         formulation = predictor.formulation
         assert isinstance(formulation, RodFormulation)
+        self._formulation, self._drag = formulation, drag
         around = Workspace(
             scene.obstacles, margin_range + 0.5 * thread.diameter, wall_radius=scene.dish.radius
         )  # margins are of the thread's surface
@@ -257,7 +258,7 @@ class ThreadForecaster:
     def _held(
         self, start: ForecastStart, commands: Points, steps: int, buffers: RolloutBuffers, slowed: bool
     ) -> Forecast:
-        model = self._slowed if slowed else self._unslowed
+        model = self._model(start, slowed)
         while True:
             state, record = self._begin(start, buffers), self._record(steps)
             self._set_force(start, record)
@@ -270,7 +271,7 @@ class ThreadForecaster:
     def _controlled(
         self, start: ForecastStart, controller: Controller, steps: int, buffers: RolloutBuffers, slowed: bool
     ) -> Forecast:
-        model = self._slowed if slowed else self._unslowed
+        model = self._model(start, slowed)
         state, record, commands = self._begin(start, buffers), self._record(steps), np.zeros((steps, 2))
         self._set_force(start, record)
         code, done = ENDED, 0
@@ -285,6 +286,14 @@ class ThreadForecaster:
             forecast = self._held(start, commands[: done + 1], done + 1, buffers, slowed)
             return replace(forecast, problem=f"more than {len(buffers.contacts.node)} contacts at once")
         return self._result(start, record, commands, code, done)
+
+    def _model(self, start: ForecastStart, slowed: bool) -> RolloutModel:
+        """Return what stays the same in a forecast, with the thread of its start."""
+        model, thread = self._slowed if slowed else self._unslowed, start.thread
+        if thread is None or thread is self.thread:
+            return model
+        model = model._replace(rod=self._formulation.rod_of(thread))
+        return model if self._drag is None else model._replace(drag=self._drag.numbers(thread))
 
     def _result(self, start: ForecastStart, record: RolloutRecord, commands: Points, code: int, done: int) -> Forecast:
         problem = "" if code == ENDED else f"the step at {done * self.step:.3f} s has no solution within the tolerance"
@@ -372,6 +381,10 @@ class ThreadForecaster:
             if value is not None and not (np.shape(value) == nodes and np.all(np.abs(value) <= MAX_COORDINATE)):
                 wanted = f"finite, shape {nodes}, at most {MAX_COORDINATE:g}"
                 raise InvalidInputError(name, f"shape {np.shape(value)}", wanted)
+        own, given = self.thread, start.thread or self.thread
+        fixed = ("length", "segments", "diameter", "attachment")
+        if any(getattr(given, name) != getattr(own, name) for name in fixed):
+            raise InvalidInputError("thread of the start", given, f"one like {own} in {', '.join(fixed)}")
         gap, unit = float(np.linalg.norm(start.vertices[0] - self._attached(pose))), self.thread.segment_length
         if gap > unit:
             wanted = f"at most {unit:.2e} m"

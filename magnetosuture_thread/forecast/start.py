@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.formulations.step import WarmStart
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.thread import Thread
 
 Vector = NDArray[np.float64]
 
@@ -30,6 +32,7 @@ class ForecastStart:
         needle_force: of the thread upon the needle, shape (2,) [N], from which a needle with drag goes on; None if it
             is not known.
         warm_start: of the formulation, which brings friction that holds already; None for none.
+        thread: with the stiffness, rest curvature and drag to forecast with; None for the forecaster's own.
     """
 
     pose: NeedlePose
@@ -39,6 +42,23 @@ class ForecastStart:
     tip_velocity: Vector | None = None
     warm_start: WarmStart | None = None
     needle_force: Vector | None = None
+    thread: Thread | None = None
+
+    @classmethod
+    def of_estimate(
+        cls, estimate: ThreadEstimate, pose: NeedlePose, tip_velocity: Vector | None = None
+    ) -> ForecastStart:
+        """Return the start from an estimate, with what the estimator has learned of the thread.
+
+        Args:
+            estimate: of the thread.
+            pose: of the needle's tail.
+            tip_velocity: see the attributes.
+        """
+        forces = estimate.prediction.forces
+        needle_force = None if forces is None else forces.needle_force
+        positions = estimate.positions
+        return cls(pose, positions, tip_velocity=tip_velocity, needle_force=needle_force, thread=estimate.thread)
 
     @classmethod
     def of_predictor(

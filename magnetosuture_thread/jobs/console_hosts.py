@@ -271,8 +271,6 @@ class SimulatedHost(RecordingHost):
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
         arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
-        keep_out = repr(self.setup.coils.keep_out)
-        arguments += ["-p", f"{PLANNER}:keep_out:={keep_out}", "-p", f"thread_model:forecast_keep_out:={keep_out}"]
         arguments += ["-p", f"thread_model:forecast_horizon:={FORECAST_HORIZON}"]
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)

@@ -39,9 +39,7 @@ class ProcedureRun:
     def __init__(self, procedure: str, setup: Setup) -> None:
         self._procedure = read_procedure(procedure)
         self._path = find_procedure_file(procedure).resolve()
-        # What the bridge keeps is what counts.
-        self._keep_out = setup.coils.keep_out
-        setup.planner.planner(setup.scene, self._keep_out).check(self._procedure)
+        setup.planner.planner(setup.scene).check(self._procedure)
         self._goals = len(self._procedure.goals)
         self.result: dict[str, Any] = {
             "procedure": self._procedure.name,
@@ -54,8 +52,8 @@ class ProcedureRun:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Arguments for the node, after `--ros-args`: it waits for bridge and recorder, and keeps out as the bridge."""
-        return "-p", "needle_planner:audience:=2", "-p", f"needle_planner:keep_out:={self._keep_out!r}"
+        """Arguments for the node, after `--ros-args`: it waits for bridge and recorder."""
+        return "-p", "needle_planner:audience:=2"
 
     @property
     def scene_arguments(self) -> tuple[str, ...]:

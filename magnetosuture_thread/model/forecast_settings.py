@@ -20,13 +20,7 @@ class ForecastSettings(Configuration):
         maximum=30.0,
     )
     forecast_step: float = quantity(0.03, "duration of its steps", unit="s", minimum=0.001, maximum=0.5)
-    forecast_keep_out: float = quantity(
-        0.0005,
-        "minimum clearance of the needle's axis in it, as keep_out of coil_bridge",
-        unit="m",
-        minimum=2.5e-5,
-        maximum=0.05,
-    )
     friction_feedback: str = shared_parameter("friction_feedback")
+    keep_out: float = shared_parameter("keep_out")
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")

@@ -104,7 +104,7 @@ class ThreadForecasts:
         def command(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
             return follower.compute_command(time, tail, heading).velocity
 
-        start, slowed = ForecastStart(pose, result.estimate.positions), settings.friction_feedback == "all"
+        start, slowed = ForecastStart.of_estimate(result.estimate, pose), settings.friction_feedback == "all"
         forecast = forecaster.forecast(start, command, request.horizon, slowed=slowed)
         answer.success = True
         answer.forecast = forecast_message(MESSAGES, MESSAGES.time(result.stamp), forecast)
@@ -117,7 +117,7 @@ class ThreadForecasts:
         commanded, filtered, source = np.zeros(2), None, ""
         if self._command is not None and abs(result.stamp - self._command[0]) <= MAX_COMMAND_AGE:
             _, commanded, filtered, source = self._command
-        start = ForecastStart(pose, result.estimate.positions, tip_velocity=filtered)
+        start = ForecastStart.of_estimate(result.estimate, pose, filtered)
         slowed = source == "operator" or self._session.settings.friction_feedback == "all"
         return forecaster.forecast(start, commanded, self._session.settings.forecast_horizon, slowed=slowed)
 

@@ -26,13 +26,7 @@ class NeedlePlannerSettings(Configuration):
     thread_length: float = shared_parameter("thread_length")
     coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     friction_feedback: str = shared_parameter("friction_feedback")
-    keep_out: float = quantity(
-        0.0005,
-        "minimum clearance of the needle's axis to wall and obstacles on a path; that of coil_bridge, or more",
-        unit="m",
-        minimum=2.5e-5,
-        maximum=0.05,
-    )
+    keep_out: float = shared_parameter("keep_out")
     pose_timeout: float = quantity(
         0.5, "a procedure pauses after this long without a needle pose", unit="s", minimum=0.05, maximum=5.0
     )
@@ -76,8 +70,7 @@ class NeedlePlannerSettings(Configuration):
         """Reject a coiled needle."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
-    def planner(self, scene: Scene, keep_out: float | None = None) -> NeedlePlanner:
-        """Return a planner for a scene, with another clearance than `keep_out` if one is given [m]."""
+    def planner(self, scene: Scene) -> NeedlePlanner:
+        """Return a planner for a scene."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
-        clearance = self.keep_out if keep_out is None else keep_out
-        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, self.coil_angles)
+        return NeedlePlanner(scene, kinematics, self.keep_out, self.thread_length, self.coil_angles)

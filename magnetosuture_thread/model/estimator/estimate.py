@@ -48,6 +48,7 @@ class ThreadEstimate:
         disturbances: what the model does not know.
         problems: why pieces or the whole observation were refused.
         slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
+        thread: with what is learned.
         compute_rows: of the barriers, at its positions.
         contact_tolerance: a node this close to a shape or the wall touches it [m].
     """
@@ -68,6 +69,7 @@ class ThreadEstimate:
     disturbances: tuple[Disturbance, ...]
     problems: tuple[str, ...]
     slow_parameters: tuple[SlowParameter, ...]
+    thread: Thread
     compute_rows: Callable[[], list[BarrierRows]] = field(repr=False, compare=False)
     contact_tolerance: float = field(repr=False)
 

@@ -350,6 +350,7 @@ class ThreadEstimator:
             disturbances=self._test.found(pose.stamp, positions),
             problems=problems,
             slow_parameters=self._slow.report(),
+            thread=self._slow.thread,
             compute_rows=compute_rows,
             contact_tolerance=tolerance,
         )

@@ -202,13 +202,22 @@ class SlowParameters:
         """Take the thread's place as one that does not depend on the parameters, as where it was measured whole."""
         self.state = replace(self.state, sensitivities=np.zeros_like(self.state.sensitivities))
 
-    def _use(self, x: Vector) -> None:
-        thread, formulation = self._thread, self._predictor.formulation
+    @property
+    def thread(self) -> Thread:
+        """The thread with what is learned."""
+        return self._with(self.state.x)
+
+    def _with(self, x: Vector) -> Thread:
+        thread = self._thread
         for kind, each, start in zip(self.kinds, x.tolist(), self._start.tolist(), strict=True):
             if each != start:  # a logarithm and back would change the last bit
                 thread = kind.write(thread, kind.from_x(each))
+        return thread
+
+    def _use(self, x: Vector) -> None:
+        formulation = self._predictor.formulation
         assert isinstance(formulation, RodFormulation)
-        formulation.set_thread(thread)
+        formulation.set_thread(self._with(x))
 
     def step(self, pose: NeedlePose) -> Prediction:
         """Let the predictor follow the needle to its next pose, and propagate the derivatives with it.

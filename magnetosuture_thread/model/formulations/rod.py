@@ -137,8 +137,12 @@ class RodFormulation(Formulation):
         Args:
             thread: of the same length, segments, diameter and attachment.
         """
-        medium, self._thread = thread.medium, thread
-        self._rod = self._rod._replace(
+        self._thread, self._rod = thread, self.rod_of(thread)
+
+    def rod_of(self, thread: Thread) -> RodProperties:
+        """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
+        medium = thread.medium
+        return self._rod._replace(
             bending_stiffness=thread.bending_stiffness,
             drag_across=medium.drag_across,
             drag_along=medium.drag_along,

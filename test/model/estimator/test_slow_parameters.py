@@ -77,6 +77,9 @@ def test_a_wrong_parameter_is_found_within_its_interval(names: tuple[str, ...], 
         assert each.low <= kind.read(real) <= each.high, each
         assert each.excited
         assert kind.to_x(each.high) - kind.to_x(each.low) < 0.2 * (2.0 * NORMAL_95 * kind.deviation(told))
+        assert kind.read(estimates[-1].thread) == pytest.approx(each.value, rel=1e-9), (
+            "forecasts start with what is learned"
+        )
     off = np.array([found.positions for found in estimates]) - true_shapes(real, way)
     assert np.abs(off[60:]).max() < 3e-5
 
