@@ -8,8 +8,6 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 import magnetosuture_thread
 
 PACKAGE = Path(magnetosuture_thread.__file__).parent
@@ -205,41 +203,47 @@ def part(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_run_one_way(path: Path):
-    here = part(path)
-    if here == "__init__":  # the public API, whose names are imported when they are first used
-        at_import = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
-        assert {getattr(node, "module", None) for node in at_import} == {"importlib", "typing"}
-        return
-    ours = [name for name in imported(path) if name.startswith("magnetosuture_thread.")]
-    parts = {name.split(".")[1] for name in ours} - {here, "__version__"}
-    assert parts <= ALLOWED[here], f"{here} may not import {parts - ALLOWED[here]}"
+def assert_none(found: dict[Path, set[str]], what: str) -> None:
+    """Check that nothing is found in any module, else name each module with what is."""
+    lines = [f"{path.relative_to(PACKAGE)} {what} {names}" for path, names in found.items() if names]
+    assert not lines
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_nodes_jobs_and_commands_use_the_public_api(path: Path):
-    if part(path) not in {"nodes", "jobs", "cli"}:
-        return
-    imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
-    inside = [node for node in imports if str(node.module).startswith("magnetosuture_thread.")]
-    assert not {alias.name for node in inside for alias in node.names if alias.name in PUBLIC}
+def test_imports_run_one_way():
+    for node in ast.parse((PACKAGE / "__init__.py").read_text()).body:  # whose names are imported when first used
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            assert getattr(node, "module", None) in {"importlib", "typing"}
+    found = {}
+    for path in MODULES:
+        here = part(path)
+        if here != "__init__":
+            ours = [name for name in imported(path) if name.startswith("magnetosuture_thread.")]
+            found[path] = {name.split(".")[1] for name in ours} - {here, "__version__"} - ALLOWED[here]
+    assert_none(found, "may not import")
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_third_party_packages_are_imported_by_their_owners_only(path: Path):
-    here = part(path)
+def test_nodes_jobs_and_commands_use_the_public_api():
+    found = {}
+    for path in MODULES:
+        if part(path) in {"nodes", "jobs", "cli"}:
+            imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
+            inside = [node for node in imports if str(node.module).startswith("magnetosuture_thread.")]
+            found[path] = {alias.name for node in inside for alias in node.names if alias.name in PUBLIC}
+    assert_none(found, "imports from inside")
+
+
+def test_third_party_packages_are_imported_by_their_owners_only():
+    packages = {path: {name.split(".")[0] for name in imported(path)} for path in MODULES}
     foreign = {
-        package
-        for package in (name.split(".")[0] for name in imported(path))
-        if here not in OWNERS.get(package, {here})
+        path: {name for name in names if part(path) not in OWNERS.get(name, {part(path)})}
+        for path, names in packages.items()
     }
-    assert not foreign, f"{here} may not import {foreign}"
+    assert_none(foreign, "may not import")
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_what_is_installed_needs_nothing_of_the_source_tree(path: Path):
-    assert not {name.split(".")[0] for name in imported(path)} & {"benchmarks", "examples", "test"}
+def test_what_is_installed_needs_nothing_of_the_source_tree():
+    outside = {"benchmarks", "examples", "test"}
+    assert_none({path: {name.split(".")[0] for name in imported(path)} & outside for path in MODULES}, "may not import")
 
 
 LATE = {"matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}

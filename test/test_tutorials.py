@@ -10,6 +10,7 @@ A comment before a block says what is special about it:
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
@@ -106,6 +107,20 @@ def test_blocks_of_a_page_run_in_their_order(page: Path, clone: Path):
             run(block, clone)
 
 
+def check_example_bag(folder: Path) -> None:
+    """Check that the example bag, replayed on the graph, was tracked in every frame."""
+    summary = json.loads((folder / "output/live/summary.json").read_text())
+    assert summary["frames"] == 240
+    assert summary["tracked"] == summary["predicted"] == 238  # the first pose comes in the third frame
+    assert summary["commands"] == 240
+    assert summary["contact_frames"] > 100
+    obstacle = next(margin for margin in summary["least_margins"] if margin["kind"] == "obstacle")
+    assert obstacle["value"] > -1e-6
+    assert obstacle["clearance"] > -25e-6  # the chord's dip between two nodes on the post
+    assert summary["error_seen"]["maximum"] < 1.0
+
+
+RESULTS = {"first_replay.md": check_example_bag}
 ON_THE_GRAPH = [page for page in PAGES if any(block.on_the_graph for block in blocks_of(page))]
 
 
@@ -115,6 +130,8 @@ def test_blocks_on_the_graph_run(page: Path, clone: Path):
     for block in blocks_of(page):
         if block.file or block.on_the_graph:
             run(block, clone)
+    if page.name in RESULTS:
+        RESULTS[page.name](clone)
 
 
 def test_no_block_is_left_out_unnoticed():
@@ -126,5 +143,6 @@ def test_no_block_is_left_out_unnoticed():
         assert not re.search(r"^    \S", BLOCK.sub("", page.read_text(encoding="utf-8")), re.MULTILINE), page
     left_out = Counter(page.name for page in PAGES for block in blocks_of(page) if block.runs.startswith("not, "))
     assert left_out == LEFT_OUT
+    assert RESULTS.keys() <= {page.name for page in ON_THE_GRAPH}
     kinds = {block.runs.partition(" ")[0] for page in PAGES for block in blocks_of(page)}
     assert kinds <= {"", "with", "until", "not,"}

@@ -61,8 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(folder: Path, *arguments: str) -> int:
-    """Run the command."""
-    return cli.main(["calibrate", *arguments, "--setup", str(folder / "lab.yaml")])
+    """Run the command, in this process unless it is given workers: each takes seconds to start."""
+    workers = () if "--workers" in arguments else ("--workers", "1")
+    return cli.main(["calibrate", *arguments, *workers, "--setup", str(folder / "lab.yaml")])
 
 
 def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Path, tmp_path: Path, capsys):

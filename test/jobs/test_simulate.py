@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
+from unittest.mock import create_autospec
 
 import cv2
 import pytest
@@ -20,7 +23,7 @@ from magnetosuture_thread.jobs.replay import replay_live
 from magnetosuture_thread.jobs.simulate import simulate
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes.recorder import Recorder
-from magnetosuture_thread.reproduce.thread_behavior import thread_behavior
+from magnetosuture_thread.reproduce import thread_behavior as thread_behavior_module
 from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.scene import read_scene
 
@@ -156,10 +159,10 @@ def test_under_faults_the_tracker_is_right_or_silent_and_the_needle_goes_on(tmp_
     assert summary.tracked > 15
 
 
-def test_with_a_simulated_clock_it_runs_faster_than_real_time(tmp_path: Path):
+def test_with_a_simulated_clock_it_runs_faster_than_real_time_and_can_be_ended_before_its_path(tmp_path: Path):
     # Few frames: how many a second can be tracked is for a benchmark.
     path = tmp_path / "short.yaml"
-    path.write_text(SHORT.replace("FAULTS", "").replace("frame_rate: 30.0", "frame_rate: 8.0"))
+    path.write_text(SHORT.replace("FAULTS", "").replace("frame_rate: 30.0", "frame_rate: 8.0") + "    speed: 0.0006\n")
     said: list[str] = []
     recording: list[float] = []  # s, of the machine's own time
     summary = simulate(
@@ -175,6 +178,7 @@ def test_with_a_simulated_clock_it_runs_faster_than_real_time(tmp_path: Path):
     bag = Bag(tmp_path / "bag")
     assert bag.start < 1000e9  # on the simulation's own clock
     assert bag.duration > 1.4 * (recording[-1] - recording[0])  # how soon nodes start and end is left out
+    assert summary.duration < 4.5  # the whole path takes 33 s
 
 
 def test_a_run_begins_with_the_first_prediction_or_after_a_while_without_any(monkeypatch: pytest.MonkeyPatch):
@@ -200,11 +204,6 @@ def test_a_run_begins_with_the_first_prediction_or_after_a_while_without_any(mon
     never = Waiting(frames=-1)
     simulate_module._wait(never, lambda: None)
     assert never.spins == [simulate_module.SETTLING_TIME]
-
-
-def test_a_run_can_be_ended_before_its_path(scenario: Path, tmp_path: Path):
-    summary = simulate(str(scenario), tmp_path / "bag", duration=0.5)
-    assert summary.duration < 1.0  # the whole path takes 1.3 s
 
 
 def test_a_scenario_without_a_path_is_refused(tmp_path: Path):
@@ -271,10 +270,18 @@ def test_an_interrupted_run_leaves_nothing_behind(scenario: Path, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_thread_behavior_draws_each_scenario(scenario: Path, tmp_path: Path):
-    runs = thread_behavior(tmp_path / "out", [str(scenario)])
+def test_thread_behavior_draws_each_scenario(run, scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What is drawn is a run of the whole graph: the one that was recorded above."""
+
+    def recorded(setup: str, output: Path, **_: Any) -> None:
+        assert setup == str(scenario)
+        shutil.copytree(run[0], output)
+
+    monkeypatch.setattr(thread_behavior_module, "simulate", create_autospec(simulate, side_effect=recorded))
+    runs = thread_behavior_module.thread_behavior(tmp_path / "out", [str(scenario)])
     assert len(runs) == 1
     assert runs[0].summary.error_truth is not None
+    assert runs[0].summary.error_truth == run[1].error_truth
     picture = cv2.imread(str(tmp_path / "out" / "behaviour.png"))
     assert picture is not None
     assert picture.shape[1] > 1000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -192,6 +193,9 @@ def test_perception_process_ends_on_a_signal(tmp_path: Path, end: signal.Signals
         try:
             assert is_heard("lab1/vision_tracker", environment)
             assert is_heard("lab1/thread_model", environment)
+            deadline = time.monotonic() + 60.0  # a node is heard while it still loads its kernels
+            while "ready: 12 segments" not in (tmp_path / "log").read_text() and time.monotonic() < deadline:
+                time.sleep(0.05)
             process.send_signal(end)
             assert process.wait(20) == 0
         finally:
