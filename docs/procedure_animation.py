@@ -1,4 +1,4 @@
-"""Draws a procedure of `simulate --procedure` as an animation: camera frames, plan, and estimated thread."""
+"""Draws a procedure of `simulate --procedure` as an animation: camera frames, plan, estimated thread and forecast."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from magnetosuture_thread.setups import read_setup
 EVERY, SPEED = 0.6, 6.0  # s of the run between two pictures, and how much faster they are shown
 SIDE, MARGIN = 440, 12  # pixels of a picture, and of the frame around the dish
 PLAN, PASSED, THREAD, INK = (40, 150, 20), (150, 200, 140), (210, 90, 0), (40, 40, 40)  # BGR
+FORECAST = (240, 180, 120)
 COLOURS = 64
 DARK = 95  # grey levels, below which a pixel is the needle's, or the rim's
 NOISE = 14  # grey levels by which a pixel differs from the empty dish by noise alone
-IMAGE, PLANNED, ESTIMATED, STATE, SETPOINT = (
+IMAGE, PLANNED, ESTIMATED, FORECAST_TOPIC, STATE, SETPOINT = TOPICS = (
     "/camera/image_raw/compressed",
     "/procedure/plan",
     "/thread/estimated",
+    "/thread/forecast",
     "/procedure/state",
     "/needle/setpoint_cp",
 )
@@ -36,7 +38,7 @@ def draw_procedure(bag: Path, setup: str, file: Path) -> None:
     view, instants, shown_at = found.rig.view(found.scene), [], -np.inf
     latest: dict[str, Any] = {}
     with AnyReader([bag]) as reader:
-        chosen = [each for each in reader.connections if each.topic in (IMAGE, PLANNED, ESTIMATED, STATE, SETPOINT)]
+        chosen = [each for each in reader.connections if each.topic in TOPICS]
         for connection, time, data in reader.messages(connections=chosen):
             latest[connection.topic] = reader.deserialize(data, connection.msgtype)
             now = 1e-9 * (time - reader.start_time)
@@ -54,7 +56,7 @@ def draw_procedure(bag: Path, setup: str, file: Path) -> None:
             _picture(np.where(moved[..., None], frame, floor), messages, view, found.scene.dish.radius, now)
         )
     sample = pictures[len(pictures) // 2].copy()
-    for k, colour in enumerate((PLAN, PASSED, THREAD, INK)):
+    for k, colour in enumerate((PLAN, PASSED, THREAD, FORECAST, INK)):
         sample.paste(colour[::-1], (0, 30 * k, 60, 30 * k + 30))
     palette = sample.quantize(COLOURS)
     frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
@@ -72,6 +74,11 @@ def _picture(frame: np.ndarray, latest: dict[str, Any], view: DishView, radius: 
         _line(frame, view.to_pixels(places[: passed + 1]), PASSED, 2)
         _line(frame, view.to_pixels(places[passed:]), PLAN, 2)
         frame[needle] = before[needle]
+    if FORECAST_TOPIC in latest:
+        ahead = latest[FORECAST_TOPIC]
+        nodes = len(ahead.positions) // max(len(ahead.time), 1)
+        last = np.array([(each.x, each.y) for each in ahead.positions[-nodes:]])
+        _line(frame, view.to_pixels(last), FORECAST, 2)
     if ESTIMATED in latest:
         _line(frame, view.to_pixels(np.array([(each.x, each.y) for each in latest[ESTIMATED].positions])), THREAD, 2)
     (u, v), reach = view.centre_px, radius / view.metres_per_pixel + MARGIN
