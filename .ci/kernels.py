@@ -15,7 +15,7 @@ from pathlib import Path
 
 from magnetosuture_thread.compiled import PACKAGE
 from magnetosuture_thread.forecast.making import make_forecaster
-from magnetosuture_thread.model.estimator import EstimatorOptions, ThreadEstimator
+from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.warm_up import warm_up
@@ -43,7 +43,7 @@ def compile_kernels() -> None:
     with subprocess.Popen([*pytest, *IN_SPACE], cwd=ROOT) as in_space:
         setup = read_setup(SETUP)
         Rig(setup.rig, setup.scene).warm_up()
-        ThreadEstimator(setup.model.predictor(setup.scene), EstimatorOptions()).warm_up()
+        ThreadSession(setup.model, setup.scene)
         warm_up()
         make_forecaster(setup.model, setup.scene).warm_up()
         besides = subprocess.run([*pytest, *BESIDES], cwd=ROOT, check=False)

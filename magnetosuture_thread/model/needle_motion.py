@@ -40,6 +40,12 @@ class NeedleMotionFilter:
         self._state, self._covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
         self._stamp = -math.inf
 
+    def warm_up(self) -> None:
+        """Filter two poses, so that no kernel is compiled in the first callback."""
+        for stamp in (0.0, 0.5 * MAX_INTERVAL):
+            self.update(NeedlePose(stamp, np.zeros(2), np.array([1.0, 0.0]), deviation=(1e-5, 1e-2)))
+        self.reset()
+
     def reset(self) -> None:
         """Forget the motion."""
         self._stamp = -math.inf

@@ -164,6 +164,7 @@ class ThreadSession:
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
         self._needle_motion = NeedleMotionFilter()
+        self._needle_motion.warm_up()
         self._initial_observation = InitialObservation()
         self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
         self._motion_before = self._estimate_motion  # the estimate's, before its last pose

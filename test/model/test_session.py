@@ -544,7 +544,8 @@ for values in (
     for _ in range(40):
         stamp += 33_000_000
         at = np.array([0.0, stamp * 5e-12])
-        outcome = session.on_pose(stamp, NeedlePose(stamp * 1e-9, at, np.array([1.0, 0.0])))
+        pose = NeedlePose(stamp * 1e-9, at, np.array([1.0, 0.0]), deviation=(1e-5, 1e-2))
+        outcome = session.on_pose(stamp, pose)
         assert outcome.prediction is None or outcome.prediction.margins
 print(kernels() - before)
 """
