@@ -16,7 +16,7 @@ from magnetosuture_thread.setups import read_setup
 EVERY, SPEED = 0.6, 6.0  # s of the run between two pictures, and how much faster they are shown
 SIDE, MARGIN = 440, 12  # pixels of a picture, and of the frame around the dish
 PLAN, PASSED, THREAD, INK = (40, 150, 20), (150, 200, 140), (210, 90, 0), (40, 40, 40)  # BGR
-FORECAST = (240, 180, 120)
+FORECAST = (215, 105, 150)
 COLOURS = 64
 DARK = 95  # grey levels, below which a pixel is the needle's, or the rim's
 NOISE = 14  # grey levels by which a pixel differs from the empty dish by noise alone

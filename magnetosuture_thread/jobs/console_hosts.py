@@ -21,7 +21,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
-from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE, START_TIMEOUT
+from magnetosuture_thread.jobs.simulate import FORECAST, SLOWER_BRIDGE, START_TIMEOUT
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import RECORDED_TOPICS, ConsoleTap
@@ -32,7 +32,6 @@ from magnetosuture_thread.setups import Setup, read_setup
 # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
 # go before the browser and the rig, and behind the bridge.
 PREFERRED, PRIORITY = "perception", 5
-FORECAST_HORIZON = 3.0  # s that the page shows ahead
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 
 
@@ -270,8 +269,7 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS]
-        arguments += ["-p", f"thread_model:forecast_horizon:={FORECAST_HORIZON}"]
+        arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS, *FORECAST]
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()

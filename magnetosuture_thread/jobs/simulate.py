@@ -64,6 +64,8 @@ POLL_PERIOD = 0.02  # s between two looks at the nodes
 
 # Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
 SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
+# Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
+FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
 # On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
 BRIDGE_AND_RECORDER = ("-p", "path_follower:audience:=2")
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
@@ -166,7 +168,7 @@ def _run(
     """Run the graph and record it; return what went wrong, so that the bag stays."""
     arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
     if execution is not None:
-        arguments += execution.scene_arguments
+        arguments += [*execution.scene_arguments, *FORECAST]
     if rate is not None:
         arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
     notes = {

@@ -14,12 +14,19 @@ class ForecastSettings(Configuration):
 
     forecast_horizon: float = quantity(
         0.0,
-        "how far ahead thread/forecast looks with every estimate, the present command held; 0 for none",
+        "how far ahead thread/forecast looks from every estimate, the present command held; 0 for none",
         unit="s",
         minimum=0.0,
         maximum=30.0,
     )
     forecast_step: float = quantity(0.03, "duration of its steps", unit="s", minimum=0.001, maximum=0.5)
+    forecast_period: float = quantity(
+        0.0,
+        "time between estimates that are forecast; 0 for every estimate, as far as there is time",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
+    )
     friction_feedback: str = shared_parameter("friction_feedback")
     keep_out: float = shared_parameter("keep_out")
     needle_length: float = shared_parameter("needle_length")

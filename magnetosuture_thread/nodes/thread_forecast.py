@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, NamedTuple
 
 import numpy as np
 from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import (
-    Forecast,
     ForecastStart,
     InvalidInputError,
     MagnetosutureError,
@@ -33,13 +34,26 @@ from magnetosuture_thread.nodes.node import PackageNode
 MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
 MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
 MIN_SPEED, MAX_SPEED = 1e-5, 0.1  # m/s
+LONG_AGO = 2**62  # ns; beyond any stamp that a message can hold
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
 
 
-class ThreadForecasts:
-    """Publishes a forecast with every estimate, where the parameter `forecast_horizon` asks for it.
+class HeldCommand(NamedTuple):
+    """What is forecast, from which start, for the message of a stamp [ns]."""
 
-    A service answers what would happen along a path instead.
+    forecaster: ThreadForecaster
+    stamp: int
+    start: ForecastStart
+    commanded: np.ndarray
+    horizon: float
+    slowed: bool
+
+
+class ThreadForecasts:
+    """Publishes a forecast of every estimate, where the parameter `forecast_horizon` asks for it.
+
+    It is made in a thread of its own, so that no pose waits for one; an estimate that comes while a forecast is made
+    takes the place of one that still waits. A service answers what would happen along a path instead.
     What is held is the command that the coil bridge follows, of `needle/filter_state`; without one the needle rests.
 
     Args:
@@ -50,6 +64,7 @@ class ThreadForecasts:
     def __init__(self, node: PackageNode, session: ThreadSession) -> None:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
+        self._started = -LONG_AGO  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
         self._published = topics.FORECAST.publisher(node)
@@ -57,6 +72,14 @@ class ThreadForecasts:
         topics.FILTER_STATE.subscribe(node, self.on_filter_state)
         node.create_service(ForecastPath, FORECAST_PATH, self.on_path)
         self._forecaster()
+        self._waiting: SimpleQueue[HeldCommand | None] = SimpleQueue()
+        self._worker = Thread(target=self._work, name="forecasts", daemon=True)
+        self._worker.start()
+
+    def close(self) -> None:
+        """Publish no more; to be called before the node is destroyed."""
+        self._waiting.put(None)
+        self._worker.join()
 
     def on_filter_state(self, message: object) -> None:
         """Remember the command that the bridge follows."""
@@ -65,8 +88,8 @@ class ThreadForecasts:
         except InvalidInputError as error:
             self._node.refuse(error)
 
-    def publish(self, result: PredictionResult, pose: NeedlePose) -> None:
-        """Publish the forecast from an estimate.
+    def start(self, result: PredictionResult, pose: NeedlePose) -> None:
+        """Begin the forecast from an estimate, which is published when it is made.
 
         Args:
             result: of the pose.
@@ -74,15 +97,32 @@ class ThreadForecasts:
         """
         if result.estimate is None or not result.estimate.converged:
             return
-        self._last = result, pose
+        self._last, settings = (result, pose), self._session.settings
+        forecaster, elapsed = self._forecaster(), abs(result.stamp - self._started)  # either way if time is set back
+        if forecaster is None or elapsed < 1_000_000_000 * settings.forecast_period:
+            return
+        self._started = result.stamp
+        commanded, filtered, source = np.zeros(2), None, ""
+        if self._command is not None and abs(result.stamp - self._command[0]) <= MAX_COMMAND_AGE:
+            _, commanded, filtered, source = self._command
+        start = ForecastStart.of_estimate(result.estimate, pose, filtered)
+        slowed = source == "operator" or settings.friction_feedback == "all"
+        self._waiting.put(HeldCommand(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
+
+    def _work(self) -> None:
+        while (command := self._waiting.get()) is not None:
+            if self._waiting.empty():
+                self._publish(command)
+
+    def _publish(self, command: HeldCommand) -> None:
         try:
-            forecast = self._forecast(result, pose)
+            forecast = command.forecaster.forecast(
+                command.start, command.commanded, command.horizon, slowed=command.slowed
+            )
         except MagnetosutureError as error:
             self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
             return
-        if forecast is None:
-            return
-        when = MESSAGES.time(result.stamp)
+        when = MESSAGES.time(command.stamp)
         self._published.publish(forecast_message(MESSAGES, when, forecast))
         if self._markers.get_subscription_count():
             self._markers.publish(forecast_markers(MESSAGES, when, forecast))
@@ -109,17 +149,6 @@ class ThreadForecasts:
         answer.success = True
         answer.forecast = forecast_message(MESSAGES, MESSAGES.time(result.stamp), forecast)
         return answer
-
-    def _forecast(self, result: PredictionResult, pose: NeedlePose) -> Forecast | None:
-        forecaster = self._forecaster()
-        if forecaster is None or result.estimate is None:
-            return None
-        commanded, filtered, source = np.zeros(2), None, ""
-        if self._command is not None and abs(result.stamp - self._command[0]) <= MAX_COMMAND_AGE:
-            _, commanded, filtered, source = self._command
-        start = ForecastStart.of_estimate(result.estimate, pose, filtered)
-        slowed = source == "operator" or self._session.settings.friction_feedback == "all"
-        return forecaster.forecast(start, commanded, self._session.settings.forecast_horizon, slowed=slowed)
 
     def _forecaster(self) -> ThreadForecaster | None:
         """Return the forecaster of the settings and the scene in force; None without a scene."""

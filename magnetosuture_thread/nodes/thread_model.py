@@ -64,6 +64,12 @@ class ThreadModelNode(PackageNode):
             f"{settings.formulation} by {settings.solver}"
         )
 
+    def destroy_node(self) -> None:
+        """Leave the graph, once no forecast is being made."""
+        if self._forecasts is not None:
+            self._forecasts.close()
+        super().destroy_node()
+
     def listen(self) -> None:
         """Subscribe to needle poses and to what is seen of the thread."""
         topics.THREAD_OBSERVATION.subscribe(self, self.on_observation_message, raw=True)
@@ -95,7 +101,7 @@ class ThreadModelNode(PackageNode):
         result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
-            self._forecasts.publish(result, read)
+            self._forecasts.start(result, read)
 
     def on_measured_thread_message(self, data: bytes) -> None:
         """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags.

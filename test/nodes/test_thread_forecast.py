@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,16 @@ from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import FilterState
 from magnetosuture_msgs.srv import ForecastPath
 
-from magnetosuture_thread import Disc, ForecastStart, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadForecaster
+from magnetosuture_thread import (
+    Disc,
+    Forecast,
+    ForecastStart,
+    NeedlePose,
+    NeedleSafetyFilter,
+    Scene,
+    Thread,
+    ThreadForecaster,
+)
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message, forecast_text
@@ -66,6 +76,28 @@ def forecast_after(bench: Any, forecasts: list[Any]) -> Any:
     bench.show(before, whole(NODES[before], before))
     bench.graph.wait(lambda: len(forecasts) > before, "a forecast")
     return forecasts[-1]
+
+
+def test_no_pose_waits_for_a_forecast_and_the_newest_estimate_is_the_next(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
+    forecasts, begun, go_on, forecast = graph.listen(topics.FORECAST), Event(), Event(), ThreadForecaster.forecast
+
+    def slow(*arguments: Any, **options: Any) -> Forecast:
+        begun.set()
+        assert go_on.wait(60.0)
+        return forecast(*arguments, **options)
+
+    monkeypatch.setattr(ThreadForecaster, "forecast", slow)
+    bench.show(0)
+    assert begun.wait(60.0)
+    for k in (1, 2, 3):
+        bench.show(k)  # waits for the estimate
+    assert not forecasts
+    go_on.set()
+    graph.wait(lambda: len(forecasts) >= 2, "forecasts")
+    bench.show(4)
+    graph.wait(lambda: forecasts[-1].header.stamp == stamp(4), "the forecast of the last")
+    assert [message.header.stamp for message in forecasts] == [stamp(0), stamp(3), stamp(4)]
 
 
 def test_without_a_horizon_nothing_is_forecast(graph: Any, monkeypatch: pytest.MonkeyPatch):
