@@ -32,6 +32,7 @@ MIN_PART, MAX_PART = 2e-3, 0.5  # of a trial of the line search, for the next on
 DESCENT = 1e-4  # of the decrease that the slope promises
 ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
 MIN_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
+STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
 
 
 class NewtonBuffers(NamedTuple):
@@ -204,10 +205,10 @@ def _minimise(
                 new_slope += gradient[i] * step[i]
             part = _shorter(part, slope, new_slope, new - energy)
             if part < MIN_LINE_SEARCH:
-                return -1, move, force
+                return (iteration if move <= STALLED * tolerance else -1), move, force
         current[:] = trial
         energy = new
-    return -1, move, force
+    return (MAX_ITERATIONS if move <= STALLED * tolerance else -1), move, force
 
 
 @compiled
@@ -243,7 +244,8 @@ def advance(
         shapes: what can be touched.
         buffers: to work in.
         driven: whether the needle's motion is given.
-        tolerance: the largest last move of a node [m].
+        tolerance: the largest last move of a node [m]; `STALLED` times as much where the energy's rounding ends the
+            search.
 
     Returns:
         Iterations, or -1 if it did not converge; the last move [m]; the largest force that is left [N].
