@@ -119,7 +119,9 @@ class CertifiedAllocation:
             return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
 
         def allocated(target: Vector) -> Allocation:
-            return self._coils.allocate(target, pose.tail, pose.heading, previous.currents, max_change, to_compensate)
+            return self._coils.allocate(
+                target, pose.tail, pose.heading, previous.currents, max_change, to_compensate, pose.age
+            )
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         for _ in range(1 + MAX_CORRECTIONS):

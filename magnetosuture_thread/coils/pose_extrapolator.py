@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,11 @@ MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a po
 
 @dataclass(frozen=True)
 class Pose:
-    """Needle pose: tail, shape (2,) [m], and unit heading at the tail, shape (2,)."""
+    """Needle pose: tail, shape (2,) [m], unit heading at the tail, shape (2,), and time since it was measured [s]."""
 
     tail: Vector
     heading: Vector
+    age: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -186,10 +187,10 @@ class PoseExtrapolator:
     def pose(self, now: float, arrival: float) -> Pose | None:
         """Return the pose extrapolated to a time of the stamps' clock and a monotonic time [s]; None if it is stale."""
         self._check_stall(arrival)
-        if self._extrapolated is None or self.stale_reason(now, arrival):
+        if self._extrapolated is None or self._accepted is None or self.stale_reason(now, arrival):
             return None
         self._extrapolate(self._velocity, now)
-        return self._extrapolated
+        return replace(self._extrapolated, age=max(0.0, now - self._accepted.stamp))
 
     def _check_plausible(self, measured: _Measured) -> None:
         """Reject an implausible pose; see the class."""

@@ -23,7 +23,7 @@ MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle th
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and across may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
-DRIFT_PER_ANGLE = 0.018  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
+DRIFT_PER_ANGLE = 0.015  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
@@ -35,7 +35,7 @@ CROSSING_TIME = (
 )
 CROSSING_GAIN, MAX_CROSSING_RATIO = 12.0, 4.0  # 1/s, and of the allowed speed: in place of TURN_GAIN, MAX_TURN_RATIO
 LEAD_WAY = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side that it is thrown from
-THROWN_FOR, LEAD_SHARE = 0.1, 0.25  # s; in a crossing; of the leeway here and there, that it is kept aside at the most
+THROWN_FOR, LEAD_SHARE = 0.1, 0.4  # s; in a crossing; of the leeway here and there, that it is kept aside at the most
 MIN_TACK_TIME = 1.0  # s; after a crossing, in which the needle does not tack
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited

@@ -117,3 +117,15 @@ def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to
     found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, None, np.zeros(2))
     assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
     assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999
+
+
+def test_the_older_the_pose_the_less_of_a_pull_is_compensated_close_to_a_coil_s_axis():
+    safety, coils = SETTINGS.safety_filter(blocks()), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    e = np.array([math.cos(0.06), math.sin(0.06)])
+    left = []
+    for age in (0.02, 0.07, 0.12):
+        pose = Pose(np.array([0.004, 0.005]) - 1.25e-3 * e, e, age)
+        disturbance = MotionDisturbance(0.0, 2e-3)
+        found, _ = coils.allocate(1e-3 * e, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2))
+        left.append(found.drift + disturbance.drift)
+    assert 0.0 <= left[0] < left[1] < left[2] <= 2.1e-3

@@ -38,6 +38,7 @@ def test_a_pose_is_carried_along_the_needle():
     assert pose is not None
     np.testing.assert_allclose(pose.tail, [0.0002, 0.0], atol=1e-12)
     np.testing.assert_allclose(pose.heading, EAST)
+    assert pose.age == pytest.approx(0.04)  # since the stamp
 
 
 def test_a_velocity_across_turns_the_needle_about_its_middle():
