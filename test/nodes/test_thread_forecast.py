@@ -100,6 +100,18 @@ def test_no_pose_waits_for_a_forecast_and_the_newest_estimate_is_the_next(graph:
     assert [message.header.stamp for message in forecasts] == [stamp(0), stamp(3), stamp(4)]
 
 
+def test_estimates_within_the_period_after_one_that_is_forecast_are_not(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    settings = {"forecast_horizon": HORIZON, "forecast_step": 0.03, "forecast_period": 0.08}  # two to three frames
+    bench = counting(monkeypatch, graph, scene="dish_150mm", **settings)
+    forecasts, expected = graph.listen(topics.FORECAST), []
+    for k in range(7):
+        bench.show(k)
+        if k % 3 == 0:
+            expected.append(stamp(k))
+            graph.wait(lambda: len(forecasts) == len(expected), "a forecast")
+    assert [message.header.stamp for message in forecasts] == expected
+
+
 def test_without_a_horizon_nothing_is_forecast(graph: Any, monkeypatch: pytest.MonkeyPatch):
     bench = counting(monkeypatch, graph, scene="dish_150mm")
     bench.show(0)
