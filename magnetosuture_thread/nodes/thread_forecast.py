@@ -73,6 +73,7 @@ class ThreadForecasts:
         node.create_service(ForecastPath, FORECAST_PATH, self.on_path)
         self._forecaster()
         self._waiting: SimpleQueue[HeldCommand | None] = SimpleQueue()
+        self._error: Exception | None = None
         self._worker = Thread(target=self._work, name="forecasts", daemon=True)
         self._worker.start()
 
@@ -94,7 +95,12 @@ class ThreadForecasts:
         Args:
             result: of the pose.
             pose: of the needle's tail, as tracked.
+
+        Raises:
+            Exception: an unexpected one that ended an earlier forecast, as in any callback.
         """
+        if self._error is not None:
+            raise self._error
         if result.estimate is None or not result.estimate.converged:
             return
         self._last, settings = (result, pose), self._session.settings
@@ -110,9 +116,12 @@ class ThreadForecasts:
         self._waiting.put(HeldCommand(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
 
     def _work(self) -> None:
-        while (command := self._waiting.get()) is not None:
-            if self._waiting.empty():
-                self._publish(command)
+        while self._error is None and (command := self._waiting.get()) is not None:
+            try:
+                if self._waiting.empty():
+                    self._publish(command)
+            except Exception as error:
+                self._error = error
 
     def _publish(self, command: HeldCommand) -> None:
         try:

@@ -100,6 +100,20 @@ def test_no_pose_waits_for_a_forecast_and_the_newest_estimate_is_the_next(graph:
     assert [message.header.stamp for message in forecasts] == [stamp(0), stamp(3), stamp(4)]
 
 
+def test_an_unexpected_error_of_a_forecast_is_raised_by_the_next_estimate(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON)
+
+    def broken(*_: Any, **__: Any) -> None:
+        raise ZeroDivisionError("broken")
+
+    monkeypatch.setattr(ThreadForecaster, "forecast", broken)
+    bench.show(0)
+    forecasts = bench.node._forecasts
+    forecasts._worker.join(60.0)
+    with pytest.raises(ZeroDivisionError, match="broken"):
+        forecasts.start(*forecasts._last)
+
+
 def test_estimates_within_the_period_after_one_that_is_forecast_are_not(graph: Any, monkeypatch: pytest.MonkeyPatch):
     settings = {"forecast_horizon": HORIZON, "forecast_step": 0.03, "forecast_period": 0.08}  # two to three frames
     bench = counting(monkeypatch, graph, scene="dish_150mm", **settings)
