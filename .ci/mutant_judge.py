@@ -20,6 +20,7 @@ import time
 import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any
@@ -232,7 +233,7 @@ def judge_all(run: Callable[[dict[str, Any], int], int]) -> None:
         for mutant in mutants:
             begin = time.monotonic()
             with written(TREE / mutant["path"], mutant["mutated"]):
-                status, by = in_fork(lambda writer, mutant=mutant: run(mutant, writer), mutant["timeout"])  # type: ignore[misc]
+                status, by = in_fork(partial(run, mutant), mutant["timeout"])
             if status == NOT_REPLACED:
                 continue  # pytest has to start anew for it
             verdict = {"number": mutant["number"], "text": mutant["text"], "caught": status != SURVIVED, "by": by}
@@ -252,7 +253,7 @@ class FirstFailure:
             os.write(self.writer, report.nodeid.encode())
 
 
-def start_anew(mutant: dict[str, Any], writer: int) -> int:
+def run_pytest(mutant: dict[str, Any], writer: int) -> int:
     """Run the tests of a mutant by a pytest that imports the package anew."""
     options = sys.argv[1:]
     done = pytest.main([*options, "-x", *mutant["tests"]], plugins=[FirstFailure(writer)])
@@ -274,4 +275,4 @@ if __name__ == "__main__":
         with contextlib.suppress(Exception):
             importlib.import_module(name)
     assert not any(name.startswith("magnetosuture_thread") for name in sys.modules)
-    judge_all(start_anew)
+    judge_all(run_pytest)

@@ -67,7 +67,7 @@ def test_where_arming_cannot_be_recorded_it_does_not_arm(system, tmp_path: Path)
     assert "stop_file" in system.latch.fault
 
 
-def test_it_does_not_arm_unless_it_was_asked_to(system):
+def test_it_arms_only_on_request(system):
     system.latch.activate()
     for asked in (False, True):
         if asked:

@@ -436,7 +436,7 @@ def test_the_host_gets_whether_an_operator_or_a_script_jogs(is_browser: bool, au
     run(test)
 
 
-def test_who_says_something_else_first_is_told_why_the_connection_ends(caplog: pytest.LogCaptureFixture):
+def test_a_first_message_other_than_hello_closes_the_connection_with_the_reason(caplog: pytest.LogCaptureFixture):
     async def test(here: Console) -> None:
         socket = await here.connect()
         await socket.send_str('{"type": "acquire_control"}')
@@ -500,7 +500,7 @@ def test_stopping_the_server_gives_up_requests_that_are_not_answered():
     asyncio.run(test())
 
 
-def test_a_page_without_the_token_is_told_whether_it_gave_a_wrong_one():
+def test_the_reason_distinguishes_a_missing_token_from_a_wrong_one():
     async def test(here: Console) -> None:
         for token, refusal in (("", ""), ("wrong", "the token is wrong"), (TOKEN, "")):
             page = await here.page(token)

@@ -213,7 +213,7 @@ def test_clearance_is_that_of_the_closest_point_from_wall_and_shapes():
     assert needle_filter(post).clearance(tail, heading) == pytest.approx(0.002)
 
 
-def test_a_dish_with_hardly_any_room_is_taken():
+def test_a_dish_barely_larger_than_the_needle_is_accepted():
     NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP + 1e-6)), keep_out=KEEP, needle_length=LENGTH)
     with pytest.raises(ConfigurationError, match="room for the needle"):
         NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP - 1e-6)), keep_out=KEEP, needle_length=LENGTH)
