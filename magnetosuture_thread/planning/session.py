@@ -221,6 +221,9 @@ class ProcedureSession:
         self._pose = stamp, tail, heading
         if executor is None or planner is None or not self.is_active:
             return None
+        if executor.path is None and not self._by_person:
+            # The needle has not been moved yet: what is found only now was there when a person began.
+            self.known.accept_disturbances()
         output = executor.update(stamp, tail, heading, self.known.condition(now))
         self._progress = output.progress
         if self.is_running:

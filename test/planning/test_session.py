@@ -157,6 +157,19 @@ def test_a_plan_moves_nothing_and_is_begun_by_an_act_of_its_own():
     assert 0.01 < run.status.clearance < 0.0175
 
 
+def test_a_force_that_is_found_before_the_needle_is_moved_was_there_when_a_person_began():
+    run = session()
+    run.plan(far(), 0.0)
+    run.resume()
+    run.known.on_estimate(0.0, {0.06: "held at 10 mm"}, thread)
+    velocities = [run.on_pose(0.1 + 0.05 * k, TAIL, EAST, 0.1 + 0.05 * k) for k in range(4)]
+    assert velocities[-1] is not None
+    assert velocities[-1].any()
+    run.known.on_estimate(0.0, {0.06: "held at 10 mm", 0.3: "held at 30 mm"}, thread)
+    run.on_pose(0.3, TAIL, EAST, 0.3)
+    assert run.status.reason == "an unmodelled contact: the thread is held at 30 mm"
+
+
 def test_who_paused_decides_whether_it_goes_on_by_itself():
     run = session()
     run.plan(far(), 0.0)
