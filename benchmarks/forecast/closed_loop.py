@@ -133,6 +133,8 @@ def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict
     first = times[np.argmax(commands.any(axis=1))]  # nothing moves before
     last = record.frame_times[-1] - horizon - made.step
     possible = [start for start in record.starts if first <= start.pose.stamp <= last]
+    if not possible:
+        raise ValueError(f"{name}: the needle did not move for {horizon:g} s")
     errors, needle, moved = [], [], []
     for index in np.random.default_rng(seed).integers(0, len(possible), moments):
         start = possible[index]
@@ -140,6 +142,8 @@ def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict
         middles = begin + made.step * (np.arange(steps) + 0.5)
         taken = commands[np.searchsorted(times, middles, side="right") - 1]
         forecast = made.forecast(start, taken, horizon, slowed=slowed)
+        if forecast.problem:
+            continue  # it ends before the horizon, and is counted
         tail, thread = record.truth(begin + made.step * len(forecast.filtered), setup.model.segments)
         _, before = record.truth(begin, setup.model.segments)
         errors.append(float(np.linalg.norm(forecast.vertices[-1] - thread, axis=1).mean()))
@@ -149,6 +153,7 @@ def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict
     return {
         "loop": name,
         "forecasts": moments,
+        "without_solution": moments - len(errors),
         "horizon_s": horizon,
         "step_s": made.step,
         "duration_s": float(record.frame_times[-1] - first),

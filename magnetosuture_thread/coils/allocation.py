@@ -29,9 +29,10 @@ DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
-# 1/s and rad: in which the error grows while the pose is extrapolated. In a crossing of a coil's axis large currents
-# against a pull are an unstable balance: a needle beside its place turns with the field there, and is thrown farther.
-ERROR_GROWTH, MAX_HEADING_ERROR = 25.0, 0.2
+# That error grows exponentially with the pose's age, at this rate [1/s] and up to this bound [rad]. In a crossing of a
+# coil's axis large currents against a pull are an unstable balance: a needle beside its place turns with the field
+# there, and is thrown farther.
+ERROR_GROWTH, MAX_HEADING_ERROR = 30.0, 0.2
 HEADING_STEP = 0.01  # rad; for the derivative by the heading
 COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
@@ -127,10 +128,10 @@ class CoilAllocation:
     against the remaining drift until it moves at a constant angle to its path. A zero velocity gives zero currents.
 
     Where a slip is compensated, what errors of the coils (`COIL_ERROR`) and of the heading would do to drift and
-    direction counts too; that of the heading is `HEADING_ERROR` exp(`ERROR_GROWTH` age), as a needle against a pull is
-    in an unstable balance close to a coil's axis. Then omega alone follows the command, not the sum of both terms, so
-    that the needle turns as commanded also where it slips; and the field along it may fall to `MIN_ALIGNING_SHARE` B_0,
-    not below.
+    direction counts too; that of the heading is min(`HEADING_ERROR` exp(`ERROR_GROWTH` age), `MAX_HEADING_ERROR`), as a
+    needle against a pull is in an unstable balance close to a coil's axis. Then omega alone follows the command, not
+    the sum of both terms, so that the needle turns as commanded also where it slips; and the field along it may fall to
+    `MIN_ALIGNING_SHARE` B_0, not below.
 
     Source: none.
 
@@ -185,7 +186,7 @@ class CoilAllocation:
             max_change: maximum change of each current [A]; not applied to a zero velocity.
             disturbance: measured; the currents give the opposite of its drift and turn the field by the opposite of its
                 angle, while `velocity` holds the rest. None where nothing is measured.
-            age: of the pose, over which it is extrapolated [s].
+            age: time since the pose was measured [s].
         """
         if not np.any(velocity):
             return self.zero()
@@ -216,7 +217,8 @@ class CoilAllocation:
             # the needle takes large currents whose fields cancel each other, and their errors do not.
             turned = lever / CORRECTION_TIME * (n @ mean) / (MIN_ALIGNING_SHARE * self._field)
             # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
-            error = min(MAX_HEADING_ERROR, HEADING_ERROR * math.exp(ERROR_GROWTH * age))
+            growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
+            error = HEADING_ERROR * math.exp(growth)
             misaligned = error / HEADING_STEP * (self._drifting(tail, heading, HEADING_STEP) - drifting)
             effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
         system = np.vstack(

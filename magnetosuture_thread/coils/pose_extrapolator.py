@@ -190,7 +190,8 @@ class PoseExtrapolator:
         if self._extrapolated is None or self._accepted is None or self.stale_reason(now, arrival):
             return None
         self._extrapolate(self._velocity, now)
-        return replace(self._extrapolated, age=max(0.0, now - self._accepted.stamp))
+        # By the worse of both, as `stale_reason`: the stamps' clock may be ahead, or be set back.
+        return replace(self._extrapolated, age=max(0.0, now - self._accepted.stamp, arrival - self._arrival))
 
     def _check_plausible(self, measured: _Measured) -> None:
         """Reject an implausible pose; see the class."""

@@ -49,8 +49,12 @@ class NeedleDrag:
             if not (math.isfinite(value) and value > 0.0):
                 raise ConfigurationError(f"needle drag {name}", value, "a positive number")
 
-    def numbers(self, thread: Thread) -> NDArray[np.float64]:
+    def numbers(self, thread: Thread, learned: Thread | None = None) -> NDArray[np.float64]:
         """Return what compiled code takes, see `RolloutModel`.
+
+        Args:
+            thread: with which `along` was measured.
+            learned: that is driven, as the estimator has learned it; None for the same.
 
         Raises:
             ConfigurationError: the thread's part is not less than the whole.
@@ -58,5 +62,6 @@ class NeedleDrag:
         part = thread.medium.drag_along * thread.length if self.thread is None else self.thread
         if not 0.0 <= part < self.along:
             raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
-        whole = thread.medium.drag_across * thread.length
+        driven = thread if learned is None else learned
+        whole = driven.medium.drag_across * driven.length
         return np.array([self.along, self.along - part, self.across, self.turning, whole])

@@ -288,12 +288,12 @@ class ThreadForecaster:
         return self._result(start, record, commands, code, done)
 
     def _model(self, start: ForecastStart, slowed: bool) -> RolloutModel:
-        """Return what stays the same in a forecast, with the thread of its start."""
+        """Return the constants of a forecast that starts with this thread."""
         model, thread = self._slowed if slowed else self._unslowed, start.thread
         if thread is None or thread is self.thread:
             return model
         model = model._replace(rod=self._formulation.rod_of(thread))
-        return model if self._drag is None else model._replace(drag=self._drag.numbers(thread))
+        return model if self._drag is None else model._replace(drag=self._drag.numbers(self.thread, thread))
 
     def _result(self, start: ForecastStart, record: RolloutRecord, commands: Points, code: int, done: int) -> Forecast:
         problem = "" if code == ENDED else f"the step at {done * self.step:.3f} s has no solution within the tolerance"
@@ -366,7 +366,8 @@ class ThreadForecaster:
             raise InvalidInputError("commands", f"shape {given.shape}", f"shape (2,) or ({steps}, 2) [m/s]")
         if not np.isfinite(given).all():
             raise InvalidInputError("commands", "not finite", "finite velocities [m/s]")
-        return np.ascontiguousarray(np.broadcast_to(given, (steps, 2)))
+        # A copy, as views of broadcasts are read-only, which is another type for compiled code.
+        return np.array(np.broadcast_to(given, (steps, 2)), order="C")
 
     def _attached(self, pose: NeedlePose) -> Vector:
         (x, y), (along, left) = pose.heading, self._slowed.offset

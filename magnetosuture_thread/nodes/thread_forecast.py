@@ -34,12 +34,12 @@ from magnetosuture_thread.nodes.node import PackageNode
 MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
 MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
 MIN_SPEED, MAX_SPEED = 1e-5, 0.1  # m/s
-LONG_AGO = 2**62  # ns; beyond any stamp that a message can hold
+NEVER = 2**62  # ns before; earlier than any stamp that a message can hold
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
 
 
-class HeldCommand(NamedTuple):
-    """What is forecast, from which start, for the message of a stamp [ns]."""
+class ForecastTask(NamedTuple):
+    """One forecast to make: the held command, where it starts, and the stamp of its message [ns]."""
 
     forecaster: ThreadForecaster
     stamp: int
@@ -52,8 +52,8 @@ class HeldCommand(NamedTuple):
 class ThreadForecasts:
     """Publishes a forecast of every estimate, where the parameter `forecast_horizon` asks for it.
 
-    It is made in a thread of its own, so that no pose waits for one; an estimate that comes while a forecast is made
-    takes the place of one that still waits. A service answers what would happen along a path instead.
+    It is made in a thread of its own, so that the node does not wait for it. While a forecast is made, only the newest
+    estimate is kept for the next one. A service answers what would happen along a path instead.
     What is held is the command that the coil bridge follows, of `needle/filter_state`; without one the needle rests.
 
     Args:
@@ -64,7 +64,7 @@ class ThreadForecasts:
     def __init__(self, node: PackageNode, session: ThreadSession) -> None:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
-        self._started = -LONG_AGO  # stamp of the last estimate that is forecast [ns]
+        self._started = -NEVER  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
         self._published = topics.FORECAST.publisher(node)
@@ -72,7 +72,7 @@ class ThreadForecasts:
         topics.FILTER_STATE.subscribe(node, self.on_filter_state)
         node.create_service(ForecastPath, FORECAST_PATH, self.on_path)
         self._forecaster()
-        self._waiting: SimpleQueue[HeldCommand | None] = SimpleQueue()
+        self._waiting: SimpleQueue[ForecastTask | None] = SimpleQueue()
         self._error: Exception | None = None
         self._worker = Thread(target=self._work, name="forecasts", daemon=True)
         self._worker.start()
@@ -89,8 +89,8 @@ class ThreadForecasts:
         except InvalidInputError as error:
             self._node.refuse(error)
 
-    def start(self, result: PredictionResult, pose: NeedlePose) -> None:
-        """Begin the forecast from an estimate, which is published when it is made.
+    def request(self, result: PredictionResult, pose: NeedlePose) -> None:
+        """Queue the forecast from an estimate; the worker thread makes and publishes it.
 
         Args:
             result: of the pose.
@@ -103,8 +103,8 @@ class ThreadForecasts:
             raise self._error
         if result.estimate is None or not result.estimate.converged:
             return
-        self._last, settings = (result, pose), self._session.settings
-        forecaster, elapsed = self._forecaster(), abs(result.stamp - self._started)  # either way if time is set back
+        forecaster, settings = self._forecaster(), self._session.settings
+        self._last, elapsed = (result, pose), abs(result.stamp - self._started)  # either way if time is set back
         if forecaster is None or elapsed < 1_000_000_000 * settings.forecast_period:
             return
         self._started = result.stamp
@@ -113,7 +113,7 @@ class ThreadForecasts:
             _, commanded, filtered, source = self._command
         start = ForecastStart.of_estimate(result.estimate, pose, filtered)
         slowed = source == "operator" or settings.friction_feedback == "all"
-        self._waiting.put(HeldCommand(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
+        self._waiting.put(ForecastTask(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
 
     def _work(self) -> None:
         while self._error is None and (command := self._waiting.get()) is not None:
@@ -123,7 +123,7 @@ class ThreadForecasts:
             except Exception as error:
                 self._error = error
 
-    def _publish(self, command: HeldCommand) -> None:
+    def _publish(self, command: ForecastTask) -> None:
         try:
             forecast = command.forecaster.forecast(
                 command.start, command.commanded, command.horizon, slowed=command.slowed
@@ -164,7 +164,7 @@ class ThreadForecasts:
         settings, scene = self._session.settings, self._session.scene
         if self._made is not None and self._made[0] is settings and self._made[1] is scene:
             return self._made[2]
-        self._made, forecaster = (settings, scene, None), None
+        self._made, self._last, forecaster = (settings, scene, None), None, None
         if scene is not None:
             forecaster = make_forecaster(settings, scene, workers=1)
             forecaster.warm_up()

@@ -101,7 +101,7 @@ class ThreadModelNode(PackageNode):
         result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
-            self._forecasts.start(result, read)
+            self._forecasts.request(result, read)
 
     def on_measured_thread_message(self, data: bytes) -> None:
         """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags.

@@ -30,12 +30,12 @@ ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as
 PULL_DECAY = 1.0  # s; in which the peak of a pull falls to 1 / e
 TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, from which on the needle tacks
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
-CROSSING_TIME = (
-    0.3  # s; after the course has changed to the other side of an axis, in which the needle is turned faster
-)
+# s; after the course has changed to the other side of an axis, in which the needle is turned faster
+CROSSING_TIME = 0.3
 CROSSING_GAIN, MAX_CROSSING_RATIO = 12.0, 4.0  # 1/s, and of the allowed speed: in place of TURN_GAIN, MAX_TURN_RATIO
-LEAD_WAY = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side that it is thrown from
-THROWN_FOR, LEAD_SHARE = 0.1, 0.4  # s; in a crossing; of the leeway here and there, that it is kept aside at the most
+LEAD_LOOKAHEAD = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side it is thrown from
+THROWN_FOR = 0.1  # s; for which the pull is not compensated in a crossing
+LEAD_SHARE = 0.4  # of the smallest leeway up to a crossing, that the needle is kept aside before it at the most
 MIN_TACK_TIME = 1.0  # s; after a crossing, in which the needle does not tack
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
@@ -77,11 +77,11 @@ class PathTracker:
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
     crosses, or while the needle is far off its path to the wrong side, as a ship tacks, but not within `MIN_TACK_TIME`
     of a crossing. In a crossing the needle is turned faster, as nothing compensates the pull meanwhile: it is thrown
-    aside by about d times `THROWN_FOR`. Before one, the path is followed as far to the other side. All of
-    theta - theta_p stays within what half of the path's leeway allows. Where d is more than the coils compensate at
-    the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower, down to
-    `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction are raised
-    by as much as the bridge slows them, within the same limits.
+    aside by about `THROWN_FOR` times the present d. Before one, the path is followed as far to the other side, without
+    the integral. All of theta - theta_p stays within what half of the path's leeway allows. Where d is more than the
+    coils compensate at the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower,
+    down to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction
+    are raised by as much as the bridge slows them, within the same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -153,7 +153,7 @@ class PathTracker:
         course = min(allowed, max(-allowed, course))
         # Close to an axis less of the pull is measured, so its peak is remembered for a while.
         self._pull = max(abs(drift), self._pull * math.exp(-interval / PULL_DECAY))
-        off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, across)))
+        off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, across - lead)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
         waits = hold or abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
@@ -167,8 +167,8 @@ class PathTracker:
                 return TrackingCommand(np.zeros(2), self.path.length, size, True)
             self._stops.pop(0)
             self._integral = -self._integral  # the same slip asks for the other direction when driven back
-        if not waits:
-            self._integral += INTEGRAL_GAIN * interval * driven * (across - lead)
+        if not waits and not lead:  # which the integral would add to
+            self._integral += INTEGRAL_GAIN * interval * driven * across
         turn += course
         raised = 1.0 / max(slowdown, MIN_SLOWDOWN)
         limit = MAX_ALONG_RATIO * speed
@@ -202,11 +202,11 @@ class PathTracker:
         return max(course, kept - planned) if self._side > 0.0 else min(course, -kept - planned)
 
     def _lead(self, direction: float, drift: float) -> float:
-        """Return how far to the left of the path the next crossing of an axis throws the needle [m]; 0 far from one."""
+        """Return the displacement to the left that is expected in the next crossing of an axis [m]; 0 far from one."""
         if abs(drift) <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
             return 0.0
         leeway = self.leeway
-        for way in np.linspace(self.travel, min(self.path.length, self.travel + LEAD_WAY), 8)[1:]:
+        for way in np.linspace(self.travel, min(self.path.length, self.travel + LEAD_LOOKAHEAD), 8)[1:]:
             leeway = min(leeway, self.path.leeway_at(way))
             ahead = self.path.at(way)[1]
             for axis in self._axes:

@@ -362,8 +362,9 @@ class NeedleSafetyFilter:
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
         key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
-        if self._pose is not None and self._pose[0] == key:
-            return self._pose[1]
+        last = self._pose  # read once, as forecasts have the same filter in a thread of their own
+        if last is not None and last[0] == key:
+            return last[1]
         size = math.hypot(key[2], key[3])
         if not (math.isfinite(size) and size > 0.0 and math.isfinite(key[0]) and math.isfinite(key[1])):
             raise InvalidInputError("pose", list(key), "finite numbers and a direction")

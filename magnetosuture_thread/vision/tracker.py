@@ -52,13 +52,14 @@ MIN_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the
 
 @dataclass(frozen=True)
 class _Pose:
-    """A needle that was seen, in the dish frame."""
+    """A needle that was seen, in the dish frame; its direction is clear if it was in one frame of those so far."""
 
     time: float
     tail: np.ndarray
     angle: float
     velocity: np.ndarray
     turn_rate: float
+    direction_is_clear: bool
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
         """Return tail and heading angle predicted with constant velocity."""
@@ -311,9 +312,12 @@ class VisionTracker:
     def _as_before(self, needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> MeasuredNeedle:
         """Return a needle the other way round if it lies where the last one was, and its shape does not rule that out.
 
-        Between two frames it cannot turn round, and a thread that touches the tip makes that look like a tail.
+        Between two frames it cannot turn round, and a thread that touches the tip makes that look like a tail. But
+        where no frame has been clear yet, the first ones may be those that were wrong.
         """
-        if self._last is None or not needle.heading_known or needle.is_clear:
+        if self._last is None or not self._last.direction_is_clear:
+            return needle
+        if needle.direction_is_clear or not needle.heading_known:
             return needle
         other = needle.reversed()
         fits = [self._fits(_pose(each, picture, view, time), self._last) for each in (needle, other)]
@@ -355,7 +359,8 @@ class VisionTracker:
             turn_rate = before.turn_rate + SMOOTHING * (turned / after - before.turn_rate)
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
-        self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate)
+        direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
+        self._last = _Pose(pose.time, pose.tail, pose.angle, velocity, turn_rate, direction_is_clear)
         self._anew = []
 
     def _region(self, image: np.ndarray, view: DishView, time: float) -> tuple[int, int, int, int]:
@@ -381,7 +386,7 @@ def _enlarged(track: Track, factor: int) -> Track:
 def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
     heading = view.directions_to_dish(needle.direction_px)
     tail = view.to_dish(needle.tail_edge_px + picture.origin)
-    return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0)
+    return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear)
 
 
 def _in_whole(part: Picture, needle: MeasuredNeedle, whole: Picture) -> tuple[Picture, MeasuredNeedle]:

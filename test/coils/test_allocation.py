@@ -168,3 +168,5 @@ def test_close_to_an_axis_the_drift_depends_less_on_the_heading_the_older_the_po
         assert drifts[1] == pytest.approx(found.drift, rel=1e-9)
         wrong.append(abs(drifts[0] - drifts[1]))
     assert wrong[2] < 0.95 * wrong[1] < 0.95 * wrong[0]
+    one, other = (made.allocate(1e-3 * heading, tail, heading, disturbance=pulled, age=age) for age in (1.0, 1e6))
+    assert (one.currents == other.currents).all(), "the error is bounded"

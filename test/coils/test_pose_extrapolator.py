@@ -41,6 +41,13 @@ def test_a_pose_is_carried_along_the_needle():
     assert pose.age == pytest.approx(0.04)  # since the stamp
 
 
+def test_the_age_of_a_pose_goes_by_stamp_or_arrival_whichever_is_longer_ago():
+    for now, arrival in ((1.06, 50.02), (0.98, 50.06)):  # late, or by a clock that is ahead
+        pose = extrapolator_at_origin().pose(now, arrival)
+        assert pose is not None
+        assert pose.age == pytest.approx(0.06)
+
+
 def test_a_velocity_across_turns_the_needle_about_its_middle():
     extrapolator = extrapolator_at_origin()
     extrapolator.apply_velocity(np.array([0.0, 0.0035]), 1.0, 48.95 + 1.0)  # one length in two seconds: 1 rad/s

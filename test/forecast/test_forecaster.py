@@ -24,6 +24,7 @@ from magnetosuture_thread import (
     ThreadPredictor,
 )
 from magnetosuture_thread.forecast import NeedleDrag
+from magnetosuture_thread.forecast.rollout import roll_out
 from magnetosuture_thread.model.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.scene import Dish
@@ -178,6 +179,23 @@ def test_the_thread_of_a_start_is_forecast_in_place_of_the_own(forecaster: Threa
     before = one.forecast(start, UP, HORIZON)
     assert np.abs(learned.vertices[-1] - before.vertices[-1]).max() > 1e-5
     assert same(before, one.forecast(start, UP, HORIZON)), "it is of that start alone"
+
+
+def test_the_needle_s_own_drag_does_not_depend_on_what_is_learned_of_the_thread():
+    own, drag = thread(), NeedleDrag(0.0255, 0.033, 1.6e-7)
+    held = replace(own, medium=replace(own.medium, drag_along=30.0 * own.medium.drag_along, drag_across=0.2))
+    before, learned = drag.numbers(own), drag.numbers(own, held)
+    assert (learned[:4] == before[:4]).all()
+    assert learned[4] == pytest.approx(0.2 * own.length)
+
+
+def test_what_is_compiled_to_warm_up_is_what_every_forecast_runs(forecaster: ThreadForecaster):
+    """Another type of commands would be compiled while poses come, for a minute at the first start on a machine."""
+    forecaster.warm_up()
+    start, steps = forecaster.straight(START), round(HORIZON / forecaster.step)
+    for commands in (UP, np.broadcast_to(UP, (steps, 2)), np.tile(UP, (steps, 1)).tolist()):
+        forecaster.forecast(start, np.asarray(commands), HORIZON)
+    assert len({signature[3] for signature in roll_out.signatures}) == 1
 
 
 def same(one: Forecast, other: Forecast) -> bool:

@@ -111,7 +111,7 @@ def test_an_unexpected_error_of_a_forecast_is_raised_by_the_next_estimate(graph:
     forecasts = bench.node._forecasts
     forecasts._worker.join(60.0)
     with pytest.raises(ZeroDivisionError, match="broken"):
-        forecasts.start(*forecasts._last)
+        forecasts.request(*forecasts._last)
 
 
 def test_estimates_within_the_period_after_one_that_is_forecast_are_not(graph: Any, monkeypatch: pytest.MonkeyPatch):

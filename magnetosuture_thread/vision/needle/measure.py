@@ -173,7 +173,7 @@ def _checked(
         heading_known=is_known,
         size_measured=is_measured,
         tail_shift_px=(tail_shift(steel, fit) or 0.0) if is_known else 0.0,
-        is_clear=is_clear,
+        direction_is_clear=is_clear,
     )
 
 

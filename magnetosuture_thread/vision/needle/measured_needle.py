@@ -8,7 +8,7 @@ import numpy as np
 
 from magnetosuture_thread.vision.needle.arc import Arc
 
-REVERSED_PX = 3.0  # deviation along the axis of a tail where a tip was fitted
+REVERSED_PX = 3.0  # px; standard deviation, along the axis, of a tail placed where a tip was fitted
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MeasuredNeedle:
         heading_known: whether it is told which end is the tail.
         size_measured: whether the length was measured, and not only known before.
         tail_shift_px: how far along the axis the tail's edge lies from where the tail is drawn [px]; see `tail_shift`.
-        is_clear: whether a needle that is drawn the other way round fits much worse.
+        direction_is_clear: whether the needle fits much worse the other way round.
     """
 
     arc: Arc
@@ -37,7 +37,7 @@ class MeasuredNeedle:
     heading_known: bool = True
     size_measured: bool = False
     tail_shift_px: float = 0.0
-    is_clear: bool = True
+    direction_is_clear: bool = True
 
     def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
