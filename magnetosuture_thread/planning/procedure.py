@@ -27,6 +27,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_procedure_file
 
 MAX_GOALS = 100
+HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
 KEYS = {"setup", "scene", "goals", "limits"}
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
 
