@@ -75,8 +75,8 @@ def _check_gap(planner: NeedlePlanner, where: str, goal: PassThrough, required: 
         raise ConfigurationError(f"{where}.between", list(goal.between), expected)
     gaps = planner.gaps(goal)
     if not gaps:
-        x, y = min(between, key=lambda gap: gap.width).along
-        expected = f"one along a gap between them, as [{x:.2f}, {y:.2f}] or [{-x:.2f}, {-y:.2f}]"
+        x, y = np.round(min(between, key=lambda gap: gap.width).along, 2) + 0.0
+        expected = f"one along a gap between them, as [{x:g}, {y:g}] or [{0.0 - x:g}, {0.0 - y:g}]"
         raise ConfigurationError(f"{where}.direction", list(goal.direction), expected)
     width = max(gap.width for gap in gaps)
     if width <= 2.0 * required:

@@ -44,7 +44,7 @@ BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS = 6  # of one goal, after which it is given up
 MAX_MISSES = 6  # of the place of one goal by the end of a path, after which it is given up
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
-PROGRESS = 2e-3  # m; on a new path, after which those before count no more
+PROGRESS = 2e-3  # m; that is left less to go than ever before, after which the plans before count no more
 WRAPPED = 0.02  # rad; of a wrap may be left
 MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
@@ -118,11 +118,10 @@ class ProcedureExecutor:
 
     A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
     known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
-    that rests for `REST_TIME` while it is commanded backs off, and its goal is planned anew; one that is off its path
-    by more than `OFF_PATH` too. Where a path has ended off the place of its goal, as a turn at its end has thrown the
-    needle aside, the next path ends as far to the other side of the place. After `MAX_REPLANS` without progress, or
-    `MAX_MISSES` of its place, the goal is given up, and the needle is at rest; so is a procedure that has waited for
-    the thread for too long.
+    that gets no further while it is commanded (`RestDetector`) backs off, and its goal is planned anew; one that is off
+    its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a turn throws the needle aside,
+    is followed by one that ends as far to the other side. After `MAX_REPLANS` without progress, or `MAX_MISSES`, the
+    goal is given up, and the needle is at rest; so is a procedure that has waited for the thread for too long.
 
     Pure: time comes in with the poses.
 
@@ -151,7 +150,7 @@ class ProcedureExecutor:
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._begin: Vector | None = None
         self._rest = RestDetector()
-        self._replans, self._misses = 0, 0
+        self._replans, self._misses, self._left = 0, 0, math.inf
         self._aim = np.zeros(2)  # from the goal's place to where its path is to end [m]
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
         self._swept = 0.0  # of the goal's wrap, so far [rad]
@@ -256,25 +255,26 @@ class ProcedureExecutor:
         assert self._tracker is not None
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
             return self._next_goal()
-        if self._tracker.travel > PROGRESS:
-            self._replans = 0
+        assert self.path is not None
+        if (left := self.path.length - self._tracker.travel) < self._left - PROGRESS:
+            self._replans, self._left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
         if self._local is None:
             command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
         else:
             command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
         if command.done:
-            return self._at_end(stamp, goal, middle, angle)
-        assert self.path is not None
+            return self._at_end(goal, middle)
         if self._reached + 1 < len(self.path.ends) and command.travel >= self.path.ends[self._reached]:
             self._begin_goal(self.goal + 1)
             self._reached += 1
-        rests = self._rest.update(stamp, middle, angle, self.planner.lever, bool(command.velocity.any()))
+        commanded = bool(command.velocity.any())
+        rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             return self._replan(stamp, command.velocity if rests else np.zeros(2))
         return self._output(command.velocity)
 
-    def _at_end(self, stamp: float, goal: Goal, middle: Vector, angle: float) -> ProcedureOutput:
+    def _at_end(self, goal: Goal, middle: Vector) -> ProcedureOutput:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
         if isinstance(goal, Tighten):
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
@@ -353,7 +353,7 @@ class ProcedureExecutor:
         return self._output(np.zeros(2))
 
     def _begin_goal(self, goal: int) -> None:
-        self.goal, self._replans, self._misses, self._aim = goal, 0, 0, np.zeros(2)
+        self.goal, self._replans, self._misses, self._left, self._aim = goal, 0, 0, math.inf, np.zeros(2)
         self._swept, self._bearing = 0.0, None
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:

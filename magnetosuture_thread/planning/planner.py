@@ -42,7 +42,16 @@ GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
 
 
 class PlanningError(MagnetosutureError):
-    """There is no way to a goal."""
+    """There is no way to a goal.
+
+    Args:
+        problem: between which places.
+        goal: its index, among those that were to be planned.
+    """
+
+    def __init__(self, problem: str, goal: int = 0) -> None:
+        super().__init__(problem)
+        self.goal = goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +158,8 @@ class NeedlePlanner:
                 begin = np.array([[*middle, states[0, 2] + math.remainder(angle - states[0, 2], 2.0 * math.pi)]])
                 states = np.vstack([begin, states])
                 return smooth_path(states, np.array(ends), self.lever, self.body, required, margin, self.near)
-        where = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm"
-        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}")
+        where, kept = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm", f"{1e3 * required:.3g} mm around it"
+        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}, with {kept}", len(ends))
 
     def standing_path(self, middle: Vector, angle: float, limits: ProcedureLimits) -> BodyPath:
         """Return a path of one pose, in which the needle stays, with the leeway that it has there."""
@@ -172,7 +181,10 @@ class NeedlePlanner:
         index = 0
         while index < len(procedure.goals):
             goals = chain(procedure, index)
-            paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+            try:
+                paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+            except PlanningError as error:
+                raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
             middle, angle = paths[-1].middles[-1], float(paths[-1].angles[-1])
             index += len(goals)
         return tuple(paths)
