@@ -133,9 +133,20 @@ def read_procedure_setup(procedure: Procedure, name: str = "") -> Setup:
         name: of another setup than the procedure's, or the path of its file.
 
     Raises:
-        ConfigurationError: neither names a setup; or see `read_setup` and `read_scene`.
+        ConfigurationError: neither names a setup, a goal is to be pursued faster than the bridge allows, or the dish
+            reaches beyond the coils; or see `read_setup` and `read_scene`.
     """
     if not (name or procedure.setup):
         raise ConfigurationError("setup", "nothing", f"a setup, as the procedure {procedure.name} names none")
     setup = read_setup(name or procedure.setup)
-    return setup.with_scene(read_scene(procedure.scene)) if procedure.scene else setup
+    for index, limits in enumerate(procedure.limits):
+        if limits.speed > setup.coils.max_speed:
+            expected = f"at most coil_bridge.max_speed of {setup.name}, {setup.coils.max_speed:g} m/s"
+            raise ConfigurationError(f"goals[{index}].limits.speed", limits.speed, expected)
+    if not procedure.scene:
+        return setup
+    scene, reach = read_scene(procedure.scene), setup.coils.reach
+    if scene.dish.radius > reach:
+        expected = f"at most {2e3 * reach:.3g} mm, which the coils of {setup.name} leave"
+        raise ConfigurationError("scene.dish.diameter", f"{1e3 * scene.dish.diameter:.3g} mm", expected)
+    return setup.with_scene(scene)

@@ -62,7 +62,10 @@ class RunLimits:
         )
 
     def broken(self, found: RunFigures) -> dict[str, str]:
-        """Return the limits that a run did not keep: by the name of the figure, what was found and what is allowed."""
+        """Return the limits that a run did not keep: by the name of the figure, what was found and what is allowed.
+
+        A run without a path has no ideal time, and has failed for that.
+        """
         clearance, ratio = found.min_needle_clearance_m, MAX_TIME_RATIO * found.ideal_time_s
         checks = {
             "min_needle_clearance_m": (
@@ -85,6 +88,6 @@ class RunLimits:
                 found.max_friction_nodes > self.friction_nodes,
                 f"{found.max_friction_nodes} nodes under friction ({self.friction_nodes} allowed)",
             ),
-            "time_s": (found.time_s > ratio, f"{found.time_s:.0f} s ({ratio:.0f} allowed)"),
+            "time_s": (found.time_s > ratio > 0.0, f"{found.time_s:.0f} s ({ratio:.0f} allowed)"),
         }
         return {name: words for name, (is_broken, words) in checks.items() if is_broken}

@@ -66,6 +66,28 @@ class RunResult:
         return {**found, **asdict(self.figures)}
 
 
+def check_run(procedure: Procedure, setup: Setup, variation: Variation) -> None:
+    """Refuse a procedure for which there is no way from where a run begins.
+
+    Args:
+        procedure: to run.
+        setup: what the nodes believe.
+        variation: the truth.
+
+    Raises:
+        ConfigurationError: it does not fit the scene.
+        PlanningError: there is no way to a goal.
+    """
+    x, y, angle = variation.setup.rig.needle_start
+    planner = _planner(setup)
+    planner.plan_all(procedure, *planner.pose(np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])))
+
+
+def _planner(setup: Setup) -> NeedlePlanner:
+    kinematics, settings = setup.coils.needle().kinematics, setup.coils
+    return NeedlePlanner(setup.scene, kinematics, settings.keep_out, setup.model.thread_length, settings.coil_angles)
+
+
 def run_procedure(
     procedure: Procedure,
     setup: Setup,
@@ -90,8 +112,7 @@ def run_procedure(
     Raises:
         ConfigurationError: the procedure does not fit the scene.
     """
-    kinematics, keep_out = setup.coils.needle().kinematics, setup.coils.keep_out
-    planner = NeedlePlanner(setup.scene, kinematics, keep_out, setup.model.thread_length, setup.coils.coil_angles)
+    planner, keep_out = _planner(setup), setup.coils.keep_out
     planner.check(procedure)
     predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
     pilot = _Pilot(procedure, planner, predictive)
@@ -156,11 +177,12 @@ def run_procedure(
 
 
 def _planned_length(executor: ProcedureExecutor, frame: LoopFrame) -> float:
-    """Return the length of the paths from here to the end of the procedure; 0 where there is none [m]."""
+    """Return the length of the paths from here to the end of the procedure [m]; 0, and end it, where there are none."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
     try:
         return sum(path.length for path in executor.plan(frame.tail, heading))
-    except PlanningError:
+    except PlanningError as error:
+        executor.abort(str(error))
         return 0.0
 
 

@@ -44,7 +44,7 @@ def vary(setup: Setup, seed: int) -> Variation:
     start in the wall or a shape is drawn anew.
 
     Raises:
-        ConfigurationError: no start is free.
+        ConfigurationError: no start is free, of needle and thread.
     """
     random = np.random.default_rng([seed, 0])
     rig, scene = setup.rig, setup.scene
@@ -78,4 +78,9 @@ def vary(setup: Setup, seed: int) -> Variation:
         except ConfigurationError:
             continue
         return Variation(seed, replace(setup, rig=drawn).with_scene(scene), gains)
-    raise ConfigurationError("rig_simulator.needle_start", list(rig.needle_start), "a start with room around it")
+    expected = "a start with room around it"
+    try:
+        rig.check_scene(scene)
+    except ConfigurationError as error:  # what is in the way, with the start as it is
+        expected += f": {error.expectation}"
+    raise ConfigurationError("rig_simulator.needle_start", list(rig.needle_start), expected)

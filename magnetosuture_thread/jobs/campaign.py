@@ -15,7 +15,7 @@ from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.campaign.bag import RunBag
 from magnetosuture_thread.campaign.loop import START
 from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
-from magnetosuture_thread.campaign.run import TRACKING, RunResult, run_procedure
+from magnetosuture_thread.campaign.run import TRACKING, RunResult, check_run, run_procedure
 from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.output import whole_folder
@@ -122,12 +122,15 @@ def simulate_campaign(
 
     Raises:
         ConfigurationError: procedure or setup cannot be used, or do not fit each other, or a bag is of no run.
+        PlanningError: there is no way to a goal from where the first run begins.
         BagError: the output exists, or cannot be written.
     """
     procedure = read_procedure(name)
     if not set(bags) <= set(seeds):
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
     used = read_procedure_setup(procedure, setup)
+    if not follower:
+        check_run(procedure, used, vary(used, seeds[0]))
     runs: dict[int, RunResult] = {}
     died: dict[int, str] = {}
     folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}

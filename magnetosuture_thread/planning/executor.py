@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
@@ -19,6 +18,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
+from magnetosuture_thread.planning.rest import RestDetector
 from magnetosuture_thread.planning.tracking import PathTracker
 
 if TYPE_CHECKING:
@@ -40,12 +40,11 @@ class PendingPath(Protocol):
 PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
 """Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
 
-REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
-REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS = 6  # of one goal, after which it is given up
+MAX_MISSES = 6  # of the place of one goal by the end of a path, after which it is given up
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
-PROGRESS = 2e-3  # m; on a new path, after which those before count no more
+PROGRESS = 2e-3  # m; that is left less to go than ever before, after which the plans before count no more
 WRAPPED = 0.02  # rad; of a wrap may be left
 MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
@@ -104,26 +103,6 @@ class ProcedureOutput:
     reason: str = ""
 
 
-@dataclass
-class _Rest:
-    """The last poses of a needle that is commanded."""
-
-    poses: deque[tuple[float, float, float, float]] = field(default_factory=deque)
-
-    def update(self, stamp: float, middle: Vector, angle: float, lever: float, commanded: bool) -> bool:
-        """Return whether the needle has rested for `REST_TIME`, while it was commanded."""
-        if not commanded:
-            self.poses.clear()
-            return False
-        self.poses.append((stamp, float(middle[0]), float(middle[1]), lever * angle))
-        while len(self.poses) > 2 and self.poses[1][0] <= stamp - REST_TIME:
-            self.poses.popleft()
-        first = self.poses[0]
-        if stamp - first[0] < REST_TIME:
-            return False
-        return all(math.dist(first[1:], each[1:]) < REST_WAY for each in self.poses)
-
-
 def plan_now(task: Callable[[], BodyPath]) -> PendingPath:
     """Plan a path here and now."""
     pending: Future[BodyPath] = Future()
@@ -139,9 +118,10 @@ class ProcedureExecutor:
 
     A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
     known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
-    that rests for `REST_TIME` while it is commanded backs off, and its goal is planned anew; one that is off its path
-    by more than `OFF_PATH` too. After `MAX_REPLANS` without progress the goal is given up, and the needle is at rest;
-    so is a procedure that has waited for the thread for too long.
+    that gets no further while it is commanded (`RestDetector`) backs off, and its goal is planned anew; one that is off
+    its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a turn throws the needle aside,
+    is followed by one that ends as far to the other side. After `MAX_REPLANS` without progress, or `MAX_MISSES`, the
+    goal is given up, and the needle is at rest; so is a procedure that has waited for the thread for too long.
 
     Pure: time comes in with the poses.
 
@@ -169,8 +149,9 @@ class ProcedureExecutor:
         self._pending: PendingPath | None = None
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._begin: Vector | None = None
-        self._rest = _Rest()
-        self._replans = 0
+        self._rest = RestDetector()
+        self._replans, self._misses, self._left = 0, 0, math.inf
+        self._aim = np.zeros(2)  # from the goal's place to where its path is to end [m]
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
         self._swept = 0.0  # of the goal's wrap, so far [rad]
         self._bearing: float | None = None
@@ -250,7 +231,7 @@ class ProcedureExecutor:
         elif self._unsure and stamp - self._waits_since > self._max_wait:
             self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
         if self.state is not ProcedureState.RUNNING:
-            self._rest = _Rest()
+            self._rest = RestDetector()
             if self.path is None or not (self._unsure and thread.may_hold):
                 self._holder = None
                 return self._output(np.zeros(2))
@@ -274,34 +255,46 @@ class ProcedureExecutor:
         assert self._tracker is not None
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
             return self._next_goal()
-        if self._tracker.travel > PROGRESS:
-            self._replans = 0
+        assert self.path is not None
+        if (left := self.path.length - self._tracker.travel) < self._left - PROGRESS:
+            self._replans, self._left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
         if self._local is None:
             command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
         else:
             command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
         if command.done:
-            return self._at_end(stamp, goal, middle, angle)
-        assert self.path is not None
+            return self._at_end(goal, middle)
         if self._reached + 1 < len(self.path.ends) and command.travel >= self.path.ends[self._reached]:
             self._begin_goal(self.goal + 1)
             self._reached += 1
-        rests = self._rest.update(stamp, middle, angle, self.planner.lever, bool(command.velocity.any()))
+        commanded = bool(command.velocity.any())
+        rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             return self._replan(stamp, command.velocity if rests else np.zeros(2))
         return self._output(command.velocity)
 
-    def _at_end(self, stamp: float, goal: Goal, middle: Vector, angle: float) -> ProcedureOutput:
+    def _at_end(self, goal: Goal, middle: Vector) -> ProcedureOutput:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
         if isinstance(goal, Tighten):
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
             return self._output(np.zeros(2))
-        if isinstance(goal, GoTo | Withdraw):
-            target = np.array(goal.position if isinstance(goal, GoTo) else goal.to or self._begin)
-            if math.dist(middle, target) > goal.tolerance:
-                return self._replan(stamp, np.zeros(2))
+        if isinstance(goal, GoTo | Withdraw) and math.dist(middle, self._place(goal)) > goal.tolerance:
+            return self._miss(goal, self._place(goal) - middle)
         return self._next_goal()
+
+    def _miss(self, goal: GoTo | Withdraw, off: Vector) -> ProcedureOutput:
+        """Plan anew, to the other side of a goal's place, from which the needle has ended off."""
+        self._misses += 1
+        if self._misses > MAX_MISSES:
+            by = f"{1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
+            self.abort(f"goal {self.goal + 1} is given up: the needle misses its place by {by}, however it is planned")
+            return self._output(np.zeros(2))
+        assert self.path is not None
+        aim, leeway = self._aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
+        self._aim = aim * min(1.0, leeway / max(math.hypot(*aim), 1e-12))
+        self._drop_path()
+        return self._output(np.zeros(2))
 
     def _plan(self, middle: Vector, angle: float) -> bool:
         """Plan from a pose, or go on with that; return whether there is a path to track."""
@@ -310,6 +303,9 @@ class ProcedureExecutor:
             assert self._begin is not None
             left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
             limits = self.procedure.limits[self.goal]
+            if isinstance(goal := goals[0], GoTo | Withdraw):  # the last of its chain
+                x, y = (self._place(goal) + self._aim).tolist()
+                goals = (replace(goal, position=(x, y)) if isinstance(goal, GoTo) else replace(goal, to=(x, y)),)
             task = partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
             self._pending = self._submit(task)
         if not self._pending.done():
@@ -319,9 +315,13 @@ class ProcedureExecutor:
         self._tracker, self._reached = PathTracker(self.path, self.planner.coil_angles), 0
         return True
 
+    def _place(self, goal: GoTo | Withdraw) -> Vector:
+        """Return the place of a goal [m]."""
+        return np.array(goal.position if isinstance(goal, GoTo) else goal.to or self._begin)
+
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
-        self._tracker, self._pending, self._rest = None, None, _Rest()
+        self._tracker, self._pending, self._rest = None, None, RestDetector()
 
     def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
         """Keep the needle where it was when this began, against what pulls it."""
@@ -353,7 +353,7 @@ class ProcedureExecutor:
         return self._output(np.zeros(2))
 
     def _begin_goal(self, goal: int) -> None:
-        self.goal, self._replans = goal, 0
+        self.goal, self._replans, self._misses, self._left, self._aim = goal, 0, 0, math.inf, np.zeros(2)
         self._swept, self._bearing = 0.0, None
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:

@@ -49,6 +49,11 @@ class LatticeGoal(NamedTuple):
     target: NDArray[np.float64]
 
 
+def turn_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return angles within half a turn of 0 [rad]."""
+    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)
+
+
 @compiled
 def _nearness(room: float, required: float, preferred: float) -> float:
     """Return the factor on the cost of a way, by the clearance of the body on it."""

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.checks import check_procedure
 from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, clearance_at, map_clearance
-from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice
+from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice, turn_of
 from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
 from magnetosuture_thread.planning.procedure import (
+    HEADING_TOLERANCE,
     Goal,
     GoTo,
     PassThrough,
     Procedure,
     ProcedureLimits,
     Tighten,
+    Withdraw,
     Wrap,
 )
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
@@ -34,13 +37,21 @@ MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for erro
 VIEW_SAMPLES = 24
 MAX_STATES = 20_000_000
 MAX_WAYS = 32  # that are kept
-HEADING_TOLERANCE = 0.3  # rad
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
 GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
 
 
 class PlanningError(MagnetosutureError):
-    """There is no way to a goal."""
+    """There is no way to a goal.
+
+    Args:
+        problem: between which places.
+        goal: its index, among those that were to be planned.
+    """
+
+    def __init__(self, problem: str, goal: int = 0) -> None:
+        super().__init__(problem)
+        self.goal = goal
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +89,7 @@ class NeedlePlanner:
         coil_angles: Sequence[float] = (),
     ) -> None:
         self.scene, self.needle, self.coil_angles = scene, needle, tuple(coil_angles)
-        self._keep_out, self._thread_length = keep_out, thread_length
+        self.keep_out, self.thread_length = keep_out, thread_length
         self.near = map_clearance(scene)
         self.lever = 0.5 * needle.chord
         # Points a step of the grid apart, about the middle of the chord.
@@ -99,35 +110,9 @@ class NeedlePlanner:
         """Refuse what can be seen to be impossible without planning.
 
         Raises:
-            ConfigurationError: a name is not of the scene, a place is not free, a gap is too narrow, or the thread is
-                too short.
+            ConfigurationError: see `check_procedure`.
         """
-        for index, (goal, limits) in enumerate(zip(procedure.goals, procedure.limits, strict=True)):
-            where, required = f"goals[{index}].{goal.GROUP}", max(self._keep_out, limits.clearance)
-            if isinstance(goal, PassThrough):
-                for name in goal.between:
-                    self._check_name(f"{where}.between", name)
-                gaps = self.gaps(goal)
-                if not gaps:
-                    raise ConfigurationError(f"{where}.direction", list(goal.direction), "one along a gap between them")
-                width = max(gap.width for gap in gaps)
-                if width <= 2.0 * required:
-                    expected = f"a gap wider than {2e3 * required:.3g} mm, twice the needle's clearance"
-                    raise ConfigurationError(f"{where}.between", f"a gap of {1e3 * width:.3g} mm", expected)
-            elif isinstance(goal, Wrap):
-                self._check_name(f"{where}.around", goal.around)
-                needed = goal.angle / (2.0 * math.pi) * self._girth(goal.around)
-                if needed > self._thread_length:
-                    expected = f"an angle for which {1e3 * self._thread_length:.3g} mm of thread are enough"
-                    raise ConfigurationError(f"{where}.angle", goal.angle, expected)
-            elif isinstance(goal, Tighten):
-                if goal.around:
-                    self._check_name(f"{where}.around", goal.around)
-                self._check_place(f"{where}.toward", goal.toward, required)
-            elif isinstance(goal, GoTo):
-                self._check_place(f"{where}.position", goal.position, required)
-            elif goal.to:
-                self._check_place(f"{where}.to", goal.to, required)
+        check_procedure(procedure, self)
 
     def plan(
         self,
@@ -151,7 +136,7 @@ class NeedlePlanner:
         Raises:
             PlanningError: there is no way to one of them.
         """
-        required = max(self._keep_out, limits.clearance)
+        required = max(self.keep_out, limits.clearance)
         for margin in MARGINS:
             states, ends, at = np.empty((0, 3)), [], self._nearest_free(middle, angle, required + margin)
             for index, goal in enumerate(goals):
@@ -165,18 +150,21 @@ class NeedlePlanner:
                 states = np.vstack([states, found])
                 ends.append(len(states))
                 at = self._state_of(found[-1])
+            if at is not None and (last := self._end_of(goals[-1], start, states[-1], required + margin)) is not None:
+                states = np.vstack([states, last])
+                ends[-1] += 1
             if at is not None and len(states):
                 # It begins where the needle is, which may be closer than what is required from then on.
                 begin = np.array([[*middle, states[0, 2] + math.remainder(angle - states[0, 2], 2.0 * math.pi)]])
                 states = np.vstack([begin, states])
                 return smooth_path(states, np.array(ends), self.lever, self.body, required, margin, self.near)
-        where = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm"
-        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}")
+        where, kept = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm", f"{1e3 * required:.3g} mm around it"
+        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}, with {kept}", len(ends))
 
     def standing_path(self, middle: Vector, angle: float, limits: ProcedureLimits) -> BodyPath:
         """Return a path of one pose, in which the needle stays, with the leeway that it has there."""
         near = body_clearance(float(middle[0]), float(middle[1]), angle, self.body, self.near)
-        leeway = max(0.0, near - max(self._keep_out, limits.clearance))
+        leeway = max(0.0, near - max(self.keep_out, limits.clearance))
         twice = np.tile(middle, (2, 1)), np.full(2, angle)
         return BodyPath(*twice, self.lever, np.full(2, leeway), np.zeros(1))
 
@@ -193,21 +181,34 @@ class NeedlePlanner:
         index = 0
         while index < len(procedure.goals):
             goals = chain(procedure, index)
-            paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+            try:
+                paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+            except PlanningError as error:
+                raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
             middle, angle = paths[-1].middles[-1], float(paths[-1].angles[-1])
             index += len(goals)
         return tuple(paths)
 
     def gaps(self, goal: PassThrough) -> list[Gap]:
         """Return the gaps between the two shapes that are passed along the goal's direction."""
-        first, second = (map_clearance(self.scene, (name,)).distance for name in goal.between)
+        wanted = np.array(goal.direction) / math.hypot(*goal.direction)
+        found = [
+            replace(gap, along=math.copysign(1.0, float(gap.along @ wanted)) * gap.along)
+            for gap in self.gaps_between(*goal.between)
+            if abs(gap.along @ wanted) >= 0.5
+        ]
+        least = min((gap.width for gap in found), default=0.0)
+        return [gap for gap in found if gap.width <= 2.0 * least]
+
+    def gaps_between(self, first_name: str, second_name: str) -> list[Gap]:
+        """Return the narrowest places between two shapes, each passed along its direction or against it."""
+        first, second = (map_clearance(self.scene, (name,)).distance for name in (first_name, second_name))
         width, step = first + second, self.near.step
         midway = (np.abs(first - second) <= 1.5 * step) & (self.near.distance >= 0.45 * width)
         if not midway.any():
             return []
         narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * GAP_WIDTH_RATIO)
         labels, count = ndimage.label(narrow, np.ones((3, 3)))
-        wanted = np.array(goal.direction) / math.hypot(*goal.direction)
         slope = np.asarray(np.gradient(first - second))
         found = []
         for label in range(1, count + 1):
@@ -217,16 +218,10 @@ class NeedlePlanner:
             if not (size := math.hypot(*across)) > 0.0:
                 continue
             along = np.array([-across[1], across[0]]) / size
-            along *= math.copysign(1.0, float(along @ wanted))
             # The middle of the gap along its direction, on the line midway between the shapes.
             points = self.near.origin + step * np.column_stack([columns, rows])
-            centre = points.mean(axis=0)
-            if along @ wanted >= 0.5:
-                found.append(Gap(centre, along, narrowest))
-        if not found:
-            return []
-        least = min(gap.width for gap in found)
-        return [gap for gap in found if gap.width <= 2.0 * least]
+            found.append(Gap(points.mean(axis=0), along, narrowest))
+        return found
 
     def thread_clearance(self, name: str, thread: Points) -> float:
         """Return the greatest distance from a shape of the part of a thread that sweeps the most about it [m]."""
@@ -272,7 +267,7 @@ class NeedlePlanner:
     def _state_of(self, state: Vector) -> NDArray[np.int64]:
         """Return column, row and direction of a state of the lattice."""
         column, row = np.rint((np.asarray(state[:2]) - self.near.origin) / self._step).astype(int)
-        return np.array([column, row, int(np.argmin(np.abs(_turn(DIRECTIONS - state[2]))))])
+        return np.array([column, row, int(np.argmin(np.abs(turn_of(DIRECTIONS - state[2]))))])
 
     def _nearest_free(self, middle: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
         """Return the free state of the lattice that is nearest to a pose; None where none is near."""
@@ -304,7 +299,7 @@ class NeedlePlanner:
                 dx, dy = x - gap.centre[0], y - gap.centre[1]
                 ahead, aside = dx * gap.along[0] + dy * gap.along[1], dy * gap.along[0] - dx * gap.along[1]
                 places |= (ahead >= 0.0) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * gap.width)
-                off = np.abs(_turn(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
+                off = np.abs(turn_of(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
                 headings |= off <= GAP_HEADING
             return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), nowhere)
         place, tolerance = start, self._step
@@ -317,8 +312,18 @@ class NeedlePlanner:
             place, tolerance = np.array(goal.to) if goal.to else start, goal.tolerance
         # At least the nearest point of the lattice.
         places = np.hypot(x - place[0], y - place[1]) <= max(0.7 * tolerance, 0.75 * self._step)
-        headings = np.abs(_turn(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
+        headings = np.abs(turn_of(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
         return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), place)
+
+    def _end_of(self, goal: Goal, start: Vector, state: Vector, kept: float) -> Vector | None:
+        """Return the pose that a goal asks for, near a state of the lattice; None for none, or if it is not free."""
+        if not isinstance(goal, GoTo | Withdraw):
+            return None
+        x, y = goal.position if isinstance(goal, GoTo) else goal.to or start.tolist()
+        angle = float(state[2])
+        if isinstance(goal, GoTo) and goal.heading:
+            angle += math.remainder(goal.heading[0] - angle, 2.0 * math.pi)
+        return np.array([x, y, angle]) if body_clearance(x, y, angle, self.body, self.near) >= kept else None
 
     def _in_view_of(self, name: str) -> NDArray[np.bool_]:
         """Return from which points of the lattice nothing is between them and a shape's nearest point."""
@@ -339,22 +344,11 @@ class NeedlePlanner:
             free &= blocking[at[0], at[1]] > 0.0
         return np.asarray(free)
 
-    def _check_name(self, where: str, name: str) -> None:
-        if name not in self.scene.names:
-            raise ConfigurationError(
-                where, name, f"a shape of the scene: {', '.join(self.scene.names) or 'it has none'}"
-            )
-
-    def _check_place(self, where: str, place: tuple[float, ...], required: float) -> None:
-        x, y = place
-        if not any(body_clearance(x, y, direction, self.body, self.near) >= required for direction in DIRECTIONS):
-            expected = f"a place with {1e3 * required:.3g} mm around the needle in some direction"
-            raise ConfigurationError(where, [x, y], expected)
-
     def _centre(self, name: str) -> Vector:
         return np.array(self._shape(name).solid.centroid.coords[0])
 
-    def _girth(self, name: str) -> float:
+    def girth(self, name: str) -> float:
+        """Return the length of a thread that lies around a shape once [m]."""
         return float(self._shape(name).solid.convex_hull.length)
 
     def _shape(self, name: str) -> SceneShape:
@@ -371,8 +365,3 @@ def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:
             break
         last += 1
     return procedure.goals[index : last + 1]
-
-
-def _turn(angles: Vector) -> Vector:
-    """Return angles within half a turn of 0."""
-    return np.asarray((angles + math.pi) % (2.0 * math.pi) - math.pi)

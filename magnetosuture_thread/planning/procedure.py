@@ -12,7 +12,8 @@ goals:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 from magnetosuture_thread.configuration import (
@@ -27,6 +28,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_procedure_file
 
 MAX_GOALS = 100
+HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
 KEYS = {"setup", "scene", "goals", "limits"}
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
 
@@ -188,7 +190,8 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
         ConfigurationError: it is no procedure; the message names goal and field.
     """
     if not isinstance(content, Mapping) or not set(content) <= KEYS or "goals" not in content:
-        given: Any = sorted(map(str, content)) if isinstance(content, Mapping) else type(content).__name__
+        nothing = "nothing" if content is None else type(content).__name__
+        given: Any = sorted(map(str, content)) if isinstance(content, Mapping) else nothing
         expected = "goals, and setup, scene and limits if they differ from the defaults"
         raise ConfigurationError("procedure", given, expected, source)
     setup, scene = content.get("setup", ""), content.get("scene", "")
@@ -196,6 +199,7 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
         if not isinstance(value, str):
             raise ConfigurationError(f"procedure.{key}", value, f"the name of a {key}", source)
     goals, common = content["goals"], _mapping(content.get("limits", {}), "limits", source)
+    from_mapping(ProcedureLimits, common, source)  # else each goal would be blamed for them
     if not isinstance(goals, list) or not 0 < len(goals) <= MAX_GOALS:
         given = len(goals) if isinstance(goals, list) else type(goals).__name__
         raise ConfigurationError("procedure.goals", given, f"a list of 1 to {MAX_GOALS} goals", source)
@@ -221,11 +225,14 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
 def read_procedure(name: str) -> Procedure:
     """Return a procedure, given as a path or as the name of one that ships with the package.
 
+    Files of setup and scene that lie beside it are found from any working directory.
+
     Raises:
         ConfigurationError: there is no such file, it cannot be read, or is no procedure.
     """
     path = find_procedure_file(name)
-    return parse_procedure(read_yaml(path, "procedure"), path.stem, str(path))
+    found = parse_procedure(read_yaml(path, "procedure"), path.stem, str(path))
+    return replace(found, setup=_beside(path, found.setup), scene=_beside(path, found.scene))
 
 
 def read_procedure_text(text: str) -> Procedure:
@@ -237,6 +244,11 @@ def read_procedure_text(text: str) -> Procedure:
     if ":" in text or "\n" in text:  # as every procedure has, and no name
         return parse_procedure(read_yaml_text(text, "procedure"), "procedure")
     return read_procedure(text)
+
+
+def _beside(path: Path, name: str) -> str:
+    """Return the path of a file that is named from the folder of another; the name as it is where there is none."""
+    return str(path.parent / name) if Path(name).suffix and (path.parent / name).is_file() else name
 
 
 def _mapping(value: Any, name: str, source: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from magnetosuture_thread.cli.main import main
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.evaluate import evaluate_bags
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 SHORT = {"goals": [{"go_to": {"position": [0.008, -0.0145], "tolerance": 1e-3}}], "setup": "hernia_ring"}
 
@@ -77,7 +77,7 @@ def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_var
 
 def test_a_start_without_room_is_refused(hernia: Setup):
     inside = replace(hernia.rig, needle_start=(0.0, 0.005, 0.0), thread_start_curvature=0.0)
-    with pytest.raises(ConfigurationError, match="a start with room around it"):
+    with pytest.raises(ConfigurationError, match=r"a start with room around it: a needle .* it would be in ring"):
         vary(replace(hernia, rig=inside).with_scene(hernia.scene), 0)
 
 
@@ -156,3 +156,26 @@ def test_a_procedure_that_does_not_fit_its_setup_is_refused(tmp_path: Path, caps
     assert main(["campaign", str(file), "--output", str(tmp_path / "out")]) == 2
     assert "goals[0].wrap.around" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+CLOSED = """
+dish: {diameter: 0.05}
+shapes: {ring: {annulus: {center: [0.0, 0.0], inner_radius: 0.006, outer_radius: 0.008}}}
+"""
+
+
+def test_a_place_without_a_way_is_refused_before_anything_moves(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "closed.yaml").write_text(CLOSED)
+    file = tmp_path / "inside.yaml"
+    goals = "[{go_to: {position: [0.012, 0.0]}}, {go_to: {position: [0.0, 0.0]}}]"
+    file.write_text(f"{{setup: dish_50mm, scene: closed.yaml, goals: {goals}}}\n")
+    assert main(["campaign", str(file), "--output", str(tmp_path / "out")]) == 1
+    assert "goals[1]: no way for the needle to go_to" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    # A run that begins all the same, as that of another seed might, ends at once.
+    procedure = read_procedure(str(file))
+    setup = read_procedure_setup(procedure)
+    found = run_procedure(procedure, setup, vary(setup, 0))
+    assert found.reason.startswith("goals[1]: no way for the needle to go_to")
+    assert found.reason.count(";") == 0  # no time where there is no ideal one
+    assert found.simulated_s < 1.0

@@ -46,6 +46,7 @@ class Needle:
         self.tail, self.heading = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])
         self.share, self.drift, self.time, self.way = 1.0, np.zeros(2), 1.0, 0.0
         self.pull = np.zeros(2)  # whatever is commanded
+        self.thrown = np.zeros(2)  # for each radian that it turns, as by its thread in a crossing of an axis [m]
 
     def run(
         self,
@@ -60,7 +61,9 @@ class Needle:
             velocity = run.update(self.time, self.tail, self.heading, condition()).velocity
             self.way += math.hypot(*velocity) / RATE
             moved = NEEDLE.body_velocity(self.heading, self.share * velocity)
+            before = self.heading
             self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *moved, 1.0 / RATE)
+            self.tail = self.tail + math.acos(min(1.0, float(before @ self.heading))) * self.thrown
             self.tail = self.tail + (self.drift * bool(velocity.any()) + self.pull) / RATE
             self.time += 1.0 / RATE
 
@@ -259,3 +262,52 @@ def test_a_shape_that_closes_the_way_fails_the_procedure_with_the_reason():
     run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone
     assert run.state is ProcedureState.FAILED
     assert "a shape of the scene" in run.reason
+
+
+GOAL_WITH_A_TURN = {"position": [-0.008, -0.004], "heading": [-math.pi / 2.0]}
+
+
+def test_a_place_that_is_missed_by_the_turn_at_its_end_is_aimed_at_from_the_other_side():
+    run, needle = executor({"go_to": {**GOAL_WITH_A_TURN, "tolerance": 2e-4}}), Needle()
+    needle.thrown = np.array([4e-4, 0.0])
+    run.start()
+    needle.run(run, 60.0, until=lambda: run._misses > 0)
+    assert (run.state, run._misses) == (ProcedureState.RUNNING, 1)
+    needle.run(run, 60.0)
+    assert (run.state, run.reason) == (ProcedureState.DONE, "")
+    assert math.dist(needle.middle, GOAL_WITH_A_TURN["position"]) < 2e-4 + 1e-9
+
+
+def test_a_place_that_is_missed_however_it_is_planned_is_given_up_with_the_distance():
+    run, needle = executor({"go_to": {**GOAL_WITH_A_TURN, "tolerance": 5e-5}}), Needle()
+    run.start()
+    for _ in range(round(120.0 * RATE)):
+        needle.thrown = np.array([4e-4 if run._misses % 2 else -4e-4, 0.0])  # each time to the side that is aimed at
+        needle.run(run, 1.0 / RATE)
+    assert run.state is ProcedureState.FAILED
+    assert "the needle misses its place by" in run.reason
+    assert "with a tolerance of 0.05 mm" in run.reason
+
+
+def test_a_long_needle_that_is_held_up_and_trembles_is_given_up_too():
+    run, needle, random = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle(), np.random.default_rng(1)
+    needle.share = 0.0
+    run.start()
+    at = needle.tail
+    for _ in range(round(100.0 * RATE)):
+        needle.run(run, 1.0 / RATE)
+        needle.tail = at + 8e-5 * random.uniform(-1.0, 1.0, 2)  # more than a needle that rests may move
+    assert run.state is ProcedureState.FAILED
+    assert "given up" in run.reason
+
+
+def test_a_needle_that_is_thrown_back_whenever_it_gets_on_is_given_up():
+    run, needle = executor({"go_to": {"position": [0.013, 0.008]}}), Needle()
+    run.start()
+    begin = needle.tail
+    for _ in range(round(120.0 * RATE)):
+        needle.run(run, 1.0 / RATE)
+        if math.dist(needle.tail, begin) > 6e-3:  # three times what was called progress
+            needle.tail = begin
+    assert run.state is ProcedureState.FAILED
+    assert "given up" in run.reason

@@ -117,6 +117,13 @@ def test_a_gap_is_passed_in_its_direction_through_its_middle():
         ({"tighten": {"tension": 1e-4, "toward": [0.0, 0.002]}}, "goals[0].tighten.toward"),
         ({"pass_through": {"between": ["post_0", "post_2"], "direction": [1.0, 0.0]}}, "a gap of 0.3"),
         ({"pass_through": {"between": ["post_0", "post_1"], "direction": [0.0, 1.0]}}, "one along a gap between them"),
+        ({"pass_through": {"between": ["post_0", "post_1"], "direction": [0.0, 1.0]}}, "as [-1, 0] or [1, 0]"),
+        ({"pass_through": {"between": ["post_1", "post_2"], "direction": [0.0, 1.0]}}, "in which no other shape lies"),
+        ({"go_to": {"position": [0.0169, 0.0], "heading": [0.0]}}, "around the needle at its heading"),
+        (
+            {"tighten": {"tension": 2e-4, "toward": [0.012, 0.0]}, "limits": {"tension": 1e-4}},
+            "goals[0].tighten.tension: got 0.0002, expected at most the limit of the tension, 0.0001 N",
+        ),
     ],
 )
 def test_what_can_be_known_to_fail_is_refused_before_anything_moves(goal: dict[str, Any], message: str):
@@ -127,9 +134,39 @@ def test_what_can_be_known_to_fail_is_refused_before_anything_moves(goal: dict[s
     assert message in str(caught.value)
 
 
+def test_wraps_that_follow_each_other_need_the_thread_of_them_all():
+    scene = posts((0.0, 0.0, 0.002), (0.009, 0.0, 0.002))
+    planner = NeedlePlanner(scene, NeedleKinematics(0.0025), KEEP_OUT, 0.03)
+    once, back, other = (
+        {"wrap": {"around": name, "angle": 8.0, "sense": sense}}
+        for name, sense in (("post_0", "clockwise"), ("post_0", "counterclockwise"), ("post_1", "clockwise"))
+    )
+    planner.check(procedure(once))  # 16 of 30 mm
+    planner.check(procedure(once, back, once))
+    planner.check(procedure(once, {"go_to": {"position": [0.0, 0.006]}}, once))  # which may have unwound it
+    for second in (once, other):
+        with pytest.raises(ConfigurationError, match=r"goals\[1\]\.wrap\.angle.*with the wraps before it"):
+            planner.check(procedure(once, second))
+
+
+@pytest.mark.parametrize("heading", [[], [-1.5708], [0.26]])
+def test_a_path_ends_at_the_very_place_and_heading_of_its_goal(heading: list[float]):
+    planner = NeedlePlanner(posts((0.004, 0.0, 0.002)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+    goal = {"go_to": {"position": [0.00811, 0.00307], "heading": heading, "tolerance": 2e-4}}
+    (path,) = planner.plan_all(procedure(goal), np.array([-0.006, -0.004]), 0.3)
+    assert path.middles[-1] == pytest.approx([0.00811, 0.00307], abs=1e-9)
+    if heading:
+        assert math.remainder(path.angles[-1] - heading[0], math.tau) == pytest.approx(0.0, abs=1e-9)
+    (back,) = planner.plan_all(procedure({"withdraw": {}}), np.array([-0.00613, -0.00389]), 0.3)
+    assert back.middles[-1] == pytest.approx([-0.00613, -0.00389], abs=1e-9)
+
+
 def test_a_place_behind_a_closed_wall_of_posts_cannot_be_reached():
     count = 14
     ring = [(0.006 * math.cos(a), 0.006 * math.sin(a), 0.0013) for a in np.linspace(0.0, math.tau, count, False)]
     planner = NeedlePlanner(posts(*ring), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
-    with pytest.raises(PlanningError, match="no way for the needle to go_to"):
+    with pytest.raises(PlanningError, match=r"goals\[0\]: no way for the needle to go_to from 12.0, 0.0 mm"):
         planner.plan_all(procedure({"go_to": {"position": [0.0, 0.0]}}), np.array([0.012, 0.0]), 0.0)
+    later: list[dict[str, Any]] = [{"wrap": {"around": "post_0", "angle": 0.1}}, {"go_to": {"position": [0.0, 0.0]}}]
+    with pytest.raises(PlanningError, match=r"goals\[1\]: no way for the needle to go_to"):
+        planner.plan_all(procedure(*later), np.array([0.012, 0.0]), 0.0)

@@ -33,6 +33,8 @@ def test_a_goal_may_have_limits_of_its_own():
     ("content", "message"),
     [
         ([], "procedure: got"),
+        (None, "procedure: got 'nothing'"),
+        ({"goals": [{"withdraw": {}}], "limits": {"speed": -1.0}}, "bad.yaml: limits.speed: got -1.0"),
         ({"goals": []}, "procedure.goals: got 0"),
         ({"goals": [{}], "speed": 1.0}, "procedure: got"),
         ({"goals": ["go"]}, "goals[0]: got"),
@@ -52,7 +54,7 @@ def test_a_goal_may_have_limits_of_its_own():
 )
 def test_what_is_no_procedure_is_refused(content: Any, message: str):
     with pytest.raises(ConfigurationError) as caught:
-        parse_procedure(content, "bad")
+        parse_procedure(content, "bad", "bad.yaml")
     assert message in str(caught.value)
 
 
@@ -61,3 +63,13 @@ def test_a_file_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path)
         read_procedure("hernai")
     with pytest.raises(ConfigurationError, match="YAML"):
         read_procedure(str(tmp_path / "none.yaml"))
+
+
+def test_files_beside_a_procedure_are_found_from_any_folder(tmp_path: Path):
+    (tmp_path / "lab.yaml").write_text("dish: {diameter: 0.05}\n", encoding="utf-8")
+    file = tmp_path / "mine.yaml"
+    file.write_text("{setup: dish_50mm, scene: lab.yaml, goals: [{withdraw: {}}]}\n", encoding="utf-8")
+    procedure = read_procedure(str(file))
+    assert (procedure.setup, procedure.scene) == ("dish_50mm", str(tmp_path / "lab.yaml"))
+    file.write_text("{setup: dish_50mm, scene: other.yaml, goals: [{withdraw: {}}]}\n", encoding="utf-8")
+    assert read_procedure(str(file)).scene == "other.yaml"  # from the working directory

@@ -80,3 +80,14 @@ def test_a_procedure_without_a_setup_or_with_a_scene_that_is_none_is_refused(tmp
         read_procedure_setup(missing, "hernia_ring")
     with pytest.raises(ConfigurationError, match="the name of a scene"):
         parse_procedure({"scene": 3, "goals": [{"withdraw": {}}]}, "plain")
+
+
+def test_a_procedure_that_its_setup_cannot_carry_out_is_refused(tmp_path: Path):
+    fast = {"goals": [{"withdraw": {}}, {"withdraw": {}, "limits": {"speed": 0.05}}], "setup": "dish_50mm"}
+    with pytest.raises(
+        ConfigurationError, match=r"goals\[1\]\.limits\.speed.*coil_bridge\.max_speed of dish_50mm, 0\.01"
+    ):
+        read_procedure_setup(parse_procedure(fast, "fast"))
+    wide = {"goals": [{"withdraw": {}}], "setup": "dish_50mm", "scene": "dish_150mm"}
+    with pytest.raises(ConfigurationError, match="at most 108 mm, which the coils of dish_50mm leave"):
+        read_procedure_setup(parse_procedure(wide, "wide"))
