@@ -22,6 +22,7 @@ from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.appearance import MIN_SHARE, Appearance, appearance_of, respaced
 from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding
+from magnetosuture_thread.vision.thread.observe import observe
 from magnetosuture_thread.vision.thread.order import Piece, find_order
 from magnetosuture_thread.vision.thread.piece_ends import BARE_COLOUR, is_bare_beyond
 from magnetosuture_thread.vision.thread.strands import Strand, first_clear_of, strand_along
@@ -229,3 +230,20 @@ def test_the_floor_beyond_an_end_is_bare_in_light_from_one_side_but_not_in_anoth
     points = np.column_stack([np.arange(20.0, 81.0, 2.0), np.full(31, 80.0)])
     strand = Strand(points, np.full(31, DARK.strength), np.ones(31, np.bool_))
     assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, NEEDLE) == bare
+
+
+@pytest.mark.parametrize("covered", [False, True])
+def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: bool):
+    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+    image = np.full((480, 640), 225, np.uint8)
+    cv2.line(image, (300, 240), (150, 240), 100, 2)
+    cv2.line(image, (300, 240), (387, 240), 50, 5)
+    if covered:
+        image[240:300, 215:255] = 140
+    noise = np.random.default_rng(0).normal(0.0, 2.0, image.shape)
+    image = np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + noise, 0.0, 255.0).astype(np.uint8)
+    view, walk = DishView((320.0, 240.0), SCALE), line((300.0, 240.0), (149.0, 240.0))
+    seen = observe(prepare(image, 2), needle, walk, view, 0.0172, 150.0 * SCALE, scale_known=True)
+    u = np.concatenate([view.to_pixels(piece.points)[:, 0] for piece in seen.pieces])
+    assert ((u > 220.0) & (u < 250.0)).any() == (not covered)
+    assert seen.complete == (not covered)
