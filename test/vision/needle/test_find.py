@@ -147,8 +147,9 @@ def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_ot
     assert other.covariance[2, 2] == 0.001
 
 
+@pytest.mark.parametrize(("cost", "told"), [(100.0, True), (120.0, True), (130.0, False)])
 def test_where_both_ways_fit_alike_the_ends_tell_which_is_right_whichever_is_tried_first(
-    monkeypatch: pytest.MonkeyPatch,
+    cost: float, told: bool, monkeypatch: pytest.MonkeyPatch
 ):
     tried: list[tuple[SteelMap, TemplateFit, TemplateFit]] = []
     pointed_way = measure._pointed_way
@@ -160,10 +161,10 @@ def test_where_both_ways_fit_alike_the_ends_tell_which_is_right_whichever_is_tri
     monkeypatch.setattr(measure, "_pointed_way", recorded)
     found, _ = find(camera_of(0.0).render(np.zeros(2), 0.4, NOWHERE))
     steel, *fits = tried[0]
-    one, other = (replace(fit, cost=1.0) for fit in fits)
-    for way in (pointed_way(steel, one, other), pointed_way(steel, other, one)):
-        assert way is not None
-        assert way.arc.direction() @ found[0].direction_px > 0.9
+    right, wrong = sorted(fits, key=lambda fit: -float(fit.arc.direction() @ found[0].direction_px))
+    right, wrong = replace(right, cost=cost), replace(wrong, cost=100.0)
+    assert pointed_way(steel, right, wrong) is (right if told else None)
+    assert pointed_way(steel, wrong, right) is (right if told else None)
 
 
 @pytest.mark.parametrize(("turns", "leaves"), [((), False), ((2.8,), True), ((1.8, -1.9), False)])

@@ -14,7 +14,7 @@ from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import FollowedThread, find_centreline, follow_thread
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
-from magnetosuture_thread.vision.thread.ridge import darker_than_around
+from magnetosuture_thread.vision.thread.ridge import ZERO, darker_than_around, faint_ridge
 from magnetosuture_thread.vision.thread.search import WALL_PX
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
@@ -219,3 +219,13 @@ def test_the_noise_that_a_ridge_is_held_to_is_that_away_from_a_windows_borders(s
     usual = darker_than_around(window)[1]
     window[side] = random.integers(0, 256, window[side].shape)
     assert darker_than_around(window)[1] == pytest.approx(usual, rel=0.06)
+
+
+@pytest.mark.parametrize("pale", [False, True])
+def test_a_faint_ridge_shows_what_is_darker_or_what_is_paler_by_units_of_noise(pale: bool):
+    difference = np.array([[-2.0, -1.0, 0.0, 1.0, 2.0]], np.float32)  # positive where it is darker
+    ridge = faint_ridge(difference, 4.0, np.zeros((1, 5), np.uint8), 1, 1, pale=pale)
+    above = ridge.strength[0].astype(float) - ZERO
+    assert above[2] == pytest.approx(0.0, abs=0.5)
+    np.testing.assert_allclose(above[[0, 1, 3]], -above[4] * np.array([1.0, 0.5, -0.5]), atol=1.0)
+    assert (above[4] < 0.0) == pale

@@ -203,6 +203,18 @@ def test_a_polyline_gets_vertices_of_about_the_wanted_distance(spacing: float):
     assert abs(len(apart) - 35.0 / spacing) < 0.5 + 1e-9
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_width_and_strength_of_a_thread_are_those_of_its_profile(sign: float):
+    aside = np.arange(80.0)[:, None] - 40.0
+    image = np.round(120.0 + sign * 60.0 * np.exp(-0.5 * aside**2) * np.ones(160)).astype(np.uint8)
+    points = np.column_stack([np.arange(20.0, 140.0, 2.0), np.full(60, 40.0)])
+    picture = prepare(image, 1)
+    found = appearance_of(picture, picture.darkest.pixels, points, np.ones(60, np.bool_))
+    assert found.pale == (sign > 0.0)
+    assert found.strength == pytest.approx(60.0, rel=0.03)
+    assert found.width_px == pytest.approx(2.355, abs=0.5)
+
+
 def test_the_noise_of_a_pixel_is_measured_beside_the_thread():
     deviation, random = 10.0, np.random.default_rng(0)
     image = random.normal(150.0, deviation, (240, 320))
@@ -217,10 +229,17 @@ def test_the_noise_of_a_pixel_is_measured_beside_the_thread():
 
 
 @pytest.mark.parametrize(
-    ("across", "colour", "bare"), [(0.0, 0.0, True), (0.16, 0.0, True), (0.0, 0.5, True), (0.0, 1.45, False)]
+    ("across", "colour", "fades", "bare"),
+    [
+        (0.0, 0.0, False, True),
+        (0.16, 0.0, False, True),
+        (0.0, 0.5, False, True),
+        (0.0, 1.45, False, False),
+        (0.0, 0.0, True, False),
+    ],
 )
-def test_the_floor_beyond_an_end_is_bare_in_light_from_one_side_but_not_in_another_colour(
-    across: float, colour: float, bare: bool
+def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_or_the_thread_fades(
+    across: float, colour: float, fades: bool, bare: bool
 ):
     image = np.full((160, 160, 3), 180.0)
     image *= 1.0 + across * (np.arange(160) > 80)[:, None, None] - 0.5 * across * (np.arange(160) != 80)[:, None, None]
@@ -228,7 +247,8 @@ def test_the_floor_beyond_an_end_is_bare_in_light_from_one_side_but_not_in_anoth
     image[79:82, 20:81] -= DARK.strength
     picture = prepare(np.round(image).astype(np.uint8), 1)
     points = np.column_stack([np.arange(20.0, 81.0, 2.0), np.full(31, 80.0)])
-    strand = Strand(points, np.full(31, DARK.strength), np.ones(31, np.bool_))
+    strength = np.where(fades & (np.arange(31) > 24), 2.0, DARK.strength)
+    strand = Strand(points, strength, np.ones(31, np.bool_))
     assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, NEEDLE) == bare
 
 
