@@ -140,6 +140,10 @@ def test_colours_tell_the_state():
     assert len(set(friction_colour(UNKNOWN))) == 1
 
 
+def test_friction_that_is_unknown_does_not_slow_the_needle():
+    assert barriers(*GATE).friction == Friction(FrictionState.UNKNOWN, (), 1.0)
+
+
 @pytest.mark.parametrize("beta", [0.5, 0.9, 1.0])
 def test_each_node_counts_as_one_factor(beta: float):
     slowed = FrictionLaw(2e-3, beta, 0.0).classify(barriers(*GATE), np.ones(8))

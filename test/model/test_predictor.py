@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
@@ -90,14 +95,14 @@ def test_a_start_needs_a_centreline():
     predictor = new()
     with pytest.raises(InvalidInputError, match="a centreline first"):
         predictor.step(pose(0.0))
-    for centreline in (
-        np.zeros((1, 2)),
-        np.array([[0.0, 0.0], [np.nan, 0.0]]),
-        np.array([[0.0, 0.0], [1e-5, 0.0]]),
-        np.zeros((3, 2)),
-        np.array([[0.005, 0.0], [0.02, 0.0]]),  # far from the needle's tail
+    for centreline, words in (
+        (np.zeros((1, 2)), "1 points"),
+        (np.array([[0.0, 0.0], [np.nan, 0.0]]), "finite points"),
+        (np.array([[0.0, 0.0], [1e-5, 0.0]]), "1.00e-05 m long"),
+        (np.zeros((3, 2)), "0.00e[+]00 m long"),
+        (np.array([[0.005, 0.0], [0.02, 0.0]]), "5.00e-03 m from the needle's tail"),
     ):
-        with pytest.raises(InvalidInputError, match="centreline"):
+        with pytest.raises(InvalidInputError, match=f"centreline.*{words}"):
             predictor.start(pose(0.0), centreline)
     assert not predictor.started
 
@@ -116,6 +121,27 @@ def test_a_needle_that_leaps_onto_a_node_is_followed():
         prediction = predictor.step(pose(k / 30.0, -unit))
     assert np.all(np.isfinite(prediction.positions))
     assert np.abs(prediction.strain).max() < 1e-2
+
+
+def test_a_thread_a_millimetre_from_a_shape_is_in_contact_with_nothing():
+    predictor = started((Disc((-0.01, 0.002), 0.001),))
+    prediction = predictor.step(pose(1.0 / 30.0, 1e-4))
+    assert prediction.margins["obstacle"].clearance.min() == pytest.approx(1e-3 - 0.5 * THREAD.diameter, abs=5e-5)
+    assert isinstance(predictor.formulation, RodFormulation)
+    assert not predictor.formulation.nodes_in_contact.any()
+    assert prediction.margins.in_contact == ()
+
+
+def test_the_status_is_that_of_the_first_step_that_was_not_solved_at_once(monkeypatch: pytest.MonkeyPatch):
+    predictor, statuses = started(), iter(("solved", "solved, after banded: stalled", "solved"))
+    follow = predictor._follow
+
+    def relabelled(*given: Any) -> Iterator[Any]:
+        return (replace(done, status=next(statuses)) for done in follow(*given))
+
+    monkeypatch.setattr(predictor, "_follow", relabelled)
+    prediction = predictor.step(pose(0.06, 1e-4))
+    assert (prediction.substeps, prediction.status) == (3, "solved, after banded: stalled")
 
 
 def test_a_reset_forgets():
@@ -209,6 +235,12 @@ def test_samples_that_come_twice_with_a_little_noise_do_no_harm(after: float):
     assert np.linalg.norm(found.positions - expected.positions, axis=1).mean() < 2e-3 * THREAD.length
 
 
+@example(  # a disc that a segment's chord lies in, and not its arc
+    turns=[0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+    speed=0.015625,
+    disc=(0.0, 0.004, 0.001953125),
+    corners=[(0.0, 0.00390625), (1.0, 0.00390625), (2.0, 0.00390625)],
+)
 @settings(max_examples=40, deadline=None)
 @given(
     turns=st.lists(st.floats(-0.6, 0.6), min_size=5, max_size=40),
@@ -225,6 +257,8 @@ def test_any_motion_keeps_the_promises(
     turns: list[float], speed: float, disc: tuple[float, float, float], corners: list[tuple[float, float]]
 ):
     """No NaN, no segment stretched by more than half a percent, no node in an obstacle, residuals proven."""
+    outer = disc[2] + 0.5 * THREAD.diameter
+    sagitta = outer * (1.0 - np.cos(0.5 * THREAD.segment_length / outer))
     obstacles: list[Disc | Polygon] = [Disc((disc[0], disc[1]), disc[2])]
     angles = np.sort([corner[0] for corner in corners])
     if np.diff(np.append(angles, angles[0] + 2.0 * np.pi)).max() < 3.0:  # else not around its middle
@@ -248,7 +282,10 @@ def test_any_motion_keeps_the_promises(
         assert np.abs(prediction.strain).max() < 5e-3
         assert prediction.residual < 1e-6
         obstacle = prediction.margins["obstacle"]
-        assert obstacle.clearance[obstacle.node > 0].min(initial=1.0) > -1e-6
+        free = obstacle.node > 0
+        assert obstacle.value[free].min(initial=1.0) > -1e-6
+        # Around a disc it is a segment's arc that touches, and its chord lies deeper; see `find_chord_contacts`.
+        assert (obstacle.clearance + sagitta * (obstacle.obstacle == 0))[free].min(initial=1.0) > -1e-6
 
 
 @settings(max_examples=40, deadline=None)

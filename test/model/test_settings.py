@@ -15,7 +15,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model import predictor
 from magnetosuture_thread.model.formulations import PaperOptions, make_formulation
 from magnetosuture_thread.model.margins import SOLID
-from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
@@ -162,6 +162,20 @@ def test_the_attachment_turns_with_the_needle():
     np.testing.assert_allclose(found.tail, [1.0 + 0.006 + 0.004, 2.0 + 0.008 - 0.003], atol=1e-15)
     assert found.heading is pose.heading
     assert found.stamp == 3.0
+
+
+def test_the_attachments_velocity_is_the_rate_of_its_place():
+    settings, velocity, rate, step = made(attachment_offset=[0.01, -0.005]), np.array([2e-3, -1e-3]), 3.0, 1e-6
+
+    def after(time: float) -> NeedlePose:
+        heading = np.array([np.cos(0.4 + rate * time), np.sin(0.4 + rate * time)])
+        return settings.attachment_pose(
+            NeedlePose(1.0 + time, time * velocity, heading, motion=NeedleMotion(velocity, rate))
+        )
+
+    motion = after(0.0).motion
+    assert motion is not None
+    np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])

@@ -73,6 +73,13 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(monkeypatc
         decode_image(png(30_000, 30_000))
 
 
+@pytest.mark.parametrize("kind", [0xC4, 0xCC, 0xDB])
+def test_tables_before_the_size_of_a_jpeg_are_skipped(kind: int):
+    data = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    table = struct.pack(">BBH", 0xFF, kind, 19) + bytes(range(1, 18))
+    assert image_header(data[:2] + table + data[2:]) == ImageHeader(64, 48)
+
+
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".webp", ".tif"])
 def test_size_and_orientation_are_read_from_the_header(ending: str):
     image = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from benchmarks.vision.frames import distorted, lens_with
 from benchmarks.vision.measurements import frame_of, measure
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.vision.lens import Lens, read_lens
+from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import SCENE, VIEW, Pose, render
@@ -128,3 +129,16 @@ def test_a_lens_that_moves_a_pixel_by_more_than_half_of_the_diagonal_is_refused(
     Lens(SIZE, "plumb_bob", (4.8, 0, 0, 0, 0), MATRIX)
     with pytest.raises(InvalidInputError, match="that can be undone"):
         Lens(SIZE, "plumb_bob", (5.4, 0, 0, 0, 0), MATRIX)
+
+
+@pytest.mark.parametrize(("across", "down"), [(0, 0), (1, 1), (2, 1), (1, 2)])
+def test_binned_frames_are_refused(across: int, down: int):
+    info = SimpleNamespace(
+        width=640, height=480, distortion_model="plumb_bob", d=LENSES["plumb_bob"], k=MATRIX, binning_x=across
+    )
+    info.binning_y = down
+    if max(across, down) > 1:
+        with pytest.raises(InvalidInputError, match=f"{across} x {down}"):
+            lens_of(info)
+    else:
+        assert lens_of(info).same_as(Lens(SIZE, "plumb_bob", LENSES["plumb_bob"], MATRIX))

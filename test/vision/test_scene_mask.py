@@ -169,6 +169,18 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
     assert inside.sum() > 20
 
 
+@pytest.mark.parametrize("factor", [2, 3])
+def test_a_shrunk_pixel_is_solid_where_all_of_its_pixels_are(factor: int):
+    scene, view = read_scene("hernia_ring"), DishView((322.3, 238.4), 1.1e-4, rotation=0.3)
+    whole, small = (scene_mask(scene, view, (481, 641), each, 3e-4, 8) for each in (1, factor))
+    assert whole is not None
+    assert small is not None
+    rows, columns = small.solid.shape
+    fill = ((0, rows * factor - 481), (0, columns * factor - 641))
+    blocks = np.pad(whole.solid, fill, mode="edge").reshape(rows, factor, columns, factor)
+    np.testing.assert_array_equal(small.solid, blocks.min(axis=(1, 3)))
+
+
 def test_an_empty_scene_has_no_mask():
     assert scene_mask(Scene(), VIEW, (480, 640), 2, 3e-4, 8) is None
 

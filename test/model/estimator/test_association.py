@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,8 @@ from magnetosuture_thread.model.estimator.association import (
     search_start,
     usable_points,
 )
+from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.model.estimator.pieces import PlacedPiece, free_end, place_pieces
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
     DEVIATION,
@@ -149,3 +153,44 @@ def test_unknown_start_is_found_at_once(start: str) -> None:
     for k in range(41, 71):
         estimate = estimator.step(way[k], whole(truth[k], k))
     assert error_percent(estimate.positions, truth[70]) < 0.3
+
+
+def test_a_piece_given_from_its_other_end_is_placed_alike() -> None:
+    turn = 0.1 * np.arange(25.0)
+    nodes = np.vstack([np.zeros(2), np.cumsum(np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)])
+    points, unit, found = nodes[8:17] * 1e-3, 1e-3, []
+    for given in (points, points[::-1]):
+        piece = ThreadPiece(given, np.full(9, 1e-5), PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, direction_known=False)
+        problems: list[str] = []
+        found += place_pieces(ThreadObservation((piece,)), nodes, np.ones(26), unit, EstimatorOptions(), problems)
+        assert not problems
+    for name in ("points", "variance", "share", "arcs", "start"):
+        np.testing.assert_allclose(getattr(found[0], name), getattr(found[1], name), atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(found[1].start + found[1].arcs, np.arange(8.0, 17.0), atol=0.05)
+
+
+@pytest.mark.parametrize("angle", [0.3, 2.0, -1.2])
+@pytest.mark.parametrize("beyond", [0.4, -0.3])
+def test_a_free_end_is_off_by_what_lies_along_the_last_segment(angle: float, beyond: float) -> None:
+    along = np.array([math.cos(angle), math.sin(angle)])
+    nodes = np.arange(26.0)[:, None] * along + (3.0, -2.0)
+    end = nodes[-1] + beyond * along + 0.2 * np.array([-along[1], along[0]])
+    piece = PlacedPiece(
+        np.vstack([nodes[20], end]), np.full(2, 1e-3), np.ones(2), np.zeros(2), 20.0, 0.1, False, True, 0.0
+    )
+    assert free_end([piece], nodes, 0.01)[0] == pytest.approx(beyond)
+    assert free_end([piece._replace(free_end=False)], nodes, 0.01) == (0.0, math.inf)
+
+
+def test_a_thread_that_lies_elsewhere_is_believed_when_a_second_frame_shows_it() -> None:
+    way = poses(14)
+    truth = true_shapes(thread_of(), way)
+    estimator = estimator_of(thread_of())
+    estimator.start_observed(way[0], whole(truth[0], 0))
+    for k in range(1, 12):
+        estimator.step(way[k], whole(truth[k], k))
+    turn = np.array([[math.cos(1.2), math.sin(1.2)], [-math.sin(1.2), math.cos(1.2)]])
+    elsewhere = [way[k].tail + (truth[k] - way[k].tail) @ turn for k in (12, 13)]
+    first, second = (estimator.step(way[k], whole(elsewhere[k - 12], k)) for k in (12, 13))
+    assert error_percent(first.positions, elsewhere[0]) > 1.0
+    assert error_percent(second.positions, elsewhere[1]) < 0.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -278,3 +280,6 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     expected = rows.clearance - 2.3263 * np.max(deviations, axis=0)
     np.testing.assert_allclose(bound, expected, rtol=1e-4)
     assert (bound < rows.clearance)[node > 0].all()
+    flat = replace(rows, gradient=np.zeros_like(rows.gradient))  # which no motion of a node changes
+    constant = replace(estimate, compute_rows=lambda: [flat])
+    np.testing.assert_array_equal(constant.clearance_bounds["obstacle"], rows.clearance)

@@ -126,3 +126,18 @@ def test_the_first_frame_after_a_gap_between_poses_says_nothing_of_disturbances(
     in_time, late = (forces_found(None, 12, interval) for interval in (1.0 / RATE, 3.0))
     first = [next(k for k, each in enumerate(found) if each) for found in (in_time, late)]
     assert first[1] == first[0] + 1
+
+
+@pytest.mark.parametrize("rest", [[1.0 / RATE] * 90, [100.0, 1.0 / RATE]])
+def test_a_disturbance_ends_once_the_camera_no_longer_moves_the_thread(rest: list[float]) -> None:
+    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
+    untouched, normals = np.zeros(26, dtype=np.bool_), np.tile([0.0, -1.0], (26, 1))
+    test, stamp, confirmed = DisturbanceTest(thread, 0.4), 0.0, []
+    for k, interval in enumerate([1.0 / RATE] * 30 + rest):
+        stamp += interval
+        test.decay(interval, untouched)
+        moved = pushed(thread, 12, 4e-5 if k < 30 else 0.0)
+        test.add(moved, normals, np.full(16, 1e-11), stamp, np.array([1e-5, 1e-3]))
+        confirmed.append(test.confirmed(stamp))
+    assert confirmed[29]
+    assert not confirmed[-1]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.model.estimator.correction import MeasuredPoints, normals_of, prior_information
 from magnetosuture_thread.model.estimator.corrector import Corrector
@@ -15,7 +15,7 @@ from magnetosuture_thread.model.estimator.options import AUTOMATIC
 from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_95
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
-from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.program import as_quadratic_program
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -278,3 +278,28 @@ def test_what_is_learned_by_itself_stays_within_a_factor_of_ten() -> None:
 def test_automatic_learning_stands_alone() -> None:
     with pytest.raises(ConfigurationError, match="auto alone"):
         EstimatorOptions(slow_parameters=("auto", "flow"))
+
+
+def test_a_parameter_that_is_known_exactly_is_off_by_what_a_wrong_length_would_move_the_thread_by() -> None:
+    learned, effect, square = learner(thread_of(), "rest_curvature")._slow, 1.0, 2e-6
+    learned.state = replace(learned.state, information=np.eye(1) * 1e30, effect=np.array([[square], [effect]]))
+    (found,) = learned.report()
+    assert 0.5 * (found.high - found.low) == pytest.approx(5e-4 * LENGTH * effect / square)
+
+
+def test_where_one_parameter_has_no_derivative_the_others_keep_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
+    way = poses(6)
+    estimator = learner(thread_of(), "stiffness_over_drag", "rest_curvature")
+    play(estimator, way[:5], true_shapes(thread_of(), way))
+    learned, predictor = estimator._slow, estimator.predictor
+    step, calls = predictor.step, iter(range(3))
+
+    def fails_for_the_first(pose: NeedlePose) -> Prediction:
+        if next(calls) == 1:  # 0 is the prediction itself
+            raise SolverError("banded", "stalled", 1.0, 1e-6)
+        return step(pose)
+
+    monkeypatch.setattr(predictor, "step", fails_for_the_first)
+    learned.step(way[5])
+    assert not learned.state.sensitivities[:, 0].any()
+    assert learned.state.sensitivities[:, 1].any()

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.vision.photographs import DIAMETER, RIGHT, ellipse_error, photo_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import Ellipse, find_ellipse
-from magnetosuture_thread.vision.dish.tilt import Tilt
+from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
 from magnetosuture_thread.vision.look import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import Pose, render
@@ -133,3 +133,21 @@ def test_the_covariance_of_an_unknown_tilt_holds_the_perspective_of_any_below_it
         error = np.array([*off, angle_off])
         covariance = found.covariance(tail, heading, radius) + np.diag([4e-6, 4e-6, 1e-3]) ** 2
         assert float(error @ np.linalg.solve(covariance, error)) < 14.16
+
+
+def test_points_of_an_ellipse_lie_evenly_around_its_centre_with_normals_outwards():
+    ellipse = Ellipse((330.0, 228.0), 150.0, 120.0, 0.7)
+    points, normals = ellipse.points(40)
+    offset = points - ellipse.centre_px
+    assert np.abs(points[:20] + points[20:] - 2.0 * np.array(ellipse.centre_px)).max() < 1e-9
+    assert np.hypot(*offset.T).max() == pytest.approx(ellipse.major, rel=1e-2)
+    assert (np.einsum("ij,ij->i", offset, normals) > 0.0).all()
+
+
+def test_of_a_tilted_dish_that_was_taken_for_a_circle_centre_scale_and_tilt_are_found():
+    given = Ellipse((335.3, 228.6), 150.0, 140.0, 0.7)
+    tilt, view = find_tilt(drawn(given, (640, 480), 190, 120), DishView((333.3, 231.6), DIAMETER / 290.0), DIAMETER)
+    assert tilt is not None
+    assert (tilt.angle, tilt.direction) == pytest.approx((math.acos(140.0 / 150.0), 0.7), abs=0.02)
+    assert math.dist(view.centre_px, given.centre_px) < 0.8
+    assert view.metres_per_pixel == pytest.approx(0.5 * DIAMETER / given.major, rel=6e-3)

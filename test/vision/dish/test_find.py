@@ -11,7 +11,7 @@ import pytest
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
-from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_dish, rim_shift
+from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_cut_dish, find_dish, rim_shift
 from magnetosuture_thread.vision.dish.tilt import Tilt
 from magnetosuture_thread.vision.dish.watch import AGREEING, LONG_SEARCH, DishWatch
 from magnetosuture_thread.vision.look import see_dish
@@ -117,3 +117,14 @@ def test_the_direction_of_a_tilt_is_the_same_in_image_and_dish(rotation: float):
     across = view.to_pixels(np.array([[0.0, 0.0], tilt.direction_in_dish]))
     u, v = across[1] - across[0]
     assert math.atan2(v, u) == pytest.approx(0.4)
+
+
+def test_a_dish_that_the_frame_cuts_off_is_found_on_whichever_side():
+    gray = gray_of((322.0, 238.0), 8e-5, 0)
+    for left, top, right, bottom in ((0, 0, 440, 480), (200, 0, 640, 480), (0, 120, 640, 480)):
+        u, v = 322.0 - left, 238.0 - top
+        cut = np.ascontiguousarray(gray[top:bottom, left:right])
+        found = find_cut_dish(cut, (u + 3.0, v - 2.0, 217.0), 0.035)
+        assert found is not None
+        assert math.dist(found.centre_px, (u, v)) < 0.3
+        assert found.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)

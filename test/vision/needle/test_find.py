@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,10 +16,14 @@ from hypothesis import strategies as st
 from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene
 from magnetosuture_thread.vision.images import prepare
+from magnetosuture_thread.vision.needle import measure
 from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.ends import leaves_tail
 from magnetosuture_thread.vision.needle.find import find_needles
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.needle.size import NeedleSize
+from magnetosuture_thread.vision.needle.steel_map import SteelMap
+from magnetosuture_thread.vision.needle.template import TemplateFit
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
 
 SIZE = NeedleSize(0.007 / VIEW.metres_per_pixel, 0.0004 / VIEW.metres_per_pixel, 0.1)
@@ -138,3 +145,35 @@ def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_ot
     assert other.covariance[1, 2] == pytest.approx(-30.0 * 0.001)
     assert other.covariance[0, 0] > 1.0, "it is not known where along the axis it ends"
     assert other.covariance[2, 2] == 0.001
+
+
+@pytest.mark.parametrize(("cost", "told"), [(100.0, True), (120.0, True), (130.0, False)])
+def test_where_both_ways_fit_alike_the_ends_tell_which_is_right_whichever_is_tried_first(
+    cost: float, told: bool, monkeypatch: pytest.MonkeyPatch
+):
+    tried: list[tuple[SteelMap, TemplateFit, TemplateFit]] = []
+    pointed_way = measure._pointed_way
+
+    def recorded(*given: Any) -> TemplateFit | None:
+        tried.append(given)
+        return pointed_way(*given)
+
+    monkeypatch.setattr(measure, "_pointed_way", recorded)
+    found, _ = find(camera_of(0.0).render(np.zeros(2), 0.4, NOWHERE))
+    steel, *fits = tried[0]
+    right, wrong = sorted(fits, key=lambda fit: -float(fit.arc.direction() @ found[0].direction_px))
+    right, wrong = replace(right, cost=cost), replace(wrong, cost=100.0)
+    assert pointed_way(steel, right, wrong) is (right if told else None)
+    assert pointed_way(steel, wrong, right) is (right if told else None)
+
+
+@pytest.mark.parametrize(("turns", "leaves"), [((), False), ((2.8,), True), ((1.8, -1.9), False)])
+def test_a_thread_leaves_a_tail_where_one_line_goes_away_from_it(turns: tuple[float, ...], leaves: bool):
+    dark = np.zeros((120, 160), np.float32)
+    for turn in turns:
+        cv2.line(dark, (60, 60), (round(60.0 + 45.0 * math.cos(turn)), round(60.0 + 45.0 * math.sin(turn))), 0.7, 2)
+    cv2.line(dark, (60, 60), (130, 60), 0.7, 5)
+    share = dark / np.float32(0.7)
+    steel = SteelMap(share, share, share, dark, 0.7, 0.0 * dark, np.zeros(dark.shape, np.uint8), (0.0, 0.0), (160, 120))
+    fit = TemplateFit(Arc(np.array([60.0, 60.0]), 0.0, 0.0), 70.0, 5.0, 0.0, 0.0, np.eye(6), 1)
+    assert leaves_tail(steel, fit) == leaves

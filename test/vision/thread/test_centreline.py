@@ -8,11 +8,13 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.vision.images import prepare
+from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import FollowedThread, find_centreline, follow_thread
+from magnetosuture_thread.vision.thread.loose import has_loose_thread
+from magnetosuture_thread.vision.thread.ridge import ZERO, darker_than_around, faint_ridge
 from magnetosuture_thread.vision.thread.search import WALL_PX
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
@@ -130,6 +132,12 @@ def test_the_walk_crosses_under_the_needle():
     check_order(walk(drawn(line), max_length=250.0), line)
 
 
+@pytest.mark.parametrize(("width", "level", "radius"), [(12, 60, 26.0), (14, 60, 23.0), (14, 120, 23.0)])
+def test_a_rope_is_followed_below_the_needle_to_its_end(width: int, level: int, radius: float):
+    line = winding(np.pi + np.clip((np.linspace(0.0, 237.0, 800) - 25.0) / radius, 0.0, 1.15 * np.pi))
+    assert line_error(walk(drawn(line, width=width, level=level), max_length=250.0), line)[1] > 0.95
+
+
 def test_a_near_pass_beside_an_earlier_part_does_not_capture_it():
     """A hairpin whose arms are 7 px apart."""
     s = np.linspace(0.0, 237.0, 1200)
@@ -192,3 +200,32 @@ def test_a_thread_a_few_grey_levels_from_the_floor_is_followed(level: int):
     mean, share = line_error(found, wave())
     assert mean < 1.0
     assert share > 0.9
+
+
+@pytest.mark.parametrize(
+    ("begin", "turn", "loose"),
+    [((300.0, 240.0), np.pi, False), ((300.0, 230.0), -1.7, False), ((300.0, 180.0), np.pi, True)],
+)
+def test_a_thread_is_loose_where_it_does_not_leave_the_needle(begin: tuple[float, float], turn: float, loose: bool):
+    line = winding(np.full(100, turn), 150.0, begin)
+    picture = prepare(drawn(line, width=2, level=80), 2)
+    assert has_loose_thread(picture, NEEDLE, Wall((320.0, 240.0), 230.0), 100.0) == loose
+
+
+@pytest.mark.parametrize("side", [np.s_[:, :30], np.s_[:, -30:], np.s_[:30], np.s_[-30:]])
+def test_the_noise_that_a_ridge_is_held_to_is_that_away_from_a_windows_borders(side: tuple[slice, ...]):
+    random = np.random.default_rng(3)
+    window = np.clip(random.normal(200.0, 3.0, (240, 320)), 0.0, 255.0).astype(np.uint8)
+    usual = darker_than_around(window)[1]
+    window[side] = random.integers(0, 256, window[side].shape)
+    assert darker_than_around(window)[1] == pytest.approx(usual, rel=0.06)
+
+
+@pytest.mark.parametrize("pale", [False, True])
+def test_a_faint_ridge_shows_what_is_darker_or_what_is_paler_by_units_of_noise(pale: bool):
+    difference = np.array([[-2.0, -1.0, 0.0, 1.0, 2.0]], np.float32)  # positive where it is darker
+    ridge = faint_ridge(difference, 4.0, np.zeros((1, 5), np.uint8), 1, 1, pale=pale)
+    above = ridge.strength[0].astype(float) - ZERO
+    assert above[2] == pytest.approx(0.0, abs=0.5)
+    np.testing.assert_allclose(above[[0, 1, 3]], -above[4] * np.array([1.0, 0.5, -0.5]), atol=1.0)
+    assert (above[4] < 0.0) == pale

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,12 +15,17 @@ from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.thread_observation import PieceEnd
-from magnetosuture_thread.vision.images import Wall
+from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.look import Track
+from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.hiding import Hiding
+from magnetosuture_thread.vision.thread.appearance import MIN_SHARE, Appearance, appearance_of, respaced
+from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding
+from magnetosuture_thread.vision.thread.observe import observe
 from magnetosuture_thread.vision.thread.order import Piece, find_order
-from magnetosuture_thread.vision.thread.strands import Strand
+from magnetosuture_thread.vision.thread.piece_ends import BARE_COLOUR, is_bare_beyond
+from magnetosuture_thread.vision.thread.strands import Strand, first_clear_of, strand_along
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 SEED = 4712
@@ -27,6 +33,8 @@ FRAMES = 6
 SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
 COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "hand_instrument"]
 SCALE = 8e-5
+DARK = Appearance(pale=False, width_px=3.0, darkness=np.array([1.0, 1.0]), strength=60.0, noise=1.0)
+NEEDLE = MeasuredNeedle(Arc(np.array([20.0, 20.0]), 0.0, 0.0), 40.0, 5.0)
 
 
 @cache
@@ -129,7 +137,8 @@ def test_the_straight_way_below_a_cover_is_taken_and_a_piece_beside_is_left():
     assert [(placed.index, placed.turned) for placed in order.placed] == [(0, False), (1, True)]
     low, high = order.placed[1].arc_length
     assert low == pytest.approx(69.0 + 102.0)
-    assert low <= high <= 260.0 - 79.0 + 1e-9
+    assert low < high <= 260.0 - 79.0 + 1e-9
+    assert order.length == pytest.approx((69.0 + 102.0 + 79.0, high + 79.0))
 
 
 def test_where_two_ways_are_as_good_none_is_taken():
@@ -170,3 +179,91 @@ def test_a_strand_from_its_other_end_has_its_points_strengths_and_gaps_in_that_o
     turned = Strand(points, np.array([3.0, 4.0, 5.0]), np.array([True, True, False])).turned()
     assert (turned.points[0].tolist(), turned.strength.tolist()) == ([2.0, 1.0], [5.0, 4.0, 3.0])
     assert turned.visible.tolist() == [False, True, True]
+
+
+def test_a_thread_is_visible_where_it_is_darker_than_a_share_of_its_usual_strength():
+    image = np.full((60, 120), 200, np.uint8)
+    for left, share in ((10, 1.0), (40, 1.5 * MIN_SHARE), (70, 0.5 * MIN_SHARE)):
+        cv2.line(image, (left, 30), (left + 29, 30), round(200.0 - share * DARK.strength), 3)
+    shown = strand_along(image, DARK, np.array([[20.0, 30.0], [50.0, 30.0], [80.0, 30.0]])).visible
+    assert shown.tolist() == [True, True, False]
+
+
+def test_a_walk_along_the_needle_is_clear_of_it_beyond_its_tip():
+    along = np.arange(0.0, 80.0, 2.0)
+    walk = NEEDLE.arc.at(along)
+    assert along[first_clear_of(NEEDLE, walk)] == pytest.approx(NEEDLE.length_px + NEEDLE_PX, abs=2.0)
+    assert along[first_clear_of(NEEDLE, NEEDLE.arc.at(-along))] == pytest.approx(NEEDLE_PX, abs=2.0)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 2.0, 7.0, 30.0])
+def test_a_polyline_gets_vertices_of_about_the_wanted_distance(spacing: float):
+    apart = np.linalg.norm(np.diff(respaced(line((0.0, 0.0), (21.0, 28.0)), spacing), axis=0), axis=1)
+    assert np.ptp(apart) < 1e-9
+    assert abs(len(apart) - 35.0 / spacing) < 0.5 + 1e-9
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_width_and_strength_of_a_thread_are_those_of_its_profile(sign: float):
+    aside = np.arange(80.0)[:, None] - 40.0
+    image = np.round(120.0 + sign * 60.0 * np.exp(-0.5 * aside**2) * np.ones(160)).astype(np.uint8)
+    points = np.column_stack([np.arange(20.0, 140.0, 2.0), np.full(60, 40.0)])
+    picture = prepare(image, 1)
+    found = appearance_of(picture, picture.darkest.pixels, points, np.ones(60, np.bool_))
+    assert found.pale == (sign > 0.0)
+    assert found.strength == pytest.approx(60.0, rel=0.03)
+    assert found.width_px == pytest.approx(2.355, abs=0.5)
+
+
+def test_the_noise_of_a_pixel_is_measured_beside_the_thread():
+    deviation, random = 10.0, np.random.default_rng(0)
+    image = random.normal(150.0, deviation, (240, 320))
+    measured = []
+    for row in range(40, 220, 40):
+        cv2.line(image, (20, row), (300, row), 60.0, 3)
+    picture = prepare(np.clip(image, 0.0, 255.0).astype(np.uint8), 1)
+    for row in range(40, 220, 40):
+        points = np.column_stack([np.arange(30.0, 290.0, 2.0), np.full(130, float(row))])
+        measured.append(appearance_of(picture, picture.darkest.pixels, points, np.ones(130, np.bool_)).noise)
+    assert np.mean(measured) == pytest.approx(deviation, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("across", "colour", "fades", "bare"),
+    [
+        (0.0, 0.0, False, True),
+        (0.16, 0.0, False, True),
+        (0.0, 0.5, False, True),
+        (0.0, 1.45, False, False),
+        (0.0, 0.0, True, False),
+    ],
+)
+def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_or_the_thread_fades(
+    across: float, colour: float, fades: bool, bare: bool
+):
+    image = np.full((160, 160, 3), 180.0)
+    image *= 1.0 + across * (np.arange(160) > 80)[:, None, None] - 0.5 * across * (np.arange(160) != 80)[:, None, None]
+    image[:, 81:] *= 1.0 + 0.5 * colour * BARE_COLOUR * np.array([-1.0, 0.0, 1.0])
+    image[79:82, 20:81] -= DARK.strength
+    picture = prepare(np.round(image).astype(np.uint8), 1)
+    points = np.column_stack([np.arange(20.0, 81.0, 2.0), np.full(31, 80.0)])
+    strength = np.where(fades & (np.arange(31) > 24), 2.0, DARK.strength)
+    strand = Strand(points, strength, np.ones(31, np.bool_))
+    assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, NEEDLE) == bare
+
+
+@pytest.mark.parametrize("covered", [False, True])
+def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: bool):
+    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+    image = np.full((480, 640), 225, np.uint8)
+    cv2.line(image, (300, 240), (150, 240), 100, 2)
+    cv2.line(image, (300, 240), (387, 240), 50, 5)
+    if covered:
+        image[240:300, 215:255] = 140
+    noise = np.random.default_rng(0).normal(0.0, 2.0, image.shape)
+    image = np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + noise, 0.0, 255.0).astype(np.uint8)
+    view, walk = DishView((320.0, 240.0), SCALE), line((300.0, 240.0), (149.0, 240.0))
+    seen = observe(prepare(image, 2), needle, walk, view, 0.0172, 150.0 * SCALE, scale_known=True)
+    u = np.concatenate([view.to_pixels(piece.points)[:, 0] for piece in seen.pieces])
+    assert ((u > 220.0) & (u < 250.0)).any() == (not covered)
+    assert seen.complete == (not covered)
