@@ -28,7 +28,7 @@ from typing import Any
 import pytest
 
 IMPORTED = "import"
-SURVIVED, CAUGHT, NOT_REPLACED = 0, 1, 3  # how a fork ends
+SURVIVED, CAUGHT, NOT_REPLACED, NOT_JUDGED = 0, 1, 3, 4  # how a fork ends
 LIMIT = float(os.environ.get("MUTANT_LIMIT", "60"))  # s; a test that takes longer judges no mutant
 TREE = Path(os.environ["MUTANT_TREE"])
 
@@ -166,7 +166,7 @@ def in_fork(run: Callable[[int], int], timeout: float) -> tuple[int, str]:
     if child == 0:
         os.setsid()
         os.close(reader)
-        status = CAUGHT
+        status = NOT_JUDGED  # where the judge itself fails, which is no test that does
         try:
             status = run(writer)
         except BaseException:
@@ -215,9 +215,9 @@ class Judge:
 
     def run(self, session: pytest.Session, mutant: dict[str, Any], writer: int) -> int:
         """Replace the code of a mutated function and run the tests of its lines; return how the fork ends."""
+        items = [self.items[name] for name in mutant["tests"]]  # a name of a test that is no more: not judged
         if not replace_code(TREE / mutant["path"], mutant["mutated"]):
             return NOT_REPLACED
-        items = [self.items[name] for name in mutant["tests"]]
         for item, following in zip(items, [*items[1:], None], strict=True):
             session.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
             if session.testsfailed:
@@ -236,7 +236,8 @@ def judge_all(run: Callable[[dict[str, Any], int], int]) -> None:
                 status, by = in_fork(partial(run, mutant), mutant["timeout"])
             if status == NOT_REPLACED:
                 continue  # pytest has to start anew for it
-            verdict = {"number": mutant["number"], "text": mutant["text"], "caught": status != SURVIVED, "by": by}
+            caught, by = status not in (SURVIVED, NOT_JUDGED), "not judged" if status == NOT_JUDGED else by
+            verdict = {"number": mutant["number"], "text": mutant["text"], "caught": caught, "by": by}
             verdicts.write(json.dumps({**verdict, "seconds": round(time.monotonic() - begin, 2)}) + "\n")
             verdicts.flush()
 
