@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.vision import tracker as tracker_module
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -199,3 +203,29 @@ def test_a_thread_that_folds_over_the_needle_while_it_moves_never_reverses_it():
         tracked += seen.state is State.TRACKED
         assert seen.state is not State.TRACKED or pose.is_right(seen)
     assert tracked >= 54
+
+
+@pytest.mark.parametrize("was_clear", [True, False])
+def test_a_needle_that_looks_the_other_way_round_keeps_only_a_direction_that_was_clear(
+    monkeypatch: pytest.MonkeyPatch, was_clear: bool
+):
+    """As where a thread touches its tip: in later frames, or in the first ones and then in none."""
+    tracker, measured, right = VisionTracker(VisionTrackerSettings(), SCENE), tracker_module.needles_in, True
+
+    def needles_in(*given: Any, **options: Any) -> Any:
+        needles, refused = measured(*given, **options)
+        needles = [replace(each, direction_is_clear=was_clear and right) for each in needles]
+        return [each if right else each.reversed() for each in needles], refused
+
+    monkeypatch.setattr(tracker_module, "needles_in", needles_in)
+    headings = []
+    for index in range(12):
+        right = (index < 6) is was_clear
+        seen, pose = tracker.track(render(moving(index)), index / RATE), moving(index)
+        if seen.state is State.TRACKED:
+            headings.append(float(seen.heading @ [np.cos(pose.heading), np.sin(pose.heading)]))
+    assert all(each > 0.9 for each in headings[-3:])
+    if was_clear:
+        assert min(headings) > 0.9
+    else:
+        assert headings[0] < -0.9
