@@ -233,4 +233,6 @@ def check_scene(thread: Thread, scene: Scene) -> None:
             if shape.geometry.radius < radius:
                 raise ConfigurationError(name, shape.geometry.radius, f"a radius {expected}")
         elif not shape.geometry.can_contain(radius):
-            raise ConfigurationError(name, "a shape", f"one with room for a disc of a radius {expected}")
+            raise ConfigurationError(
+                name, "a shape that a segment could pass through", f"one with room for a disc of a radius {expected}"
+            )

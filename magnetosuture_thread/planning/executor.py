@@ -41,10 +41,9 @@ PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
 """Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
 
 BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
-MAX_REPLANS = 6  # of one goal, after which it is given up
-MAX_MISSES = 6  # of the place of one goal by the end of a path, after which it is given up
+MAX_REPLANS, MAX_DETOURS, MAX_MISSES = 6, 20, 6  # of a goal: without progress, without less to go, off its place
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
-PROGRESS = 2e-3  # m; that is left less to go than ever before, after which the plans before count no more
+PROGRESS = 2e-3  # m; on a new path, or less to go than ever before, after which plans before count no more
 WRAPPED = 0.02  # rad; of a wrap may be left
 MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
@@ -120,10 +119,9 @@ class ProcedureExecutor:
     known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
     that gets no further while it is commanded (`RestDetector`) backs off, and its goal is planned anew; one that is off
     its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a turn throws the needle aside,
-    is followed by one that ends as far to the other side. After `MAX_REPLANS` without progress, or `MAX_MISSES`, the
-    goal is given up, and the needle is at rest; so is a procedure that has waited for the thread for too long.
-
-    Pure: time comes in with the poses.
+    is followed by one that ends as far to the other side. After `MAX_REPLANS`, `MAX_DETOURS` or `MAX_MISSES` the goal
+    is given up, and the needle rests; so is a procedure that has waited too long for the thread. Time comes in with the
+    poses: it is pure.
 
     Args:
         procedure: what to do.
@@ -150,7 +148,7 @@ class ProcedureExecutor:
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._begin: Vector | None = None
         self._rest = RestDetector()
-        self._replans, self._misses, self._left = 0, 0, math.inf
+        self._replans, self._detours, self._misses, self._left = 0, 0, 0, math.inf
         self._aim = np.zeros(2)  # from the goal's place to where its path is to end [m]
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
         self._swept = 0.0  # of the goal's wrap, so far [rad]
@@ -256,8 +254,10 @@ class ProcedureExecutor:
         if isinstance(goal, Tighten) and self._is_tight(goal, thread):
             return self._next_goal()
         assert self.path is not None
+        if self._tracker.travel > PROGRESS:
+            self._replans = 0
         if (left := self.path.length - self._tracker.travel) < self._left - PROGRESS:
-            self._replans, self._left = 0, left
+            self._detours, self._left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
         if self._local is None:
             command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
@@ -287,8 +287,8 @@ class ProcedureExecutor:
         """Plan anew, to the other side of a goal's place, from which the needle has ended off."""
         self._misses += 1
         if self._misses > MAX_MISSES:
-            by = f"{1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
-            self.abort(f"goal {self.goal + 1} is given up: the needle misses its place by {by}, however it is planned")
+            by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
+            self.abort(f"goal {self.goal + 1} is given up: the needle misses its place {by}, however it is planned")
             return self._output(np.zeros(2))
         assert self.path is not None
         aim, leeway = self._aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
@@ -334,8 +334,8 @@ class ProcedureExecutor:
 
     def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
-        self._replans += 1
-        if self._replans > MAX_REPLANS:
+        self._replans, self._detours = self._replans + 1, self._detours + 1
+        if self._replans > MAX_REPLANS or self._detours > MAX_DETOURS:
             self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
             return self._output(np.zeros(2))
         self._drop_path()
@@ -353,8 +353,8 @@ class ProcedureExecutor:
         return self._output(np.zeros(2))
 
     def _begin_goal(self, goal: int) -> None:
-        self.goal, self._replans, self._misses, self._left, self._aim = goal, 0, 0, math.inf, np.zeros(2)
-        self._swept, self._bearing = 0.0, None
+        self.goal, self._replans, self._detours, self._misses, self._left = goal, 0, 0, 0, math.inf
+        self._swept, self._bearing, self._aim = 0.0, None, np.zeros(2)
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:
         """Return the speed at which tension and friction stay within the goal's limits [m/s]."""

@@ -37,6 +37,7 @@ MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for erro
 VIEW_SAMPLES = 24
 MAX_STATES = 20_000_000
 MAX_WAYS = 32  # that are kept
+PLACE_SHARE, PLACE_STEPS = 0.7, 0.75  # of a goal's tolerance, and of the lattice: how far from its place a way may end
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
 GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
 
@@ -311,14 +312,14 @@ class NeedlePlanner:
         else:
             place, tolerance = np.array(goal.to) if goal.to else start, goal.tolerance
         # At least the nearest point of the lattice.
-        places = np.hypot(x - place[0], y - place[1]) <= max(0.7 * tolerance, 0.75 * self._step)
+        places = np.hypot(x - place[0], y - place[1]) <= max(PLACE_SHARE * tolerance, PLACE_STEPS * self._step)
         headings = np.abs(turn_of(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
         return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), place)
 
     def _end_of(self, goal: Goal, start: Vector, state: Vector, kept: float) -> Vector | None:
         """Return the pose that a goal asks for, near a state of the lattice; None for none, or if it is not free."""
-        if not isinstance(goal, GoTo | Withdraw):
-            return None
+        if not isinstance(goal, GoTo | Withdraw) or PLACE_SHARE * goal.tolerance >= PLACE_STEPS * self._step:
+            return None  # a state of the lattice is near enough
         x, y = goal.position if isinstance(goal, GoTo) else goal.to or start.tolist()
         angle = float(state[2])
         if isinstance(goal, GoTo) and goal.heading:
