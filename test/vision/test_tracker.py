@@ -10,6 +10,7 @@ import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.vision import look
 from magnetosuture_thread.vision import tracker as tracker_module
 from magnetosuture_thread.vision.look import State, Track
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -210,10 +211,10 @@ def test_a_needle_that_looks_the_other_way_round_keeps_only_a_direction_that_was
     monkeypatch: pytest.MonkeyPatch, was_clear: bool
 ):
     """As where a thread touches its tip: in later frames, or in the first ones and then in none."""
-    tracker, measured, right = VisionTracker(VisionTrackerSettings(), SCENE), tracker_module.needles_in, True
+    tracker, right = VisionTracker(VisionTrackerSettings(), SCENE), True
 
     def needles_in(*given: Any, **options: Any) -> Any:
-        needles, refused = measured(*given, **options)
+        needles, refused = look.needles_in(*given, **options)
         needles = [replace(each, direction_is_clear=was_clear and right) for each in needles]
         return [each if right else each.reversed() for each in needles], refused
 
