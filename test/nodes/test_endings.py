@@ -46,6 +46,14 @@ LAST = (topics.CURRENTS, topics.RIG_CURRENTS, topics.NEEDLE_SETPOINT, topics.BRI
 TIMEOUT = 60.0  # s for a process on a busy machine
 
 
+@pytest.fixture(autouse=True)
+def _terminal() -> Iterator[None]:
+    """Let what is started hear of SIGHUP, also where the tests run under nohup, which has it ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @contextmanager
 def process(graph, **parameters: Any) -> Iterator[subprocess.Popen[bytes]]:
     """Start a bridge as a process in the test's graph, whose wires end at the test."""
