@@ -116,22 +116,20 @@ class ThreadForecasts:
         self._waiting.put(ForecastTask(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
 
     def _work(self) -> None:
-        while self._error is None and (command := self._waiting.get()) is not None:
+        while self._error is None and (task := self._waiting.get()) is not None:
             try:
                 if self._waiting.empty():
-                    self._publish(command)
+                    self._publish(task)
             except Exception as error:
                 self._error = error
 
-    def _publish(self, command: ForecastTask) -> None:
+    def _publish(self, task: ForecastTask) -> None:
         try:
-            forecast = command.forecaster.forecast(
-                command.start, command.commanded, command.horizon, slowed=command.slowed
-            )
+            forecast = task.forecaster.forecast(task.start, task.commanded, task.horizon, slowed=task.slowed)
         except MagnetosutureError as error:
             self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
             return
-        when = MESSAGES.time(command.stamp)
+        when = MESSAGES.time(task.stamp)
         self._published.publish(forecast_message(MESSAGES, when, forecast))
         if self._markers.get_subscription_count():
             self._markers.publish(forecast_markers(MESSAGES, when, forecast))

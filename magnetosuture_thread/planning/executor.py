@@ -120,8 +120,8 @@ class ProcedureExecutor:
     that gets no further while it is commanded (`RestDetector`) backs off, and its goal is planned anew; one that is off
     its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a turn throws the needle aside,
     is followed by one that ends as far to the other side. After `MAX_REPLANS`, `MAX_DETOURS` or `MAX_MISSES` the goal
-    is given up, and the needle rests; so is a procedure that has waited too long for the thread. Time comes in with the
-    poses: it is pure.
+    is given up, and the needle rests; so is a procedure that has waited too long for the thread. Pure: time comes in
+    with the poses.
 
     Args:
         procedure: what to do.

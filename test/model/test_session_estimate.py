@@ -277,7 +277,7 @@ def test_a_thread_that_is_fixed_beside_the_tail_is_estimated(offset: float):
 
 
 @pytest.mark.parametrize("observed", [False, True])
-def test_where_a_pose_cannot_be_solved_only_a_thread_that_was_never_measured_begins_anew(
+def test_a_pose_without_solution_restarts_the_estimate_only_of_a_thread_that_was_never_measured(
     observed: bool, monkeypatch: pytest.MonkeyPatch
 ):
     session = ThreadSession(made(initial_shape="straight"), None)

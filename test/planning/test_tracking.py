@@ -224,5 +224,6 @@ def test_before_a_crossing_the_needle_is_kept_to_the_side_that_it_is_thrown_from
     left, right = offset_before_crossing(-2.5e-3, 0.6), offset_before_crossing(2.5e-3, 0.6)
     assert left > plain + 5e-5
     assert right < plain - 5e-5
-    assert max(abs(left), abs(right)) < 0.7 * LEEWAY
+    # The lead is 0.4 of it; were it integrated besides, the needle would be off by 0.64.
+    assert max(abs(left), abs(right)) < 0.5 * LEEWAY
     assert abs(plain) < 1e-5, "what is not pulled is on its path"

@@ -135,7 +135,7 @@ def test_the_covariance_of_an_unknown_tilt_holds_the_perspective_of_any_below_it
         assert float(error @ np.linalg.solve(covariance, error)) < 14.16
 
 
-def test_points_of_an_ellipse_lie_evenly_around_its_centre_with_normals_outwards():
+def test_points_of_an_ellipse_are_symmetric_about_its_centre_and_have_outward_normals():
     ellipse = Ellipse((330.0, 228.0), 150.0, 120.0, 0.7)
     points, normals = ellipse.points(40)
     offset = points - ellipse.centre_px

@@ -147,9 +147,9 @@ def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_ot
     assert other.covariance[2, 2] == 0.001
 
 
-@pytest.mark.parametrize(("cost", "told"), [(100.0, True), (120.0, True), (130.0, False)])
-def test_where_both_ways_fit_alike_the_ends_tell_which_is_right_whichever_is_tried_first(
-    cost: float, told: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("cost", "decided"), [(100.0, True), (120.0, True), (130.0, False)])
+def test_the_ends_decide_between_two_directions_that_fit_equally_in_either_order(
+    cost: float, decided: bool, monkeypatch: pytest.MonkeyPatch
 ):
     tried: list[tuple[SteelMap, TemplateFit, TemplateFit]] = []
     pointed_way = measure._pointed_way
@@ -163,8 +163,8 @@ def test_where_both_ways_fit_alike_the_ends_tell_which_is_right_whichever_is_tri
     steel, *fits = tried[0]
     right, wrong = sorted(fits, key=lambda fit: -float(fit.arc.direction() @ found[0].direction_px))
     right, wrong = replace(right, cost=cost), replace(wrong, cost=100.0)
-    assert pointed_way(steel, right, wrong) is (right if told else None)
-    assert pointed_way(steel, wrong, right) is (right if told else None)
+    assert pointed_way(steel, right, wrong) is (right if decided else None)
+    assert pointed_way(steel, wrong, right) is (right if decided else None)
 
 
 @pytest.mark.parametrize(("turns", "leaves"), [((), False), ((2.8,), True), ((1.8, -1.9), False)])
