@@ -36,6 +36,13 @@ _QUANTITIES: dict[str, tuple[Any, str, str, float | None, float | None]] = {
         2.5e-5,
         0.05,
     ),
+    "pose_margin": (
+        0.0,
+        "clearance kept in addition to keep_out, for the error of a needle pose that is extrapolated to the present",
+        "m",
+        0.0,
+        0.005,
+    ),
     "thread_length": (0.019, "rest length of the thread", "m", 0.001, 2.0),
     "viscosity": (1.0, "dynamic viscosity of the liquid; glycerin at room temperature is about 1", "Pa s", 1e-4, 100.0),
     "coil_angles": (

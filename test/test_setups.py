@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file, share_directory
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import read_setup
@@ -50,6 +52,18 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     assert coils.needle_drag == pytest.approx(body.drag[0] + thread_drag, rel=0.05)
     coil = rig.field().per_current(np.zeros((1, 3)))[0, 0]
     assert np.linalg.norm(coil) == pytest.approx(coils.field_per_current, rel=0.01)
+
+
+def test_bridge_planner_and_forecast_keep_the_same_clearance():
+    """Else plans lead where the filter stops the needle, and forecasts do not show it."""
+    setup = read_setup("hernia_ring")
+    coils = setup.coils
+    planner = NeedlePlannerSettings(keep_out=coils.keep_out, pose_margin=coils.pose_margin).planner(setup.scene)
+    clearance = coils.keep_out + coils.pose_margin
+    assert coils.pose_margin > 0.0
+    assert coils.safety_filter(setup.scene).keep_out == pytest.approx(clearance)
+    assert planner.keep_out == pytest.approx(clearance)
+    assert make_forecaster(setup.model, setup.scene).safety.keep_out == pytest.approx(clearance)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -85,7 +85,8 @@ def check_run(procedure: Procedure, setup: Setup, variation: Variation) -> None:
 
 def _planner(setup: Setup) -> NeedlePlanner:
     kinematics, settings = setup.coils.needle().kinematics, setup.coils
-    return NeedlePlanner(setup.scene, kinematics, settings.keep_out, setup.model.thread_length, settings.coil_angles)
+    clearance = settings.keep_out + settings.pose_margin
+    return NeedlePlanner(setup.scene, kinematics, clearance, setup.model.thread_length, settings.coil_angles)
 
 
 def run_procedure(

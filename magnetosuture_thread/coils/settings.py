@@ -78,6 +78,7 @@ class CoilBridgeSettings(Configuration):
 
     scene: str = shared_parameter("scene")
     keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
     barriers: tuple[str, ...] = quantity((), "barriers of your own for the needle, each as module:class; see Barrier")
     approach_rate: float = quantity(
         10.0,
@@ -253,7 +254,7 @@ class CoilBridgeSettings(Configuration):
         return NeedleSafetyFilter(
             scene,
             load_barriers(self.barriers, f"{self.GROUP}.barriers"),
-            keep_out=self.keep_out,
+            keep_out=self.keep_out + self.pose_margin,
             approach_rate=self.approach_rate,
             hold_time=self.hold_time,
             max_speed=self.max_speed,

@@ -21,7 +21,7 @@ def make_forecaster(
     Args:
         settings: of the thread model.
         scene: dish and shapes.
-        safety: the needle's filter; None for one with the settings' needle and `keep_out`.
+        safety: the needle's filter; None for one with the settings' needle, `keep_out` and `pose_margin`.
         options: further arguments of `ThreadForecaster`, by name; they come before those of the settings.
 
     Raises:
@@ -30,7 +30,7 @@ def make_forecaster(
     if safety is None:
         safety = NeedleSafetyFilter(
             scene,
-            keep_out=settings.keep_out,
+            keep_out=settings.keep_out + settings.pose_margin,
             needle_length=settings.needle_length,
             needle_curvature=settings.needle_curvature,
         )

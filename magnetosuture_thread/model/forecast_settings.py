@@ -29,5 +29,6 @@ class ForecastSettings(Configuration):
     )
     friction_feedback: str = shared_parameter("friction_feedback")
     keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")

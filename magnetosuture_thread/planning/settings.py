@@ -27,6 +27,7 @@ class NeedlePlannerSettings(Configuration):
     coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     friction_feedback: str = shared_parameter("friction_feedback")
     keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
     pose_timeout: float = quantity(
         0.5, "a procedure pauses after this long without a needle pose", unit="s", minimum=0.05, maximum=5.0
     )
@@ -73,4 +74,5 @@ class NeedlePlannerSettings(Configuration):
     def planner(self, scene: Scene) -> NeedlePlanner:
         """Return a planner for a scene."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
-        return NeedlePlanner(scene, kinematics, self.keep_out, self.thread_length, self.coil_angles)
+        clearance = self.keep_out + self.pose_margin  # as the bridge's filter
+        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, self.coil_angles)

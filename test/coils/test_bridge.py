@@ -356,6 +356,25 @@ def test_the_needle_never_comes_closer_than_it_may(
     assert least < 0.003  # it did get there
 
 
+def test_a_pose_error_within_pose_margin_brings_the_needle_no_closer_than_keep_out():
+    """Each pose is measured 20 um farther from the wall than the needle is, which the bridge cannot know."""
+    error, least = 2e-5, {}
+    for margin in (0.0, error):
+        settings, scene = CoilBridgeSettings(pose_margin=margin), Scene(Dish(0.035), ())
+        plant = Plant(settings, scene, velocity=(0.02, 0.0)).ready()
+        plant.tail = None
+        tail, heading, needle = np.array([0.004, 0.0]), EAST, settings.needle().kinematics
+        for number in range(1, 800):
+            if number % 10 == 0:
+                measured = tail - error * EAST
+                plant.bridge.extrapolator.update(measured, heading, plant.time, number, plant.time, plant.time)
+            moved = needle.body_velocity(heading, plant.run(PERIOD)[0].allocation.velocity)
+            tail, heading = needle.moved(tail, heading, *moved, PERIOD)
+        least[margin] = scene.dish.radius - math.hypot(*needle.tip(tail, heading)) - settings.keep_out
+    assert least[0.0] < -0.8 * error
+    assert -1e-9 < least[error] < 1e-5
+
+
 def compensated_motion(
     plant: Plant, tail: NDArray[np.float64], heading: NDArray[np.float64], pull: NDArray[np.float64], steps: int
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:

@@ -13,8 +13,9 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 
-def test_the_filter_has_dish_shapes_and_keep_out():
-    settings = CoilBridgeSettings(keep_out=0.001, approach_rate=2.0)
+@pytest.mark.parametrize(("keep_out", "pose_margin"), [(0.001, 0.0), (0.0007, 0.0003)])
+def test_the_filter_has_dish_shapes_keep_out_and_pose_margin(keep_out: float, pose_margin: float):
+    settings = CoilBridgeSettings(keep_out=keep_out, pose_margin=pose_margin, approach_rate=2.0)
     post = SceneShape("post", "instrument", Disc((-0.006, 0.0), 0.001))
     safety, east = settings.safety_filter(Scene(Dish(0.035), (post,))), np.array([1.0, 0.0])
     assert safety.clearance(np.array([0.0, 0.0]), east) == pytest.approx(0.005)
