@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from magnetosuture_thread.campaign.loop import LoopFrame
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.planner import NeedlePlanner
-from magnetosuture_thread.planning.procedure import Wrap
+from magnetosuture_thread.planning.procedure import ProcedureLimits, Wrap
 from magnetosuture_thread.safety.barriers import measure
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
@@ -46,6 +47,7 @@ class RunExtremes:
     Args:
         planner: whose needle it is.
         scene: around it.
+        limits: of each goal.
         wrap: whose angle is measured; None for none.
 
     Attributes:
@@ -55,14 +57,19 @@ class RunExtremes:
         wrapped: maximum angle that the thread swept about the shape of the wrap [deg].
         tension: peak of the thread [N].
         friction_nodes: maximum under friction at once, by the model.
+        tension_excess: maximum of the tension above the limit of the goal that is pursued [N].
+        friction_excess: the same of the nodes under friction.
         closest: the instant with the minimum clearance; None before the first frame.
     """
 
-    def __init__(self, planner: NeedlePlanner, scene: Scene, wrap: Wrap | None) -> None:
-        self._planner, self._wrap, self._scene = planner, wrap, scene
+    def __init__(
+        self, planner: NeedlePlanner, scene: Scene, limits: Sequence[ProcedureLimits], wrap: Wrap | None
+    ) -> None:
+        self._planner, self._wrap, self._scene, self._limits = planner, wrap, scene, limits
         self._packed = pack_scene(scene)
         self.clearance, self.penetration, self.rest, self.wrapped = math.inf, 0.0, 0.0, 0.0
         self.tension, self.friction_nodes = 0.0, 0
+        self.tension_excess, self.friction_excess = -limits[0].tension, -limits[0].friction_nodes
         self.closest: RunInstant | None = None
         self._last: deque[RunInstant] = deque()
         self._anchor: tuple[float, float, float, float] | None = None
@@ -86,6 +93,9 @@ class RunExtremes:
         self.penetration = max(self.penetration, -self._distance(frame.thread))
         self.tension = max(self.tension, frame.tension)
         self.friction_nodes = max(self.friction_nodes, frame.condition.friction_nodes)
+        limits = self._limits[goal]
+        self.tension_excess = max(self.tension_excess, frame.tension - limits.tension)
+        self.friction_excess = max(self.friction_excess, frame.condition.friction_nodes - limits.friction_nodes)
         if self._wrap is not None:
             swept = math.degrees(self._planner.swept_by(self._wrap.around, frame.thread))
             self.wrapped = max(self.wrapped, abs(swept))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from magnetosuture_thread.planning.procedure import Procedure
-
 KEEP_OUT_TOLERANCE = 5e-6  # m
 PENETRATION_TOLERANCE = 1e-6  # m
 MAX_REST = 3.0  # s
@@ -25,6 +23,8 @@ class RunFigures:
         wrap_degrees: that the thread swept at the most about the shape of the first wrap; 0 without one.
         max_tension_n: peak of the thread.
         max_friction_nodes: under friction at once, by the model.
+        max_tension_excess_n: of the tension above the limit of the goal that was pursued; negative if it stayed below.
+        max_friction_excess: of the nodes under friction above that goal's limit.
     """
 
     time_s: float
@@ -35,59 +35,35 @@ class RunFigures:
     wrap_degrees: float
     max_tension_n: float
     max_friction_nodes: int
+    max_tension_excess_n: float
+    max_friction_excess: int
 
-
-@dataclass(frozen=True)
-class RunLimits:
-    """Limits of a run.
-
-    Attributes:
-        clearance: minimum of the needle's axis from wall and shapes [m].
-        tension: of the thread [N].
-        friction_nodes: at once.
-    """
-
-    clearance: float
-    tension: float
-    friction_nodes: int
-
-    @classmethod
-    def of(cls, procedure: Procedure, keep_out: float) -> RunLimits:
-        """Return the limits of a procedure, with the bridge's `keep_out` [m]: the strictest of its goals'."""
-        limits = procedure.limits
-        return cls(
-            keep_out - KEEP_OUT_TOLERANCE,
-            min(each.tension for each in limits),
-            min(each.friction_nodes for each in limits),
-        )
-
-    def broken(self, found: RunFigures) -> dict[str, str]:
-        """Return the limits that a run did not keep: by the name of the figure, what was found and what is allowed.
+    def beyond_limits(self, keep_out: float) -> dict[str, str]:
+        """Return what a run did not keep: by the name of the figure, what was found and what is allowed.
 
         A run without a path has no ideal time, and has failed for that.
+
+        Args:
+            keep_out: of the bridge [m].
         """
-        clearance, ratio = found.min_needle_clearance_m, MAX_TIME_RATIO * found.ideal_time_s
+        clearance, allowed = self.min_needle_clearance_m, keep_out - KEEP_OUT_TOLERANCE
+        ratio = MAX_TIME_RATIO * self.ideal_time_s
+        tension, friction = self.max_tension_excess_n, self.max_friction_excess
         checks = {
             "min_needle_clearance_m": (
-                clearance < self.clearance,
-                f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * self.clearance:.3f} allowed)",
+                clearance < allowed,
+                f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)",
             ),
             "max_thread_penetration_m": (
-                found.max_thread_penetration_m > PENETRATION_TOLERANCE,
-                f"a node of the thread {1e6 * found.max_thread_penetration_m:.1f} um in wall or shape",
+                self.max_thread_penetration_m > PENETRATION_TOLERANCE,
+                f"a node of the thread {1e6 * self.max_thread_penetration_m:.1f} um in wall or shape",
             ),
             "longest_rest_s": (
-                found.longest_rest_s > MAX_REST,
-                f"a rest of {found.longest_rest_s:.1f} s ({MAX_REST:g} allowed)",
+                self.longest_rest_s > MAX_REST,
+                f"a rest of {self.longest_rest_s:.1f} s ({MAX_REST:g} allowed)",
             ),
-            "max_tension_n": (
-                found.max_tension_n > self.tension,
-                f"a tension of {1e3 * found.max_tension_n:.3g} mN ({1e3 * self.tension:.3g} allowed)",
-            ),
-            "max_friction_nodes": (
-                found.max_friction_nodes > self.friction_nodes,
-                f"{found.max_friction_nodes} nodes under friction ({self.friction_nodes} allowed)",
-            ),
-            "time_s": (found.time_s > ratio > 0.0, f"{found.time_s:.0f} s ({ratio:.0f} allowed)"),
+            "max_tension_n": (tension > 0.0, f"a tension {1e3 * tension:.3g} mN above the limit of its goal"),
+            "max_friction_nodes": (friction > 0, f"{friction} more nodes under friction than its goal allows"),
+            "time_s": (self.time_s > ratio > 0.0, f"{self.time_s:.0f} s ({ratio:.0f} allowed)"),
         }
         return {name: words for name, (is_broken, words) in checks.items() if is_broken}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from magnetosuture_thread.campaign.extremes import RunExtremes, RunInstant
-from magnetosuture_thread.campaign.limits import RunFigures, RunLimits
+from magnetosuture_thread.campaign.limits import RunFigures
 from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.campaign.variation import Variation
 from magnetosuture_thread.errors import SolverError
@@ -23,7 +23,7 @@ from magnetosuture_thread.planning.executor import (
     plan_now,
 )
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.predictive import FORECAST_STEP, PredictiveController
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
 from magnetosuture_thread.rig.rig import Rig
@@ -113,7 +113,7 @@ def run_procedure(
     Raises:
         ConfigurationError: the procedure does not fit the scene.
     """
-    planner, keep_out = _planner(setup), setup.coils.keep_out
+    planner = _planner(setup)
     planner.check(procedure)
     predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
     pilot = _Pilot(procedure, planner, predictive)
@@ -130,7 +130,7 @@ def run_procedure(
         recorder=recorder,
     )
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
-    extremes = RunExtremes(planner, setup.scene, wraps[0] if wraps else None)
+    extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     began, planned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
     reason = f"not done after {MAX_TIME:g} s"
     try:
@@ -142,7 +142,7 @@ def run_procedure(
             extremes.update(frame, running, executor.goal, None if executor.path is None else executor.path.middles)
             if math.isnan(began) and running:
                 began = frame.time
-                planned = _planned_length(executor, frame)
+                planned = _planned_time(executor, frame)
             ahead = max(0.0, executor.travel - before)
             before = executor.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
@@ -151,19 +151,20 @@ def run_procedure(
                 break
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
-    slowest = min(limits.speed for limits in procedure.limits)
     figures = RunFigures(
         rig.time - began if math.isfinite(began) else rig.time,
-        planned / slowest * (weighted / way if way > 0.0 else 1.0),
+        planned * (weighted / way if way > 0.0 else 1.0),
         extremes.clearance,
         extremes.penetration,
         extremes.rest,
         extremes.wrapped,
         extremes.tension,
         extremes.friction_nodes,
+        extremes.tension_excess,
+        extremes.friction_excess,
     )
     reached = executor.state is ProcedureState.DONE
-    reasons = [*filter(None, [reason]), *RunLimits.of(procedure, keep_out).broken(figures).values()]
+    reasons = [*filter(None, [reason]), *figures.beyond_limits(setup.coils.keep_out).values()]
     return RunResult(
         variation.seed,
         not reasons,
@@ -177,14 +178,19 @@ def run_procedure(
     )
 
 
-def _planned_length(executor: ProcedureExecutor, frame: LoopFrame) -> float:
-    """Return the length of the paths from here to the end of the procedure [m]; 0, and end it, where there are none."""
+def _planned_time(executor: ProcedureExecutor, frame: LoopFrame) -> float:
+    """Return the time of the paths from here to the end at their goals' speeds [s]; 0, and end it, without a way."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
     try:
-        return sum(path.length for path in executor.plan(frame.tail, heading))
+        paths = executor.plan(frame.tail, heading)
     except PlanningError as error:
         executor.abort(str(error))
         return 0.0
+    time, index, procedure = 0.0, 0, executor.procedure
+    for path in paths:  # one for the goals of each chain, whose limits are the same
+        time += path.length / procedure.limits[index].speed
+        index += len(chain(procedure, index))
+    return time
 
 
 @dataclass(frozen=True)

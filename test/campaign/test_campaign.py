@@ -11,12 +11,16 @@ import pytest
 
 import magnetosuture_thread.campaign.run as campaign
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.campaign.extremes import RunExtremes
+from magnetosuture_thread.campaign.loop import LoopFrame
 from magnetosuture_thread.campaign.run import RunResult, run_procedure
 from magnetosuture_thread.campaign.variation import vary
 from magnetosuture_thread.cli.main import main
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.jobs.evaluate import evaluate_bags
-from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
+from magnetosuture_thread.planning.executor import ThreadCondition
+from magnetosuture_thread.planning.planner import NeedlePlanner
+from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, parse_procedure, read_procedure
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 SHORT = {"goals": [{"go_to": {"position": [0.008, -0.0145], "tolerance": 1e-3}}], "setup": "hernia_ring"}
@@ -79,6 +83,40 @@ def test_a_start_without_room_is_refused(hernia: Setup):
     inside = replace(hernia.rig, needle_start=(0.0, 0.005, 0.0), thread_start_curvature=0.0)
     with pytest.raises(ConfigurationError, match=r"a start with room around it: a needle .* it would be in ring"):
         vary(replace(hernia, rig=inside).with_scene(hernia.scene), 0)
+
+
+def test_each_goal_has_its_own_speed_in_the_ideal_time(hernia: Setup, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(campaign, "MAX_TIME", 0.5)
+
+    def ideal_time(*speeds: float) -> float:
+        places = ([0.008, -0.0145], [0.004, -0.0145])
+        goals = [
+            {"go_to": {"position": place}, "limits": {"speed": speed}}
+            for place, speed in zip(places, speeds, strict=True)
+        ]
+        procedure = parse_procedure({"goals": goals, "setup": "hernia_ring"}, "two_speeds")
+        return run_procedure(procedure, hernia, vary(hernia, 3)).figures.ideal_time_s
+
+    slow = ideal_time(0.001, 0.001)
+    one, other = ideal_time(0.001, 0.002), ideal_time(0.002, 0.001)
+    assert max(one, other) < slow
+    assert one + other == pytest.approx(1.5 * slow)
+
+
+def test_tension_and_friction_are_judged_by_the_limits_of_the_goal_that_is_pursued(hernia: Setup, short: Procedure):
+    limits = (ProcedureLimits(tension=4e-4, friction_nodes=9), ProcedureLimits(tension=1e-4, friction_nodes=2))
+    planner = NeedlePlanner(hernia.scene, hernia.coils.needle().kinematics, hernia.coils.keep_out, 0.05)
+    extremes, thread = RunExtremes(planner, hernia.scene, limits, None), np.array([[0.008, -0.0145], [0.007, -0.0145]])
+
+    def pursue(goal: int, tension: float, nodes: int) -> tuple[float, int]:
+        condition = ThreadCondition(friction_nodes=nodes)
+        extremes.update(LoopFrame(1.0, thread[0], 0.0, thread, tension, condition, np.zeros(2), ""), True, goal, None)
+        return extremes.tension_excess, extremes.friction_excess
+
+    assert pursue(0, 3e-4, 9) == pytest.approx((-1e-4, 0))
+    assert pursue(1, 0.5e-4, 1) == pytest.approx((-0.5e-4, 0))
+    assert pursue(1, 1.5e-4, 4) == pytest.approx((0.5e-4, 2))
+    assert pursue(0, 0.0, 0) == pytest.approx((0.5e-4, 2))  # the maximum stays
 
 
 def test_the_path_follower_runs_for_comparison(hernia: Setup, monkeypatch: pytest.MonkeyPatch):

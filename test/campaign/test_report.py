@@ -20,7 +20,7 @@ from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.setups import read_setup
 
 VOID = {"meta", "br", "link", "img"}
-GOOD = RunFigures(80.0, 75.0, 0.0003, 0.0, 0.4, 365.0, 1.5e-5, 12)
+GOOD = RunFigures(80.0, 75.0, 0.0003, 0.0, 0.4, 365.0, 1.5e-5, 12, -4.85e-4, -9988)
 
 
 class _Tags(HTMLParser):
@@ -96,6 +96,24 @@ def test_reasons_tiles_and_limits_follow_from_the_figures(details: CampaignDetai
     assert page.count(">1 of 2</span>") == 2  # tiles: succeeded, reached all goals
     assert re.findall(r'class="beyond">([^<]+)<', page) == ["0.200 mm"]
     assert '<td class="words">bags/seed_3</td>' in page
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("min_needle_clearance_m", {"min_needle_clearance_m": 0.00029}, "0.290 mm from wall or shape (0.295 allowed)"),
+        ("max_thread_penetration_m", {"max_thread_penetration_m": 2e-6}, "2.0 um in wall or shape"),
+        ("longest_rest_s", {"longest_rest_s": 3.1}, "3.1 s (3 allowed)"),
+        ("max_tension_n", {"max_tension_excess_n": 2e-5}, "0.02 mN above the limit of its goal"),
+        ("max_friction_nodes", {"max_friction_excess": 3}, "3 more nodes under friction than its goal allows"),
+        ("time_s", {"time_s": 113.0}, "113 s (112 allowed)"),
+    ],
+)
+def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, change: dict[str, float], words: str):
+    assert GOOD.beyond_limits(0.0003) == {}
+    found = replace(GOOD, **change).beyond_limits(0.0003)
+    assert found.keys() == {name}
+    assert words in found[name]
 
 
 def test_the_page_loads_and_runs_nothing(details: CampaignDetails):

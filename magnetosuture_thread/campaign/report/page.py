@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from magnetosuture_thread.campaign.limits import MAX_REST, MAX_TIME_RATIO, PENETRATION_TOLERANCE, RunLimits
+from magnetosuture_thread.campaign.limits import KEEP_OUT_TOLERANCE, MAX_REST, MAX_TIME_RATIO, PENETRATION_TOLERANCE
 from magnetosuture_thread.campaign.report.charts import RunChart, draw_chart
 from magnetosuture_thread.campaign.report.pictures import InstantPicture, outline_shapes, picture_instant
 from magnetosuture_thread.campaign.run import RunResult
@@ -49,9 +49,9 @@ class CampaignDetails:
     bags: dict[int, str]
 
     @property
-    def limits(self) -> RunLimits:
-        """Limits of a run."""
-        return RunLimits.of(self.procedure, self.setup.coils.keep_out)
+    def min_clearance(self) -> float:
+        """Clearance of the needle's axis that a run has to keep [m]."""
+        return self.setup.coils.keep_out - KEEP_OUT_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def write_campaign_page(details: CampaignDetails, runs: Sequence[RunResult]) -> 
         shapes=outline_shapes(scene),
         dish_radius=1e3 * scene.dish.radius,
         needle_width=1e3 * details.setup.rig.needle_width,
-        halo_width=2e3 * details.limits.clearance,
+        halo_width=2e3 * details.min_clearance,
         max_rest=MAX_REST,
         max_time_ratio=MAX_TIME_RATIO,
         max_penetration=PENETRATION_TOLERANCE,
@@ -115,7 +115,7 @@ def write_campaign_page(details: CampaignDetails, runs: Sequence[RunResult]) -> 
 
 
 def _row(details: CampaignDetails, run: RunResult, *, drawn: bool) -> RunRow:
-    broken = frozenset(details.limits.broken(run.figures))
+    broken = frozenset(run.figures.beyond_limits(details.setup.coils.keep_out))
     if not drawn or not run.last_instants:
         return RunRow(run, broken, (), None)
     scene, speed = details.setup.scene, details.procedure.limits[0].speed
@@ -143,7 +143,7 @@ def _reasons(rows: Sequence[RunRow]) -> list[tuple[str, list[int]]]:
 def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
     if not rows:
         return []
-    count, limits = len(rows) + len(details.died), details.limits
+    count, required = len(rows) + len(details.died), details.min_clearance
     successes, reached = sum(row.result.success for row in rows), sum(row.result.reached for row in rows)
     figures = [row.result.figures for row in rows]
     clearance = min(found.min_needle_clearance_m for found in figures)
@@ -156,8 +156,8 @@ def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
         Tile(
             "closest needle",
             f"{1e3 * clearance:.3f} mm",
-            _grade(clearance >= limits.clearance),
-            f"of all runs; at least {1e3 * limits.clearance:.3f} mm",
+            _grade(clearance >= required),
+            f"of all runs; at least {1e3 * required:.3f} mm",
         ),
         Tile(
             "deepest node of the thread",
@@ -175,18 +175,19 @@ def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
 
 
 def _charts(details: CampaignDetails, runs: Sequence[RunResult]) -> list[RunChart]:
-    limits = details.limits
+    tensions = {limits.tension for limits in details.procedure.limits}
+    tension = tensions.pop() if len(tensions) == 1 else math.inf  # goals with limits of their own have no common line
     marks = [(run.seed, run.success) for run in runs]
     columns = [
         ("time over ideal time", "", [time_ratio(run) for run in runs], MAX_TIME_RATIO, False),
         (
             "minimum clearance of the needle's axis", "mm",
-            [1e3 * run.figures.min_needle_clearance_m for run in runs], 1e3 * limits.clearance, True,
+            [1e3 * run.figures.min_needle_clearance_m for run in runs], 1e3 * details.min_clearance, True,
         ),
         ("longest rest", "s", [run.figures.longest_rest_s for run in runs], MAX_REST, False),
         (
             "peak tension", "mN", [1e3 * run.figures.max_tension_n for run in runs],
-            1e3 * limits.tension if limits.tension < 1.0 else math.nan, False,
+            1e3 * tension if tension < 1.0 else math.nan, False,
         ),
     ]  # fmt: skip
     if any(run.figures.wrap_degrees for run in runs):
