@@ -124,14 +124,19 @@ class CertifiedAllocation:
             )
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
+        resting: Allocation | None = None  # against the disturbance alone
         for _ in range(1 + MAX_CORRECTIONS):
             found = allocated(target)
             share, name = certified(found, disturbed)
             if pull.any():
                 share, name = min((share, name), certified(found, disturbed + pull))
-            kept = found.scaled(share)
+            kept, turning = found.scaled(share), found.velocity + disturbed - aside
             if share < 1.0 and disturbance is not None:
-                kept = allocated(aside - disturbed).towards(found, share)
+                resting = resting or allocated(aside - disturbed)
+                if certified(resting, disturbed)[0] < 1.0:
+                    turning, drift = found.velocity - resting.velocity, found.drift - resting.drift
+                    share, name = safety.safe_share(turning, pose.tail, pose.heading, drift)
+                kept = resting.towards(found, share)
                 own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
                 kept = kept.scaled(own)
             error = math.hypot(*(kept.velocity - velocity))
@@ -139,7 +144,6 @@ class CertifiedAllocation:
                 best, min_error, limiting = kept, error, name
             if share >= MIN_SHARE:
                 break
-            turning = found.velocity + disturbed - aside
             clear, _ = safety.nearest_clear(turning, pose.tail, pose.heading)
             target = target - (turning - clear)
         return best, limiting

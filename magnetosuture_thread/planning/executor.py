@@ -241,7 +241,14 @@ class ProcedureExecutor:
             if self._tracker is None and not self._plan(middle, angle):
                 return self._hold(stamp, middle, angle, thread)
             self._holder = None
-            return self._pursue(stamp, middle, angle, thread)
+            output = self._pursue(stamp, middle, angle, thread)
+            if self._tracker is not None or self.state is not ProcedureState.RUNNING:
+                return output
+            if stamp < self._back_off_until:
+                return self._output(self._back_off)
+            # A new path begins with the next pose. Without a command the coils would be off until then, and the thread
+            # would pull the needle aside.
+            return self._hold(stamp, middle, angle, thread)
         except PlanningError as error:
             self.abort(str(error))
             return self._output(np.zeros(2))

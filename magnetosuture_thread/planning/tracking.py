@@ -25,7 +25,7 @@ MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that correct
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
 DRIFT_PER_ANGLE = 0.015  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
-MIN_SPEED_SHARE = 0.3  # to which the speed falls where the drift is more than they compensate
+MIN_SPEED_SHARE = 0.45  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
 PULL_DECAY = 1.0  # s; in which the peak of a pull falls to 1 / e
 TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, from which on the needle tacks
@@ -38,6 +38,7 @@ THROWN_FOR = 0.1  # s; for which the pull is not compensated in a crossing
 LEAD_SHARE = 0.4  # of the smallest leeway up to a crossing, that the needle is kept aside before it at the most
 MIN_TACK_TIME = 1.0  # s; after a crossing, in which the needle does not tack
 AXIS_CROSSED = 0.02  # rad; of the planned direction beyond an axis, from which on the needle lies on that side of it
+MIN_HOLD_SPEED = 1e-6  # m/s
 MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
 
 
@@ -130,7 +131,8 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
-            hold: the setpoint stands still, and is never done.
+            hold: the setpoint stands still, and is never done; the command is at least `MIN_HOLD_SPEED`, as the coils are
+                off without one and do not compensate what pulls the needle.
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
         if not 0.0 < interval <= MAX_INTERVAL:
@@ -178,6 +180,8 @@ class PathTracker:
         gain, ratio = (CROSSING_GAIN, MAX_CROSSING_RATIO) if crosses else (TURN_GAIN, MAX_TURN_RATIO)
         limit = ratio * speed
         v += min(limit, max(-limit, raised * gain * self.path.lever * turn))
+        if hold and math.hypot(u, v) < MIN_HOLD_SPEED:
+            u, v = MIN_HOLD_SPEED, 0.0
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
 
     def _off_axes(self, stamp: float, direction: float, course: float, across: float) -> float:
