@@ -116,12 +116,12 @@ class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
     A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
-    known well enough to go on, the needle is kept in place: at a zero command the thread would pull it away. A needle
-    that gets no further while it is commanded (`RestDetector`) backs off, and its goal is planned anew; one that is off
-    its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a turn throws the needle aside,
-    is followed by one that ends as far to the other side. After `MAX_REPLANS`, `MAX_DETOURS` or `MAX_MISSES` the goal
-    is given up, and the needle rests; so is a procedure that has waited too long for the thread. Pure: time comes in
-    with the poses.
+    known well enough to go on, the needle is kept where it is: at a zero command the coils are off, and the thread
+    pulls it away. A needle that gets no further while it is commanded (`RestDetector`) backs off, and its goal is
+    planned anew; one that is off its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a
+    turn throws the needle aside, is followed by one that ends as far to the other side. After `MAX_REPLANS`,
+    `MAX_DETOURS` or `MAX_MISSES` the goal is given up, and the needle rests; so is a procedure that has waited too long
+    for the thread. Pure: time comes in with the poses.
 
     Args:
         procedure: what to do.
@@ -144,15 +144,14 @@ class ProcedureExecutor:
         self.state, self.reason, self.goal = ProcedureState.READY, "", 0
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
-        self._pending: PendingPath | None = None
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
+        self._pending: PendingPath | None = None
         self._begin: Vector | None = None
         self._rest = RestDetector()
         self._replans, self._detours, self._misses, self._left = 0, 0, 0, math.inf
         self._aim = np.zeros(2)  # from the goal's place to where its path is to end [m]
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
-        self._swept = 0.0  # of the goal's wrap, so far [rad]
-        self._bearing: float | None = None
+        self._swept, self._bearing = 0.0, math.nan  # of the goal's wrap: so far, and the needle's then [rad]
         self._speed = math.inf
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
@@ -217,8 +216,7 @@ class ProcedureExecutor:
             thread: what is known of it now.
         """
         middle, angle = self._pose(tail, heading)
-        if self._begin is None:
-            self._begin = middle
+        self._begin = middle if self._begin is None else self._begin
         if self.state is ProcedureState.RUNNING and thread.problem:
             self.pause(thread.problem)
             self._unsure, self._waits_since = True, stamp
@@ -233,33 +231,31 @@ class ProcedureExecutor:
             if self.path is None or not (self._unsure and thread.may_hold):
                 self._holder = None
                 return self._output(np.zeros(2))
-            return self._hold(stamp, middle, angle, thread)
+            return self._output(self._hold(stamp, middle, angle, thread))
         self._sweep(middle)
-        if stamp < self._back_off_until:
-            return self._output(self._back_off)
+        velocity = None
         try:
-            if self._tracker is None and not self._plan(middle, angle):
-                return self._hold(stamp, middle, angle, thread)
-            self._holder = None
-            output = self._pursue(stamp, middle, angle, thread)
-            if self._tracker is not None or self.state is not ProcedureState.RUNNING:
-                return output
-            if stamp < self._back_off_until:
-                return self._output(self._back_off)
-            # A new path begins with the next pose. Without a command the coils would be off until then, and the thread
-            # would pull the needle aside.
-            return self._hold(stamp, middle, angle, thread)
+            if stamp >= self._back_off_until and (self._tracker is not None or self._plan(middle, angle)):
+                self._holder = None
+                velocity = self._pursue(stamp, middle, angle, thread)
         except PlanningError as error:
             self.abort(str(error))
-            return self._output(np.zeros(2))
+        return self._output(self._wait(stamp, middle, angle, thread) if velocity is None else velocity)
 
-    def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
+    def _wait(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
+        """Return the command where there is no path to track: to back off, or to keep the needle in place."""
+        if self.state is not ProcedureState.RUNNING:
+            return np.zeros(2)
+        return self._back_off if stamp < self._back_off_until else self._hold(stamp, middle, angle, thread)
+
+    def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector | None:
+        """Return the command on the path; None where that has ended, and the next one begins with the next pose."""
         goal = self.procedure.goals[self.goal]
-        if isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED:
-            return self._next_goal()
+        swept = isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED
+        if swept or (isinstance(goal, Tighten) and self._is_tight(goal, thread)):
+            self._next_goal()
+            return None
         assert self._tracker is not None
-        if isinstance(goal, Tighten) and self._is_tight(goal, thread):
-            return self._next_goal()
         assert self.path is not None
         if self._tracker.travel > PROGRESS:
             self._replans = 0
@@ -271,37 +267,38 @@ class ProcedureExecutor:
         else:
             command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
         if command.done:
-            return self._at_end(goal, middle)
+            self._at_end(goal, middle)
+            return None
         if self._reached + 1 < len(self.path.ends) and command.travel >= self.path.ends[self._reached]:
             self._begin_goal(self.goal + 1)
             self._reached += 1
         commanded = bool(command.velocity.any())
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
-            return self._replan(stamp, command.velocity if rests else np.zeros(2))
-        return self._output(command.velocity)
+            self._replan(stamp, command.velocity if rests else np.zeros(2))
+            return None
+        return command.velocity
 
-    def _at_end(self, goal: Goal, middle: Vector) -> ProcedureOutput:
+    def _at_end(self, goal: Goal, middle: Vector) -> None:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
         if isinstance(goal, Tighten):
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
-            return self._output(np.zeros(2))
-        if isinstance(goal, GoTo | Withdraw) and math.dist(middle, self._place(goal)) > goal.tolerance:
-            return self._miss(goal, self._place(goal) - middle)
-        return self._next_goal()
+        elif isinstance(goal, GoTo | Withdraw) and math.dist(middle, self._place(goal)) > goal.tolerance:
+            self._miss(goal, self._place(goal) - middle)
+        else:
+            self._next_goal()
 
-    def _miss(self, goal: GoTo | Withdraw, off: Vector) -> ProcedureOutput:
+    def _miss(self, goal: GoTo | Withdraw, off: Vector) -> None:
         """Plan anew, to the other side of a goal's place, from which the needle has ended off."""
         self._misses += 1
         if self._misses > MAX_MISSES:
             by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
             self.abort(f"goal {self.goal + 1} is given up: the needle misses its place {by}, however it is planned")
-            return self._output(np.zeros(2))
+            return
         assert self.path is not None
         aim, leeway = self._aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
         self._aim = aim * min(1.0, leeway / max(math.hypot(*aim), 1e-12))
         self._drop_path()
-        return self._output(np.zeros(2))
 
     def _plan(self, middle: Vector, angle: float) -> bool:
         """Plan from a pose, or go on with that; return whether there is a path to track."""
@@ -330,38 +327,35 @@ class ProcedureExecutor:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
         self._tracker, self._pending, self._rest = None, None, RestDetector()
 
-    def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> ProcedureOutput:
-        """Keep the needle where it was when this began, against what pulls it."""
+    def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
+        """Return the command that keeps the needle where it was when this began, against what pulls it."""
         limits = self.procedure.limits[self.goal]
         if self._holder is None:
-            path = self.planner.standing_path(middle, angle, limits)
-            self._holder = PathTracker(path, self.planner.coil_angles)
+            self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.coil_angles)
         at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
-        return self._output(self._holder.compute_command(*at, hold=True).velocity)
+        return self._holder.compute_command(*at, hold=True).velocity
 
-    def _replan(self, stamp: float, stopped: Vector) -> ProcedureOutput:
+    def _replan(self, stamp: float, stopped: Vector) -> None:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
         self._replans, self._detours = self._replans + 1, self._detours + 1
         if self._replans > MAX_REPLANS or self._detours > MAX_DETOURS:
             self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
-            return self._output(np.zeros(2))
+            return
         self._drop_path()
         if stopped.any():
             self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
-        return self._output(np.zeros(2))
 
-    def _next_goal(self) -> ProcedureOutput:
-        """Rest, and plan from here in the next step; or be done."""
+    def _next_goal(self) -> None:
+        """Plan the next goal from the next pose; or be done."""
         self._drop_path()
         if self.goal + 1 == len(self.procedure.goals):
             self.state = ProcedureState.DONE
-            return ProcedureOutput(np.zeros(2), self.state, self.goal, 1.0)
-        self._begin_goal(self.goal + 1)
-        return self._output(np.zeros(2))
+        else:
+            self._begin_goal(self.goal + 1)
 
     def _begin_goal(self, goal: int) -> None:
         self.goal, self._replans, self._detours, self._misses, self._left = goal, 0, 0, 0, math.inf
-        self._swept, self._bearing, self._aim = 0.0, None, np.zeros(2)
+        self._swept, self._bearing, self._aim = 0.0, math.nan, np.zeros(2)
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:
         """Return the speed at which tension and friction stay within the goal's limits [m/s]."""
@@ -375,11 +369,10 @@ class ProcedureExecutor:
     def _is_tight(self, goal: Tighten, thread: ThreadCondition) -> bool:
         if goal.tension > 0.0 and thread.tension < goal.tension:
             return False
-        if goal.clearance > 0.0:
-            if thread.vertices is None:
-                return False
-            return self.planner.thread_clearance(goal.around, thread.vertices) <= goal.clearance
-        return True
+        if not goal.clearance > 0.0:
+            return True
+        found = thread.vertices
+        return found is not None and self.planner.thread_clearance(goal.around, found) <= goal.clearance
 
     def _sweep(self, middle: Vector) -> None:
         """Add up the angle that the needle sweeps about the shape of a wrap."""
@@ -387,7 +380,7 @@ class ProcedureExecutor:
         if not isinstance(goal, Wrap):
             return
         bearing = self.planner.bearing(goal.around, middle)
-        if self._bearing is not None:
+        if math.isfinite(self._bearing):
             self._swept += math.remainder(bearing - self._bearing, 2.0 * math.pi)
         self._bearing = bearing
 
@@ -399,7 +392,7 @@ class ProcedureExecutor:
         return middle, angle
 
     def _output(self, velocity: Vector) -> ProcedureOutput:
-        progress = 0.0
+        progress = 1.0 if self.state is ProcedureState.DONE else 0.0
         if self._tracker is not None and self.path is not None:
             before = float(self.path.ends[self._reached - 1]) if self._reached else 0.0
             way = float(self.path.ends[self._reached]) - before

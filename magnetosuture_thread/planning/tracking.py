@@ -131,8 +131,8 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
-            hold: the setpoint stands still, and is never done; the command is at least `MIN_HOLD_SPEED`, as the coils are
-                off without one and do not compensate what pulls the needle.
+            hold: the setpoint stands still, and is never done. The command is at least `MIN_HOLD_SPEED`: at a zero
+                command the coils are off, and compensate nothing.
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
         if not 0.0 < interval <= MAX_INTERVAL:

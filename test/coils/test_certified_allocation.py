@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.certified_allocation import MIN_SHARE, CertifiedAllocation
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
@@ -20,12 +21,12 @@ E = np.array([math.cos(HEADING), math.sin(HEADING)])
 LEFT = np.array([-E[1], E[0]])
 
 
-def blocks(*gaps: float) -> Scene:
+def blocks(*gaps: float, along: NDArray[np.float64] = E) -> Scene:
     """Return a dish with blocks beside the needle, which lies in the middle: at these distances to its left [m]."""
-    shapes = []
+    shapes, left = [], np.array([-along[1], along[0]])
     for k, gap in enumerate(gaps):
         far = gap + math.copysign(2e-3, gap)
-        corners = [a * E + b * LEFT for a, b in ((-4e-3, gap), (4e-3, gap), (4e-3, far), (-4e-3, far))]
+        corners = [a * along + b * left for a, b in ((-4e-3, gap), (4e-3, gap), (4e-3, far), (-4e-3, far))]
         polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
         shapes.append(SceneShape(f"block_{k}", "wall", polygon))
     return Scene(Dish(0.05), tuple(shapes))
@@ -129,3 +130,20 @@ def test_the_older_the_pose_the_less_of_a_pull_is_compensated_close_to_a_coil_s_
         found, _ = coils.allocate(1e-3 * e, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2))
         left.append(found.drift + disturbance.drift)
     assert 0.0 <= left[0] < left[1] < left[2] <= 2.1e-3
+
+
+@pytest.mark.parametrize("speed", [1e-3, -1e-3])
+def test_a_needle_on_a_coil_s_axis_that_is_pulled_to_a_block_may_be_driven_along_it_but_not_turned_to_it(speed: float):
+    """No currents hold it there: the pull alone takes it closer than it may be, whatever is commanded."""
+    east, north, pull = np.array([1.0, 0.0]), np.array([0.0, 1.0]), MotionDisturbance(0.0, 1e-3)
+    safety, coils = SETTINGS.safety_filter(blocks(2.6e-4, along=east)), CertifiedAllocation(SETTINGS.allocation(), 0.02)
+    pose = Pose(-1.25e-3 * east, east)
+
+    def allocated(velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+        found, _ = coils.allocate(velocity, pose, safety, coils.zero(), math.inf, pull, np.zeros(2))
+        assert found.drift + pull.drift > 5e-4
+        return found.velocity
+
+    assert allocated(speed * east) @ east == pytest.approx(speed, rel=0.05)
+    resting = allocated(1e-9 * east)
+    assert abs((allocated(1e-3 * north) - resting) @ north) < 1e-4

@@ -110,7 +110,8 @@ def test_a_thread_that_is_not_known_pauses_and_goes_on_once_it_is():
     needle.run(run, 1.0)
     way = needle.way
     needle.run(run, 2.0, lambda: replace(KNOWN, problem="the thread has not been measured for 1.0 s"))
-    assert (run.state, needle.way) == (ProcedureState.PAUSED, way)
+    assert run.state is ProcedureState.PAUSED
+    assert needle.way - way < 1e-5  # it is held, see `MIN_HOLD_SPEED`
     assert "not been measured" in run.reason
     needle.run(run, 60.0)
     assert run.state is ProcedureState.DONE
@@ -182,6 +183,24 @@ def test_a_needle_is_kept_in_place_while_its_path_is_planned():
     planning.is_ready = True
     needle.run(run, 60.0)
     assert (run.state, len(planning.tasks)) == (ProcedureState.DONE, 2)
+
+
+def test_a_needle_that_is_pulled_is_commanded_from_each_path_to_the_next():
+    """A pose with a zero command turns the coils off: between two goals, and where a path ends off its place."""
+    planning = Planning()
+    goals = [{"go_to": {"position": [x, 0.0], "tolerance": 1e-4}} for x in (-0.008, -0.006)]
+    run, needle = executor(*goals, submit=planning.submit), Needle()
+    planning.is_ready = True
+    needle.pull = np.array([0.0, 4e-4])
+    run.start()
+    found = []
+    while run.state is ProcedureState.RUNNING and needle.time < 100.0:
+        way = needle.way
+        needle.run(run, 0.5 / RATE)
+        found.append(needle.way - way)
+    assert run.state is ProcedureState.DONE
+    assert len(planning.tasks) >= 2
+    assert min(found[:-1]) > 0.0
 
 
 def test_a_pause_by_a_person_outlasts_a_thread_that_is_known_again():

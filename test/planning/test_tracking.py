@@ -16,6 +16,7 @@ from magnetosuture_thread.planning.tracking import (
     DRIFT_PER_ANGLE,
     MAX_ALONG_RATIO,
     MAX_AXIS_ANGLE,
+    MIN_HOLD_SPEED,
     MIN_SPEED_SHARE,
     MIN_TACK_TIME,
     TACK_SHARE,
@@ -227,3 +228,13 @@ def test_before_a_crossing_the_needle_is_kept_to_the_side_that_it_is_thrown_from
     # The lead is 0.4 of it; were it integrated besides, the needle would be off by 0.64.
     assert max(abs(left), abs(right)) < 0.5 * LEEWAY
     assert abs(plain) < 1e-5, "what is not pulled is on its path"
+
+
+def test_a_needle_that_is_held_where_it_is_is_commanded_all_the_same():
+    """At a zero command the coils are off, and compensate nothing."""
+    tracker = PathTracker(path(np.zeros(80)))
+    middle, angle = tracker.path.at(0.0)
+    for k in range(3):
+        command = tracker.compute_command(k / RATE, middle, angle, 0.002, hold=True)
+        assert math.hypot(*command.velocity) == pytest.approx(MIN_HOLD_SPEED)
+        assert not command.done
