@@ -116,8 +116,8 @@ class RunBag:
         reason = "" if margins is not None else result.reason
         packed = packed_margins(when, margins, reason, result.scene_version, of_estimate=of_estimate)
         self._bag.write(MARGINS.recorded, time, packed)
-        self._bag.write_message(NEEDLE_COMMAND.recorded, time, MESSAGES.twist_message(stamp, commanded))
-        self._command = stamp
+        self._bag.write_message(NEEDLE_COMMAND.recorded, time, MESSAGES.twist_message(time, commanded))
+        self._command = time
 
     def on_bridge(self, now: float, output: BridgeOutput) -> None:
         """Write currents and what became of the command, from the first command on."""

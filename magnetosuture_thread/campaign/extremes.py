@@ -72,6 +72,7 @@ class RunExtremes:
         self.tension_excess, self.friction_excess = -limits[0].tension, -limits[0].friction_nodes
         self.closest: RunInstant | None = None
         self._last: deque[RunInstant] = deque()
+        self._angle = 0.0  # of the needle's chord [rad]
         self._anchor: tuple[float, float, float, float] | None = None
 
     def update(self, frame: LoopFrame, running: bool, goal: int, path: Points | None) -> None:
@@ -99,7 +100,9 @@ class RunExtremes:
         if self._wrap is not None:
             swept = math.degrees(self._planner.swept_by(self._wrap.around, frame.thread))
             self.wrapped = max(self.wrapped, abs(swept))
-        at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * angle)
+        # Not wrapped at a half turn, over which noise would be a turn of the needle.
+        self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
+        at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * self._angle)
         if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > REST_WAY:
             self._anchor = at
         self.rest = max(self.rest, frame.time - self._anchor[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -221,10 +222,8 @@ class ClosedLoop:
         """Hand a measurement to bridge, thread model and controller, in the order of the graph."""
         self._count += 1
         stamp, now = measured.stamp, self.now
-        try:
+        with suppress(InvalidInputError):  # the bridge's node reports it, and the others take the pose all the same
             self.bridge.on_pose(measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance)
-        except InvalidInputError:
-            return  # as the node does, which reports it
         nanoseconds = round(1e9 * stamp)
         if measured.observation is not None:
             list(self.session.on_observation(nanoseconds, measured.observation))

@@ -11,18 +11,18 @@ import numpy as np
 
 from magnetosuture_thread.campaign.extremes import RunExtremes, RunInstant
 from magnetosuture_thread.campaign.limits import RunFigures
-from magnetosuture_thread.campaign.loop import ClosedLoop, Controller, LoopFrame, LoopRecorder, Vector
+from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.campaign.variation import Variation
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.planning.executor import (
-    PendingPath,
     ProcedureExecutor,
     ProcedureState,
     ThreadCondition,
-    plan_now,
 )
 from magnetosuture_thread.planning.path import BodyPath
+from magnetosuture_thread.planning.pending import PendingPath, plan_now
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.predictive import FORECAST_STEP, PredictiveController
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
@@ -116,13 +116,13 @@ def run_procedure(
     planner = _planner(setup)
     planner.check(procedure)
     predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
-    pilot = _Pilot(procedure, planner, predictive)
+    pilot, leader = _Pilot(procedure, planner, predictive), _Follower(setup) if follower else None
     executor = pilot.executor
     rig = Rig(variation.setup.rig, setup.scene)
     loop = ClosedLoop(
         setup,
         rig,
-        _follow(setup) if follower else pilot.compute_command,
+        pilot.compute_command if leader is None else leader.compute_command,
         variation.seed,
         camera=camera,
         losses=variation.losses,
@@ -138,16 +138,19 @@ def run_procedure(
             frame = loop.step()
             if frame is None:
                 continue
-            running = executor.state is ProcedureState.RUNNING or (follower and rig.began < math.inf)
+            running = executor.state is ProcedureState.RUNNING or (leader is not None and rig.began < math.inf)
             extremes.update(frame, running, executor.goal, None if executor.path is None else executor.path.middles)
             if math.isnan(began) and running:
                 began = frame.time
-                planned = _planned_time(executor, frame)
+                planned = _planned_time(executor, frame) if leader is None else leader.ideal_time
             ahead = max(0.0, executor.travel - before)
             before = executor.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
             if executor.state in (ProcedureState.DONE, ProcedureState.FAILED):
                 reason = executor.reason
+                break
+            if leader is not None and leader.progress >= 1.0:
+                reason = "the path of the follower, which knows no goals, has ended"
                 break
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
@@ -226,9 +229,19 @@ class _Pilot:
         return _PlannedPath(plan_now(task), lambda: self._now >= due - 1e-9)
 
 
-def _follow(setup: Setup) -> Controller:
-    follower = setup.follower.follower()
-    return lambda stamp, tail, heading, thread: follower.compute_command(stamp, tail, heading).velocity
+class _Follower:
+    """Commands as the path follower of the setup, up to the end of its path."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._follower, self.progress = setup.follower.follower(), 0.0
+        points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
+        self.ideal_time = float(arc_lengths(points)[-1]) / setup.follower.speed
+
+    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
+        """Return the velocity of the tip."""
+        command = self._follower.compute_command(stamp, tail, heading)
+        self.progress = command.progress
+        return command.velocity
 
 
 def _predictive(setup: Setup, planner: NeedlePlanner, seed: int) -> PredictiveController:

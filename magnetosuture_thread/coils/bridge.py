@@ -120,8 +120,7 @@ class CoilBridge:
     def __init__(self, settings: CoilBridgeSettings, latch: ArmingLatch, scene: Scene | None) -> None:
         self.latch = latch
         self.watchdogs = {name: CommandWatchdog(settings.command_timeout, topic) for name, topic in INPUTS.items()}
-        # The coils certainly hold a current for this long.
-        self._hold = min(settings.command_timeout, settings.driver_timeout)
+        self._hold = min(settings.command_timeout, settings.driver_timeout)  # the coils certainly hold a current
         kinematics = settings.needle().kinematics
         self.extrapolator = PoseExtrapolator(
             kinematics,
@@ -135,13 +134,10 @@ class CoilBridge:
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
         self.feedforward = settings.feedforward()
         self._observer = MotionObserver(kinematics, self._hold) if settings.motion_compensation else None
-        self._settings = settings
-        self._gains = settings.gain_estimator()
+        self._settings, self._gains = settings, settings.gain_estimator()
         self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None
-        self._losses = 0
-        self._previous = self._coils.zero()
-        self._velocity = np.zeros(2)
+        self._losses, self._previous, self._velocity = 0, self._coils.zero(), np.zeros(2)
         self._last_step, self._was_armed = -math.inf, False
         self._stopped: float | None = None
         self._blocked, self._blocked_reason = -math.inf, ""
@@ -171,6 +167,13 @@ class CoilBridge:
         self._filter = None if scene is None else self._settings.safety_filter(scene)
         self._last_step = -math.inf  # it took its time, before which the coils were set to zero
         self.extrapolator.dish_radius = math.inf if scene is None else scene.dish.radius
+
+    def rest(self, now: float, arrival: float) -> None:
+        """Register that the currents are zero from a time on; see `step` for the times."""
+        self._clear()
+        if self._observer is not None:
+            self._observer.rest(now)
+        self.extrapolator.apply_velocity(self._velocity, now, arrival)
 
     def command(self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
         """Register a command of an input; see `CommandWatchdog.update`.
@@ -293,6 +296,7 @@ class CoilBridge:
         if self.feedforward is not None and not no_prediction:
             pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
         sidestep = min(filtered.slowdown * math.hypot(*selected.velocity), max_speed - math.hypot(*filtered.filtered))
+        sidestep = max(0.0, sidestep)  # while the needle slows down to another limit it is still faster
         allocation, limiting = self._coils.allocate(
             filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, pull, sidestep
         )
@@ -359,12 +363,8 @@ class CoilBridge:
         filtered: FilteredCommand | None = None,
     ) -> BridgeOutput:
         """Return zero currents, without limits on change."""
-        if self._stopped is None:
-            self._stopped = arrival
-        self._clear()
-        if self._observer is not None:
-            self._observer.rest(now)
-        self.extrapolator.apply_velocity(self._velocity, now, arrival)
+        self._stopped = arrival if self._stopped is None else self._stopped
+        self.rest(now, arrival)
         publish = arrival - self._stopped <= self._settings.zero_hold
         slowdown = filtered.slowdown if filtered is not None else 1.0
         return self._output(selected, reasons, publish, active, slowdown)

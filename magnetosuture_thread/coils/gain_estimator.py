@@ -49,6 +49,9 @@ class CoilGainEstimator:
 
     def apply(self, now: float, currents: Vector) -> None:
         """Register the currents from a time of the stamps' clock on, shape (m,) [A]."""
+        if self._applied and now < self._applied[-1][0]:  # time was set back
+            self._applied.clear()
+            self._last = min(self._last, now)
         self._applied.append((now, currents))
 
     def stop(self) -> None:

@@ -62,12 +62,14 @@ def read_measurements(path: Path) -> ProbeMeasurements:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise InvalidInputError(str(path), reason, "a readable CSV file") from None
-    rows = [
-        (number, [cell.strip() for cell in cells])
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.startswith("#")
-        for cells in csv.reader([line])
-    ]
+    rows = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            rows += [(number, [cell.strip() for cell in cells]) for cells in csv.reader([line])]
+        except csv.Error as error:
+            raise InvalidInputError(f"{path}, line {number}", str(error), "comma-separated values") from None
     if not rows or sorted(rows[0][1]) != sorted(COLUMNS):
         where, given = (f"{path}, line {rows[0][0]}", rows[0][1]) if rows else (str(path), "nothing")
         raise InvalidInputError(where, given, f"the columns {','.join(COLUMNS)}")

@@ -132,6 +132,7 @@ class PoseExtrapolator:
         if stamp < self._newest:  # time was set back
             self._accepted = self._candidate = None
             self._unknown_until = -math.inf
+            self._history.clear()
         self._newest = stamp
         measured = _Measured(tail, self._needle.tip(tail, heading), stamp, self._pose_uncertainty(covariance))
         self._check_plausible(measured)

@@ -187,8 +187,10 @@ class NeedlePlannerNode(PackageNode):
     def _deaf(self) -> Iterator[None]:
         """While a path is planned, for up to some seconds, nothing is heard: what is known gets no older by that."""
         began = time.monotonic()
-        yield
-        self._session.known.shift(time.monotonic() - began)
+        try:
+            yield
+        finally:
+            self._session.known.shift(time.monotonic() - began)
 
 
 def main(arguments: list[str] | None = None) -> int:

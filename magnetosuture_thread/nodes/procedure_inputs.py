@@ -56,7 +56,7 @@ class ProcedureInputs:
         if not math.isfinite(tension):
             self._node.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
             return
-        self._known.on_prediction(tension, lambda: _vertices(message))
+        self._known.on_prediction(time.monotonic(), tension, lambda: _vertices(message))
 
     def on_estimate(self, message: EstimatedThread) -> None:
         """Register how sure the estimate is, and which forces the model does not know of."""
@@ -66,7 +66,7 @@ class ProcedureInputs:
             )
             for each in message.disturbances[:MAX_DISTURBANCES]
         }
-        self._known.on_estimate(message.unmeasured_for, found, lambda: _vertices(message))
+        self._known.on_estimate(time.monotonic(), message.unmeasured_for, found, lambda: _vertices(message))
 
     def on_margins(self, message: SafetyMargins) -> None:
         """Register the thread's friction, and whether its margins are valid."""
@@ -119,6 +119,7 @@ def _reason(message: Any) -> str:
     return shortened(message.reason, MAX_REASON_CHARS) or "no reason is given"
 
 
-def _vertices(message: Any) -> Points:
-    """Return the nodes of a predicted or estimated thread, shape (n + 1, 2) [m]."""
-    return np.array([(point.x, point.y) for point in message.positions])
+def _vertices(message: Any) -> Points | None:
+    """Return the nodes of a predicted or estimated thread, shape (n + 1, 2) [m]; None where these are no thread."""
+    found = np.array([(point.x, point.y) for point in message.positions])
+    return found if len(found) >= 2 and np.isfinite(found).all() else None

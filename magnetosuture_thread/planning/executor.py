@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
+from magnetosuture_thread.planning.pending import PathSubmitter, PendingPath, plan_now
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
 from magnetosuture_thread.planning.rest import RestDetector
@@ -26,19 +25,6 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-
-class PendingPath(Protocol):
-    """A path that is being planned, as `concurrent.futures.Future` is one."""
-
-    def done(self) -> bool:
-        """Return whether planning has ended."""
-
-    def result(self) -> BodyPath:
-        """Return the path, or raise what planning raised."""
-
-
-PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
-"""Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
 
 BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS, MAX_DETOURS, MAX_MISSES = 6, 20, 6  # of a goal: without progress, without less to go, off its place
@@ -102,16 +88,6 @@ class ProcedureOutput:
     reason: str = ""
 
 
-def plan_now(task: Callable[[], BodyPath]) -> PendingPath:
-    """Plan a path here and now."""
-    pending: Future[BodyPath] = Future()
-    try:
-        pending.set_result(task())
-    except PlanningError as error:
-        pending.set_exception(error)
-    return pending
-
-
 class ProcedureExecutor:
     """Takes the needle through the goals of a procedure.
 
@@ -164,6 +140,11 @@ class ProcedureExecutor:
         return self.state is ProcedureState.RUNNING or (self._unsure and self._holder is not None)
 
     @property
+    def is_tracking(self) -> bool:
+        """Whether there is a path that the needle is on."""
+        return self._tracker is not None
+
+    @property
     def travel(self) -> float:
         """Way of the tip on the present path [m]; 0 without one."""
         return 0.0 if self._tracker is None else self._tracker.travel
@@ -201,6 +182,7 @@ class ProcedureExecutor:
         """Plan in another scene from now on; a procedure that does not fit it fails."""
         self.planner = planner
         self._drop_path()
+        self._holder, self._left, self._aim, self._bearing = None, math.inf, np.zeros(2), math.nan
         try:
             planner.check(self.procedure)
         except MagnetosutureError as error:
@@ -222,20 +204,23 @@ class ProcedureExecutor:
             self._unsure, self._waits_since = True, stamp
         elif self._unsure and not thread.problem:
             self.state, self.reason, self._unsure = ProcedureState.RUNNING, "", False  # on the path of before
-        elif self._unsure and not thread.may_hold:
-            self._waits_since = stamp  # for something else than the thread
-        elif self._unsure and stamp - self._waits_since > self._max_wait:
-            self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
+        elif self._unsure:
+            self.reason = thread.problem
+            if not thread.may_hold:
+                self._waits_since = stamp  # for something else than the thread
+            elif stamp - self._waits_since > self._max_wait:
+                self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
+        if self.state in (ProcedureState.RUNNING, ProcedureState.PAUSED):
+            self._sweep(middle)  # also by hand: else a wrap that was unwound in a pause would count
         if self.state is not ProcedureState.RUNNING:
             self._rest = RestDetector()
             if self.path is None or not (self._unsure and thread.may_hold):
                 self._holder = None
                 return self._output(np.zeros(2))
             return self._output(self._hold(stamp, middle, angle, thread))
-        self._sweep(middle)
         velocity = None
         try:
-            if stamp >= self._back_off_until and (self._tracker is not None or self._plan(middle, angle)):
+            if not self._backs_off(stamp) and (self._tracker is not None or self._plan(middle, angle)):
                 self._holder = None
                 velocity = self._pursue(stamp, middle, angle, thread)
         except PlanningError as error:
@@ -246,7 +231,10 @@ class ProcedureExecutor:
         """Return the command where there is no path to track: to back off, or to keep the needle in place."""
         if self.state is not ProcedureState.RUNNING:
             return np.zeros(2)
-        return self._back_off if stamp < self._back_off_until else self._hold(stamp, middle, angle, thread)
+        return self._back_off if self._backs_off(stamp) else self._hold(stamp, middle, angle, thread)
+
+    def _backs_off(self, stamp: float) -> bool:
+        return 0.0 < self._back_off_until - stamp <= BACK_OFF_TIME  # no longer, where time was set back
 
     def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector | None:
         """Return the command on the path; None where that has ended, and the next one begins with the next pose."""
@@ -326,6 +314,7 @@ class ProcedureExecutor:
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
         self._tracker, self._pending, self._rest = None, None, RestDetector()
+        self._back_off_until = -math.inf
 
     def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
         """Return the command that keeps the needle where it was when this began, against what pulls it."""
@@ -364,7 +353,8 @@ class ProcedureExecutor:
             self._speed = max(0.0, self._speed * TENSION_SHARE * limits.tension / thread.tension)
         self._speed = min(limits.speed, max(self._speed * 1.03, 0.02 * limits.speed))
         crowded = thread.friction_nodes - limits.friction_nodes
-        return self._speed if crowded < 0 or limits.friction_nodes >= 10_000 else 0.3 * self._speed
+        is_free = crowded < 0 or not thread.friction_nodes or limits.friction_nodes >= 10_000
+        return self._speed if is_free else 0.3 * self._speed
 
     def _is_tight(self, goal: Tighten, thread: ThreadCondition) -> bool:
         if goal.tension > 0.0 and thread.tension < goal.tension:

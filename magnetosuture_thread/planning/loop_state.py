@@ -44,8 +44,8 @@ class LoopState:
         self._tracker = ""
         self._margins: _Margins | None = None
         self._tension = self._drift = 0.0
-        self._vertices: Callable[[], Points] | None = None
-        self._estimates, self._estimate_problem = False, ""
+        self._vertices: Callable[[], Points | None] | None = None
+        self._estimated, self._estimate_problem = -math.inf, ""
         self._disturbances: dict[float, str] = {}
         self._accepted: set[float] = set()
         self._held = -math.inf
@@ -61,23 +61,31 @@ class LoopState:
         """Register why the tracker has no needle in a frame; empty if it has."""
         self._tracker = problem and f"the needle is not tracked: {problem}"
 
-    def on_prediction(self, tension: float, vertices: Callable[[], Points]) -> None:
-        """Register a predicted thread: the peak of its tension [N], and its vertices where they are needed."""
+    def on_prediction(self, now: float, tension: float, vertices: Callable[[], Points | None]) -> None:
+        """Register a predicted thread: the peak of its tension [N], and what returns its vertices.
+
+        Where no thread is estimated any more, nothing of the last estimate counts.
+        """
         self._tension = tension
-        if not self._estimates:
-            self._vertices = vertices
+        if now - self._estimated > self._settings.thread_timeout:
+            self._vertices, self._estimate_problem, self._disturbances = vertices, "", {}
 
     def on_estimate(
-        self, unmeasured_for: float, disturbances: Mapping[float, str], vertices: Callable[[], Points]
+        self,
+        now: float,
+        unmeasured_for: float,
+        disturbances: Mapping[float, str],
+        vertices: Callable[[], Points | None],
     ) -> None:
         """Register an estimated thread.
 
         Args:
+            now: a monotonic time [s].
             unmeasured_for: time since the thread was measured [s].
             disturbances: forces on it that the model does not know of, as texts, each by when it was found first [s].
-            vertices: returns them, shape (n + 1, 2) [m].
+            vertices: returns them, shape (n + 1, 2) [m]; None where they are not valid.
         """
-        self._estimates, self._vertices, self._estimate_problem = True, vertices, ""
+        self._estimated, self._vertices, self._estimate_problem = now, vertices, ""
         if not unmeasured_for <= self._settings.unmeasured_timeout:  # also where it is no number
             self._estimate_problem = f"the thread has not been measured for {unmeasured_for:.1f} s"
         self._accepted &= disturbances.keys()
@@ -106,6 +114,7 @@ class LoopState:
     def shift(self, duration: float) -> None:
         """Take what is known to be younger by a time in which nothing was heard, as while a path is planned [s]."""
         self._pose += duration
+        self._estimated += duration
         self._held += duration
         self._last_problem_time += duration
         if self._margins is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.checks import check_procedure
@@ -79,6 +79,9 @@ class NeedlePlanner:
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
         coil_angles: direction of each coil from the dish's centre [rad], for `PathTracker`.
+
+    Raises:
+        ConfigurationError: the needle has no room in the dish.
     """
 
     def __init__(
@@ -89,6 +92,10 @@ class NeedlePlanner:
         thread_length: float,
         coil_angles: Sequence[float] = (),
     ) -> None:
+        least = needle.chord + 2.0 * keep_out
+        if scene.dish.diameter <= least:
+            expected = f"more than {least:g} m, room for the needle and the clearance on both sides"
+            raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
         self.scene, self.needle, self.coil_angles = scene, needle, tuple(coil_angles)
         self.keep_out, self.thread_length = keep_out, thread_length
         self.near = map_clearance(scene)
@@ -138,12 +145,12 @@ class NeedlePlanner:
             PlanningError: there is no way to one of them.
         """
         required = max(self.keep_out, limits.clearance)
+        targets = [self._lattice_goal(goal, start, None if index else swept) for index, goal in enumerate(goals)]
         for margin in MARGINS:
             states, ends, at = np.empty((0, 3)), [], self._nearest_free(middle, angle, required + margin)
-            for index, goal in enumerate(goals):
+            for target in targets:
                 if at is None:
                     break
-                target = self._lattice_goal(goal, start, swept if index == 0 else None)
                 found = self._search(target, required + margin, at)
                 if not len(found):
                     at = None
@@ -248,10 +255,10 @@ class NeedlePlanner:
         """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none."""
         # A procedure is planned as a whole, and then goal by goal from the same points of the lattice.
         key = (start.tobytes(), kept, *(np.asarray(part).tobytes() for part in goal))
-        if key not in self._ways:
+        if (found := self._ways.get(key)) is None:
             if len(self._ways) >= MAX_WAYS:
                 self._ways.clear()
-            self._ways[key] = search_lattice(
+            found = self._ways[key] = search_lattice(
                 start,
                 self.body,
                 self.lever,
@@ -263,7 +270,7 @@ class NeedlePlanner:
                 DIRECTIONS,
                 MAX_STATES,
             )
-        return self._ways[key]
+        return found  # kept or not: another thread may have cleared what is kept
 
     def _state_of(self, state: Vector) -> NDArray[np.int64]:
         """Return column, row and direction of a state of the lattice."""

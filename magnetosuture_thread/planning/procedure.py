@@ -108,7 +108,7 @@ class Wrap(Configuration):
 
 @dataclass(frozen=True)
 class Tighten(Configuration):
-    """Pull the thread until it is under a tension, or as near to a shape as wanted."""
+    """Pull the thread until it is under a tension, as near to a shape as wanted, or both where both are given."""
 
     GROUP: ClassVar[str] = "tighten"
 

@@ -45,6 +45,8 @@ class RestDetector:
             self.travel, self.since = travel, stamp
         elif stamp - self.since > STALL_TIME:
             return True
+        if self.poses and stamp < self.poses[-1][0]:
+            self.poses.clear()  # time was set back
         self.poses.append((stamp, float(middle[0]), float(middle[1]), lever * angle))
         while len(self.poses) > 2 and self.poses[1][0] <= stamp - REST_TIME:
             self.poses.popleft()

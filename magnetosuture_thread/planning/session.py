@@ -11,9 +11,10 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.clearance_map import body_clearance
-from magnetosuture_thread.planning.executor import PathSubmitter, ProcedureExecutor, ProcedureState, Vector, plan_now
+from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, Vector
 from magnetosuture_thread.planning.loop_state import LoopState
 from magnetosuture_thread.planning.path import BodyPath
+from magnetosuture_thread.planning.pending import PathSubmitter, plan_now
 from magnetosuture_thread.planning.planner import NeedlePlanner, chain
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
@@ -104,10 +105,12 @@ class ProcedureSession:
         """Go by another scene; a procedure that does not fit it fails, and so does one that was only planned.
 
         Raises:
-            ConfigurationError: no path can be planned in the scene.
+            ConfigurationError: the needle has no room in it; the scene of before stays.
         """
         self._planner = self._settings.planner(scene)
         self.known.scene_version = scene.version
+        del self._planned[1:]  # paths of later goals, by the scene of before
+        self._shown = None
         if self._executor is None:
             return
         if self._executor.state is ProcedureState.READY:
@@ -237,7 +240,7 @@ class ProcedureSession:
     def setpoint(self) -> tuple[Vector, float] | None:
         """Where the path wants the needle's tip, shape (2,) [m], and the chord's angle [rad]; None without one."""
         executor = self._executor
-        if executor is None or executor.path is None or not self.is_running:
+        if executor is None or executor.path is None or not (self.is_running and executor.is_tracking):
             return None
         middle, angle = executor.path.at(executor.travel)
         return middle + executor.path.lever * np.array([math.cos(angle), math.sin(angle)]), angle
@@ -292,7 +295,7 @@ def compile_planning() -> None:
     session.on_pose(0.0, at, heading, 0.0)
     session.plan(parse_procedure({"goals": [{"go_to": {"position": [0.01, 0.0]}}]}, "warm-up"), 0.0)
     session.resume()
-    session.known.on_prediction(0.0, lambda: np.zeros((2, 2)))
+    session.known.on_prediction(0.0, 0.0, lambda: np.zeros((2, 2)))
     session.known.on_margins(0.0, "", 0, 1.0, session.known.scene_version)
     for k in range(2):
         session.on_pose(0.05 * k, at, heading, 0.0)

@@ -268,7 +268,7 @@ class NeedleSafetyFilter:
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
         if not self._barriers:
             return found
-        return min(found, self._checked_share(velocity, tail, heading), key=lambda share: share[0])
+        return min(found, self._checked_share(velocity, tail, heading, drift), key=lambda share: share[0])
 
     def _added_rows(self, needle: PosedNeedle) -> AddedRows:
         """Return the rows of the added barriers on the tip's velocity, each over the size of its gradient."""
@@ -288,24 +288,25 @@ class NeedleSafetyFilter:
             found.append(AddedRows(on_tip, rows.value / size, rate, which))
         return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
-    def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[float, str]:
+    def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0) -> tuple[float, str]:
         """Return the share of a velocity with which every added barrier holds at every check, and what it is for."""
-        broken = self._broken(velocity, tail, heading)
+        broken = self._broken(velocity, tail, heading, drift)
         if not broken:
             return 1.0, ""
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if self._broken(middle * velocity, tail, heading) else (middle, high)
+            is_broken = bool(self._broken(middle * velocity, tail, heading, middle * drift))
+            low, high = (low, middle) if is_broken else (middle, high)
         return low, broken
 
-    def _broken(self, velocity: Vector, tail: Vector, heading: Vector) -> str:
+    def _broken(self, velocity: Vector, tail: Vector, heading: Vector, drift: float) -> str:
         """Return the first added barrier that gets below 0, or lower than it is, within the hold; empty for none."""
         heading = heading / math.hypot(float(heading[0]), float(heading[1]))
         along, across = self.kinematics.body_velocity(heading, velocity)
         begin = self._at(tail, heading).points
         times = [check / CHECKS * self.hold_time for check in range(1, CHECKS + 1)]
-        points = [self._points_at(*self.kinematics.moved(tail, heading, along, across, time)) for time in times]
+        points = [self._points_at(*self.kinematics.moved(tail, heading, along, across, time, drift)) for time in times]
         for barrier in self._barriers:
             barrier.set_time(self._time)
             least = np.minimum(barrier.value(begin), 0.0) - ROUNDING

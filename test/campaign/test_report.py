@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def test_reasons_tiles_and_limits_follow_from_the_figures(details: CampaignDetai
         ("time_s", {"time_s": 113.0}, "113 s (112 allowed)"),
     ],
 )
-def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, change: dict[str, float], words: str):
+def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, change: dict[str, Any], words: str):
     assert GOOD.beyond_limits(0.0003) == {}
     found = replace(GOOD, **change).beyond_limits(0.0003)
     assert found.keys() == {name}

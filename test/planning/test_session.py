@@ -30,7 +30,7 @@ def known(now: float = 0.0, **changes: Any) -> LoopState:
     state = LoopState(NeedlePlannerSettings(**changes))
     state.scene_version = "1"
     state.on_pose(now, 0.006, 0.0175)
-    state.on_estimate(0.0, {}, thread)
+    state.on_estimate(0.0, 0.0, {}, thread)
     state.on_margins(now, "", 3, 0.7, "1")
     return state
 
@@ -49,7 +49,7 @@ def test_a_bridge_that_feeds_friction_back_to_the_operator_only_slows_no_procedu
 @pytest.mark.parametrize("unmeasured", [1.01, math.inf, math.nan])
 def test_an_estimate_that_was_not_measured_is_unsure(unmeasured: float):
     state = known()
-    state.on_estimate(unmeasured, {}, thread)
+    state.on_estimate(0.0, unmeasured, {}, thread)
     assert "not been measured" in state.condition(0.1).problem
 
 
@@ -58,7 +58,7 @@ def test_the_first_of_what_is_missing_is_named():
     assert state.condition(0.0).problem == NO_POSE
     state.on_pose(0.0, 0.0, 0.0175)
     assert state.condition(0.0).problem == NO_THREAD
-    state.on_prediction(1e-5, thread)
+    state.on_prediction(0.0, 1e-5, thread)
     assert state.condition(0.0).problem == NO_MARGINS
     state.on_margins(0.0, "", 0, 1.0, "another")
     assert state.condition(0.0).problem == "thread_model goes by another scene"
@@ -105,15 +105,15 @@ def test_the_needle_may_be_held_while_the_thread_alone_is_not_known():
 
 def test_a_force_that_is_new_is_a_problem_and_one_that_a_person_goes_on_with_is_none():
     state = known(settle=0.0)
-    state.on_estimate(0.0, {3.5: "held at 10 mm"}, thread)
+    state.on_estimate(0.0, 0.0, {3.5: "held at 10 mm"}, thread)
     assert state.condition(0.1).problem == "an unmodelled contact: the thread is held at 10 mm"
     state.accept_disturbances()
     assert not state.condition(0.1).problem
-    state.on_estimate(0.0, {3.5: "held at 12 mm", 4.0: "held at 30 mm"}, thread)
+    state.on_estimate(0.0, 0.0, {3.5: "held at 12 mm", 4.0: "held at 30 mm"}, thread)
     assert state.condition(0.1).problem == "an unmodelled contact: the thread is held at 30 mm"
-    state.on_estimate(0.0, {}, thread)
+    state.on_estimate(0.0, 0.0, {}, thread)
     assert not state.condition(0.1).problem
-    state.on_estimate(0.0, {3.5: "held at 10 mm"}, thread)  # it was gone
+    state.on_estimate(0.0, 0.0, {3.5: "held at 10 mm"}, thread)  # it was gone
     assert "held at 10 mm" in state.condition(0.1).problem
 
 
@@ -130,7 +130,7 @@ def session(now: float = 0.0) -> ProcedureSession:
     """Return a session whose needle and thread are known."""
     made = ProcedureSession(SETTINGS, SCENE)
     made.on_pose(0.0, TAIL, EAST, now)
-    made.known.on_estimate(0.0, {}, thread)
+    made.known.on_estimate(0.0, 0.0, {}, thread)
     made.known.on_margins(now, "", 0, 1.0, SCENE.version)
     return made
 
@@ -161,11 +161,11 @@ def test_a_force_that_is_found_before_the_needle_is_moved_was_there_when_a_perso
     run = session()
     run.plan(far(), 0.0)
     run.resume()
-    run.known.on_estimate(0.0, {0.06: "held at 10 mm"}, thread)
+    run.known.on_estimate(0.0, 0.0, {0.06: "held at 10 mm"}, thread)
     velocities = [run.on_pose(0.1 + 0.05 * k, TAIL, EAST, 0.1 + 0.05 * k) for k in range(4)]
     assert velocities[-1] is not None
     assert velocities[-1].any()
-    run.known.on_estimate(0.0, {0.06: "held at 10 mm", 0.3: "held at 30 mm"}, thread)
+    run.known.on_estimate(0.0, 0.0, {0.06: "held at 10 mm", 0.3: "held at 30 mm"}, thread)
     run.on_pose(0.3, TAIL, EAST, 0.3)
     assert run.status.reason == "an unmodelled contact: the thread is held at 30 mm"
 

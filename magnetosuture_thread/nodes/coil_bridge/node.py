@@ -141,6 +141,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             return
         self._step()  # first: a scene that waited while the process was frozen must not hide that it was
         self.system.zero()  # building the filter takes some milliseconds
+        self.system.bridge.rest(*self._times())
         self.system.bridge.set_scene(scene)
         self._step()
 
