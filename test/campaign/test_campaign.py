@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,6 +126,27 @@ def test_the_path_follower_runs_for_comparison(hernia: Setup, monkeypatch: pytes
     assert not found.success
     assert "not done after 3 s" in found.reason
     assert found.last_instants[-1].frame.commanded.any()
+
+
+def test_a_run_of_the_path_follower_ends_with_its_path(hernia: Setup):
+    x, y, _ = hernia.rig.needle_start
+    follower = replace(hernia.follower, waypoints=(x - 0.001, y + 0.0012, x - 0.002, y + 0.0022))
+    near = replace(hernia, follower=follower).with_scene(hernia.scene)
+    found = run_procedure(read_procedure("hernia"), near, vary(near, 3), follower=True)
+    assert found.simulated_s < 60.0
+    assert "the path of the follower, which knows no goals, has ended" in found.reason
+    assert 0.5 < found.figures.ideal_time_s < 5.0
+
+
+@pytest.mark.parametrize("angle", [0.0, math.pi])
+def test_a_needle_that_trembles_in_one_place_rests_whatever_its_direction(hernia: Setup, angle: float):
+    planner = NeedlePlanner(hernia.scene, hernia.coils.needle().kinematics, hernia.coils.keep_out, 0.05)
+    extremes, thread = RunExtremes(planner, hernia.scene, (ProcedureLimits(),), None), np.full((3, 2), 0.008)
+    for k in range(100):
+        heading = angle + 1e-5 * (-1.0) ** k
+        frame = LoopFrame(0.05 * k, thread[0], heading, thread, 0.0, ThreadCondition(), np.ones(2), "")
+        extremes.update(frame, True, 0, None)
+    assert extremes.rest == pytest.approx(0.05 * 99)
 
 
 def test_with_the_camera_the_tracker_measures(hernia: Setup, short: Procedure, monkeypatch: pytest.MonkeyPatch):

@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pytest
@@ -749,3 +750,35 @@ def test_it_does_not_arm_while_the_driver_is_not_ready():
     with pytest.raises(InvalidInputError, match=r"not ready \(no answer\)"):
         plant.bridge.arm(DriverState(False, "no answer"))
     assert all(still(output) for output in plant.run(0.1))
+
+
+def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
+    """While it is still faster than the limit, nothing is left for a sidestep, to neither side."""
+    tail, heading = TAIL, np.array([math.cos(0.4), math.sin(0.4)])
+    changes: dict[str, Any] = {"motion_compensation": True, "without_prediction": "slow", "max_acceleration": 0.2}
+    settings = CoilBridgeSettings(**changes, prediction_timeout=0.1, speed_without_prediction=0.001)
+    plant = Plant(settings, velocity=(0.01 * math.cos(0.4), 0.01 * math.sin(0.4))).ready()
+    plant.tail, across, needle = None, [], settings.needle().kinematics
+    for number in range(1, 120):
+        if number % 3 == 0:
+            plant.bridge.on_pose(tail, heading, plant.time, number, plant.time, plant.time)
+        plant.thread = number < 60
+        found = plant.run(PERIOD)[0].allocation
+        along, left = needle.body_velocity(heading, found.velocity)
+        tail, heading = needle.moved(tail, heading, along, left, PERIOD, found.drift)
+        across.append(abs(found.drift))
+    assert max(across) < 1e-3
+
+
+def test_coils_that_were_set_to_zero_for_a_new_scene_moved_no_needle_meanwhile():
+    plant = Plant(CoilBridgeSettings(motion_compensation=True)).ready()
+    plant.run(0.2)
+    plant.time += PERIOD
+    before = plant.bridge.extrapolator.pose(plant.time, plant.time)
+    plant.bridge.rest(plant.time, plant.time)
+    plant.bridge.set_scene(Scene(Dish(0.04)))
+    plant.time += 0.06  # as long as the filter of many corners takes
+    after = plant.bridge.extrapolator.pose(plant.time, plant.time)
+    assert before is not None
+    assert after is not None
+    np.testing.assert_allclose(after.tail, before.tail, atol=1e-12)

@@ -37,6 +37,7 @@ def test_coils_with_names_have_the_order_in_which_they_come(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (HEADER + "0," + "1" * 140_000 + ",0,0,0,0\n", "probe.csv, line 2: got field larger than field limit"),
         ("", "probe.csv: got nothing, expected the columns coil,current,x,y,bx,by"),
         ("coil,current,x,y,bx\n0,1,0,0,0\n", "line 1: got .* expected the columns"),
         (HEADER, "a header only"),

@@ -282,3 +282,15 @@ def test_a_velocity_before_the_first_pose_moves_nothing():
     pose = extrapolator.pose(1.1, 50.1)
     assert pose is not None
     assert pose.tail.tolist() == [0.0, 0.0]
+
+
+def test_after_time_was_set_back_a_pose_is_where_it_was_measured():
+    """The velocities that were applied have stamps of the clock before; the last one goes on."""
+    extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045)
+    extrapolator.update(np.zeros(2), EAST, 100.0, 1, 100.0, 50.0)
+    for later in (0.0, 0.05):
+        extrapolator.apply_velocity(np.array([0.01, 0.0]), 100.0 + later, 50.0 + later)
+    extrapolator.update(np.zeros(2), EAST, 90.0, 2, 90.02, 50.07)
+    pose = extrapolator.pose(90.02, 50.07)
+    assert pose is not None
+    np.testing.assert_allclose(pose.tail, [0.01 * 0.02, 0.0], atol=1e-12)

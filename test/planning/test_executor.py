@@ -327,3 +327,66 @@ def test_a_needle_that_is_thrown_back_whenever_it_gets_on_is_given_up():
             needle.tail = begin
     assert run.state is ProcedureState.FAILED
     assert "given up" in run.reason
+
+
+@pytest.mark.parametrize("pauses", [False, True])
+def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
+    run, needle = executor({"wrap": {"around": "post", "angle": 5.0, "sense": "counterclockwise"}}), Needle()
+    poses: list[tuple[np.ndarray, np.ndarray]] = []
+    run.start()
+    needle.run(run, 300.0, until=lambda: poses.append((needle.tail, needle.heading)) or needle.way > 0.009)
+    way = needle.way
+    if pauses:
+        run.pause("the operator has taken over")
+        for tail, heading in reversed(poses):
+            needle.tail, needle.heading, needle.time = tail, heading, needle.time + 1.0 / RATE
+            run.update(needle.time, tail, heading, KNOWN)
+        run.start()
+    needle.run(run, 300.0)
+    assert run.state is ProcedureState.DONE
+    assert (needle.way > 2.7 * way) == pauses  # all of the way again, or what was left of it
+
+
+@pytest.mark.parametrize("change", ["time was set back", "resumed"])
+def test_a_needle_backs_off_no_longer_once_time_was_set_back_or_it_was_resumed(change: str):
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    needle.share = 0.0
+    run.start()
+    needle.run(run, 5.0, until=lambda: run._backs_off(needle.time))
+    assert run.state is ProcedureState.RUNNING
+    needle.share = 1.0
+    if change == "resumed":
+        run.pause("by the operator")
+        run.start()
+    else:
+        needle.time -= 600.0
+    needle.run(run, 30.0)
+    assert run.state is ProcedureState.DONE
+
+
+def test_a_shape_that_moves_while_it_is_wrapped_counts_as_no_turn_of_the_needle():
+    run, needle = executor({"wrap": {"around": "post", "angle": 3.2, "sense": "counterclockwise"}}), Needle()
+    run.start()
+    needle.run(run, 60.0, until=lambda: needle.way > 0.012)
+    assert run.state is ProcedureState.RUNNING
+    moved = SceneShape("post", "instrument", Disc((-0.011, 0.002), 0.002))
+    run.set_planner(NeedlePlanner(Scene(Dish(), (moved,)), NEEDLE, 2.5e-4, 0.05))
+    before = needle.way
+    needle.run(run, 200.0)
+    assert run.state is ProcedureState.DONE
+    assert needle.way - before > 0.004
+
+
+def test_the_reason_of_a_pause_is_what_is_missing_now():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
+    run.start()
+    for problem in ("no needle pose for more than 0.5 s", "the thread has not been measured for 1.0 s"):
+        needle.run(run, 0.5, lambda problem=problem: replace(KNOWN, problem=problem))
+        assert (run.state, run.reason) == (ProcedureState.PAUSED, problem)
+
+
+def test_a_limit_of_no_node_under_friction_does_not_slow_a_needle_without_any():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, friction_nodes=0, speed=0.002), Needle()
+    run.start()
+    needle.run(run, 2.0)
+    assert needle.way > 0.0025

@@ -215,6 +215,60 @@ def test_another_scene_ends_what_was_only_planned():
     )
 
 
+def test_a_setpoint_is_of_a_path_that_the_needle_is_on():
+    """Between two paths there is none: the start of the last one is where nobody wants the needle any more."""
+    run = session()
+    run.plan(far(), 0.0)
+    run.resume()
+    tail = TAIL.copy()
+    for k in range(400):
+        now = 0.1 + 0.05 * k
+        run.known.on_margins(now, "", 0, 1.0, SCENE.version)
+        velocity = run.on_pose(now, tail, EAST, now)
+        assert velocity is not None
+        if run.status.goal == 1:
+            break
+        assert run.setpoint is not None
+        tail = tail + 0.05 * float(velocity @ EAST) * EAST
+    assert run.status.goal == 1
+    assert run.setpoint is None
+
+
+def test_paths_that_were_planned_in_another_scene_are_not_shown_any_more():
+    run = session()
+    run.plan(far(), 0.0)
+    run.resume()
+    for k in range(4):
+        run.on_pose(0.1 + 0.05 * k, TAIL, EAST, 0.1 + 0.05 * k)
+    plan = run.new_plan()
+    assert plan is not None
+    run.set_scene(Scene(Dish(0.036)))
+    changed = run.new_plan()
+    assert changed is not None
+    assert len(changed) < len(plan)
+
+
+def test_a_needle_without_room_in_a_scene_leaves_the_scene_of_before():
+    run = ProcedureSession(NeedlePlannerSettings(needle_length=0.007, keep_out=5e-4), SCENE)
+    with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: .* more than 0\.008 m, room for the needle"):
+        run.set_scene(Scene(Dish(0.0079)))
+    assert run.known.scene_version == SCENE.version
+
+
+def test_a_thread_that_is_estimated_no_more_is_known_by_its_prediction():
+    state = known(settle=0.0)
+    state.on_estimate(0.0, 2.0, {3.5: "held at 10 mm"}, thread)
+    state.on_prediction(0.4, 1e-5, lambda: np.ones((2, 2)))  # the next estimate may be under way
+    assert "not been measured" in state.condition(0.4).problem
+    state.on_prediction(0.6, 1e-5, lambda: np.ones((2, 2)))
+    state.on_margins(0.6, "", 0, 1.0, "1")
+    state.on_pose(0.6, 0.006, 0.0175)
+    condition = state.condition(0.6)
+    assert condition.problem == ""
+    assert condition.vertices is not None
+    assert condition.vertices.tolist() == [[1.0, 1.0], [1.0, 1.0]]
+
+
 def test_a_text_is_a_procedure_or_the_name_of_one():
     assert read_procedure_text("hernia").name == "hernia"
     assert len(read_procedure_text("goals: [{withdraw: {}}]").goals) == 1

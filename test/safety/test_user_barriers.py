@@ -142,3 +142,12 @@ def test_shapes_wall_and_added_barriers_are_named_apart():
     assert safety.filter(np.array([0.01, 0.0]), np.array([0.0143, -0.001]), heading).active == ("wall",)
     with pytest.raises(ConfigurationError, match="a name that no other barrier has"):
         needle(HalfPlane(), HalfPlane())
+
+
+def test_the_share_that_keeps_an_added_barrier_includes_the_drift():
+    safety = needle(HalfPlane(0.001))
+    tail, east, drift = np.array([0.0, 0.0008]), np.array([1.0, 0.0]), 2e-3
+    velocity = np.array([0.0, drift])  # all of the needle, which does not turn
+    share, name = safety.safe_share(velocity, tail, east, drift)
+    assert name == "half_plane"
+    assert share == pytest.approx(2e-4 / (drift * HOLD), abs=0.01)
