@@ -331,10 +331,10 @@ def test_a_needle_that_is_thrown_back_whenever_it_gets_on_is_given_up():
 
 @pytest.mark.parametrize("pauses", [False, True])
 def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
-    run, needle = executor({"wrap": {"around": "post", "angle": 5.0, "sense": "counterclockwise"}}), Needle()
+    run, needle = executor({"wrap": {"around": "post", "angle": 6.2, "sense": "counterclockwise"}}), Needle()
     poses: list[tuple[np.ndarray, np.ndarray]] = []
     run.start()
-    needle.run(run, 300.0, until=lambda: poses.append((needle.tail, needle.heading)) or needle.way > 0.009)
+    needle.run(run, 300.0, until=lambda: poses.append((needle.tail, needle.heading)) or run._swept > 4.6)
     way = needle.way
     if pauses:
         run.pause("the operator has taken over")
@@ -344,7 +344,7 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
         run.start()
     needle.run(run, 300.0)
     assert run.state is ProcedureState.DONE
-    assert (needle.way > 2.7 * way) == pauses  # all of the way again, or what was left of it
+    assert (needle.way > 1.9 * way) == pauses  # all of the way again, or what was left of it
 
 
 @pytest.mark.parametrize("change", ["time was set back", "resumed"])
@@ -367,9 +367,12 @@ def test_a_needle_backs_off_no_longer_once_time_was_set_back_or_it_was_resumed(c
 def test_a_shape_that_moves_while_it_is_wrapped_counts_as_no_turn_of_the_needle():
     run, needle = executor({"wrap": {"around": "post", "angle": 3.2, "sense": "counterclockwise"}}), Needle()
     run.start()
-    needle.run(run, 60.0, until=lambda: needle.way > 0.012)
+    needle.run(run, 60.0, until=lambda: run._swept > 1.0)
     assert run.state is ProcedureState.RUNNING
-    moved = SceneShape("post", "instrument", Disc((-0.011, 0.002), 0.002))
+    # By its new place the needle is 2.9 rad farther around it.
+    bearing = math.atan2(*(needle.middle - np.array([0.003, 0.0]))[::-1]) + 2.9
+    place = needle.middle - 0.005 * np.array([math.cos(bearing), math.sin(bearing)])
+    moved = SceneShape("post", "instrument", Disc((float(place[0]), float(place[1])), 0.002))
     run.set_planner(NeedlePlanner(Scene(Dish(), (moved,)), NEEDLE, 2.5e-4, 0.05))
     before = needle.way
     needle.run(run, 200.0)
