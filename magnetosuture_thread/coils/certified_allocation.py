@@ -23,7 +23,9 @@ class CertifiedAllocation:
 
     The motion that is certified is that of the currents and of the measured disturbance. Where it is not, as much of
     the velocity is taken as is, while the currents against the disturbance stay, as far as they are certified without
-    it. Where nothing is known of a disturbance, all currents are scaled by the certified share.
+    it. Where no currents hold the needle against the disturbance, as on a coil's axis, and that alone is not certified,
+    the velocity is certified by itself: else none would be, not even one along the shape or off the axis. Where nothing
+    is known of a disturbance, all currents are scaled by the certified share.
 
     A needle cannot turn away from what it lies along, as its other end would come closer. Where a disturbance is
     measured, the currents therefore take it off sideways by their force across it, see `NeedleSafetyFilter.sidestep`.
