@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -334,7 +335,12 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
     run, needle = executor({"wrap": {"around": "post", "angle": 6.2, "sense": "counterclockwise"}}), Needle()
     poses: list[tuple[np.ndarray, np.ndarray]] = []
     run.start()
-    needle.run(run, 300.0, until=lambda: poses.append((needle.tail, needle.heading)) or run._swept > 4.6)
+
+    def wrapped() -> bool:
+        poses.append((needle.tail, needle.heading))
+        return run._swept > 4.6
+
+    needle.run(run, 300.0, until=wrapped)
     way = needle.way
     if pauses:
         run.pause("the operator has taken over")
@@ -353,7 +359,7 @@ def test_a_needle_backs_off_no_longer_once_time_was_set_back_or_it_was_resumed(c
     needle.share = 0.0
     run.start()
     needle.run(run, 5.0, until=lambda: run._backs_off(needle.time))
-    assert run.state is ProcedureState.RUNNING
+    assert run.is_commanding
     needle.share = 1.0
     if change == "resumed":
         run.pause("by the operator")
@@ -368,7 +374,7 @@ def test_a_shape_that_moves_while_it_is_wrapped_counts_as_no_turn_of_the_needle(
     run, needle = executor({"wrap": {"around": "post", "angle": 3.2, "sense": "counterclockwise"}}), Needle()
     run.start()
     needle.run(run, 60.0, until=lambda: run._swept > 1.0)
-    assert run.state is ProcedureState.RUNNING
+    assert run.is_commanding
     # By its new place the needle is 2.9 rad farther around it.
     bearing = math.atan2(*(needle.middle - np.array([0.003, 0.0]))[::-1]) + 2.9
     place = needle.middle - 0.005 * np.array([math.cos(bearing), math.sin(bearing)])
@@ -384,7 +390,7 @@ def test_the_reason_of_a_pause_is_what_is_missing_now():
     run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle()
     run.start()
     for problem in ("no needle pose for more than 0.5 s", "the thread has not been measured for 1.0 s"):
-        needle.run(run, 0.5, lambda problem=problem: replace(KNOWN, problem=problem))
+        needle.run(run, 0.5, partial(replace, KNOWN, problem=problem))
         assert (run.state, run.reason) == (ProcedureState.PAUSED, problem)
 
 
