@@ -104,7 +104,7 @@ def test_each_goal_has_its_own_speed_in_the_ideal_time(hernia: Setup, monkeypatc
     assert one + other == pytest.approx(1.5 * slow)
 
 
-def test_tension_and_friction_are_judged_by_the_limits_of_the_goal_that_is_pursued(hernia: Setup, short: Procedure):
+def test_tension_and_friction_are_compared_with_the_limits_of_the_present_goal(hernia: Setup, short: Procedure):
     limits = (ProcedureLimits(tension=4e-4, friction_nodes=9), ProcedureLimits(tension=1e-4, friction_nodes=2))
     planner = NeedlePlanner(hernia.scene, hernia.coils.needle().kinematics, hernia.coils.keep_out, 0.05)
     extremes, thread = RunExtremes(planner, hernia.scene, limits, None), np.array([[0.008, -0.0145], [0.007, -0.0145]])

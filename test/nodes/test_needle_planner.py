@@ -34,7 +34,7 @@ from magnetosuture_thread.interface import (
     PLAN_PROCEDURE,
     RESUME_PROCEDURE,
 )
-from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes import procedure_inputs, topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
@@ -439,3 +439,11 @@ def test_without_a_scene_or_a_needle_nothing_is_begun(graph):
         client.destroy()
     assert "a scene first" in reasons[0]
     assert "a needle that is tracked" in reasons[1]
+
+
+@pytest.mark.parametrize("positions", [[], [Point()], [Point(), Point(x=math.nan)]])
+def test_positions_that_are_no_thread_are_none(positions: list[Point]):
+    assert procedure_inputs._vertices(PredictedThread(positions=positions)) is None
+    found = procedure_inputs._vertices(PredictedThread(positions=[Point(), Point(x=-0.01)]))
+    assert found is not None
+    assert found.tolist() == [[0.0, 0.0], [-0.01, 0.0]]

@@ -248,7 +248,7 @@ def test_paths_that_were_planned_in_another_scene_are_not_shown_any_more():
     assert len(changed) < len(plan)
 
 
-def test_a_needle_without_room_in_a_scene_leaves_the_scene_of_before():
+def test_a_scene_that_is_too_small_for_the_needle_is_refused():
     run = ProcedureSession(NeedlePlannerSettings(needle_length=0.007, keep_out=5e-4), SCENE)
     with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: .* more than 0\.008 m, room for the needle"):
         run.set_scene(Scene(Dish(0.0079)))

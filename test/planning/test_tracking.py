@@ -16,7 +16,6 @@ from magnetosuture_thread.planning.tracking import (
     DRIFT_PER_ANGLE,
     MAX_ALONG_RATIO,
     MAX_AXIS_ANGLE,
-    MIN_HOLD_SPEED,
     MIN_SPEED_SHARE,
     MIN_TACK_TIME,
     TACK_SHARE,
@@ -236,5 +235,5 @@ def test_a_needle_that_is_held_where_it_is_is_commanded_all_the_same():
     middle, angle = tracker.path.at(0.0)
     for k in range(3):
         command = tracker.compute_command(k / RATE, middle, angle, 0.002, hold=True)
-        assert math.hypot(*command.velocity) == pytest.approx(MIN_HOLD_SPEED)
+        assert 0.0 < math.hypot(*command.velocity) < 1e-5
         assert not command.done
