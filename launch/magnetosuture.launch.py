@@ -5,13 +5,15 @@ The setup is one that ships with the package, by `setup:=NAME`, or a file of you
 arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
 arms itself. With `planner:=true` procedures can be executed, and no path follower starts. With `console:=true` the
 operator's page is served on this machine. Where tf2_ros is installed, the dish's frame is published as that of
-`parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others.
+`parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others. With `enclaves:=true`
+each process is in the SROS2 enclave of its name, below that of its namespace: see docs/how_to/security.md.
 
 What only looks comes back when its process dies: the camera's nodes and the operator's page. What moves the needle does
 not: a person arms the bridge, planner and path follower would begin anew amid a motion, and the scene server would
 forget the shapes that were added since.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
@@ -48,9 +50,14 @@ def generate_launch_description() -> LaunchDescription:
         file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
-        planner = LaunchConfiguration("planner").perform(context) == "true"
+        planner, enclaves = (LaunchConfiguration(name).perform(context) == "true" for name in ("planner", "enclaves"))
         frame = LaunchConfiguration("parent_frame").perform(context)
-        return [*started(str(file.resolve()), planner), *transforms(frame)]
+        outer = LaunchConfiguration("namespace").perform(context).strip("/")
+
+        def ros_arguments(name: str) -> list[str]:
+            return ["--enclave", f"/{outer}/{name}" if outer else f"/{name}"] if enclaves else []
+
+        return [*started(str(file.resolve()), planner, ros_arguments), *transforms(frame, ros_arguments)]
 
     return LaunchDescription(
         [
@@ -62,13 +69,14 @@ def generate_launch_description() -> LaunchDescription:
             switch("simulated", "with a rig in software"),
             switch("planner", "with the needle planner, in place of the path follower"),
             switch("console", "with the operator's page"),
+            switch("enclaves", "each process in the SROS2 enclave of its name"),
             OpaqueFunction(function=nodes),
         ]
     )
 
 
-def started(file: str, planner: bool) -> list[Node]:
-    """Return the nodes with a parameter file, the needle planner among them or not."""
+def started(file: str, planner: bool, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
+    """Return the nodes with a parameter file, the needle planner among them or not, and ROS arguments by their name."""
     with_console = IfCondition(LaunchConfiguration("console"))
     with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
 
@@ -79,6 +87,7 @@ def started(file: str, planner: bool) -> list[Node]:
             name=name if named else None,
             namespace=LaunchConfiguration("namespace"),
             parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
+            ros_arguments=ros_arguments(name),
             output="screen",
             respawn=name in RESPAWNED,
             respawn_delay=RESPAWN_DELAY,
@@ -98,7 +107,7 @@ def started(file: str, planner: bool) -> list[Node]:
     ]
 
 
-def transforms(parent_frame: str) -> list[Node]:
+def transforms(parent_frame: str, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
     """Return the publisher of the dish's frame in another one; none without tf2_ros, or without a name."""
     if not parent_frame or "tf2_ros" not in get_packages_with_prefixes():
         return []
@@ -109,6 +118,7 @@ def transforms(parent_frame: str) -> list[Node]:
             name="dish_transform",
             namespace=LaunchConfiguration("namespace"),
             arguments=["--frame-id", parent_frame, "--child-frame-id", "dish"],
+            ros_arguments=ros_arguments("dish_transform"),
             remappings=[("/tf_static", "tf_static")],  # two rigs in two namespaces have a dish each
         )
     ]

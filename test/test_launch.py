@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -80,7 +81,7 @@ def test_a_setup_is_one_of_those_that_ship(description):
 
 def test_every_switch_names_its_choices(description):
     switches = {entry.given[0]: entry for entry in description if entry.kind == "argument"}
-    for name in ("use_sim_time", "simulated", "planner", "console"):
+    for name in ("use_sim_time", "simulated", "planner", "console", "enclaves"):
         assert switches[name].choices == ["true", "false"]
         assert switches[name].default_value == "false"
 
@@ -117,6 +118,25 @@ def test_the_frame_of_the_dish_is_published_where_tf2_is_installed(description, 
     assert transform.arguments == ["--frame-id", "bench", "--child-frame-id", DISH_FRAME]
     assert (transform.namespace.name, transform.remappings) == ("namespace", [("/tf_static", "tf_static")])
     assert "tf2_ros" not in {node.package for node in nodes(description, parent_frame="")}
+
+
+@pytest.mark.parametrize(("namespace", "outer"), [("", ""), ("left", "/left"), ("/left", "/left")])
+def test_each_process_is_in_the_enclave_of_its_name_where_asked(
+    description, monkeypatch: pytest.MonkeyPatch, namespace: str, outer: str
+):
+    monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
+    policies = ElementTree.parse(ROOT / "config" / "security" / "policies.xml").getroot()
+    enclaves = {f"{outer}{enclave.get('path')}" for enclave in policies.iter("enclave")}
+    started = [
+        node
+        for planner in ("true", "false")
+        for node in nodes(description, namespace=namespace, planner=planner, enclaves="true")
+    ]
+    for node in started:
+        name = "dish_transform" if node.package == "tf2_ros" else node.executable
+        assert node.ros_arguments == ["--enclave", f"{outer}/{name}"]
+        assert node.ros_arguments[1] in enclaves
+    assert all(node.ros_arguments == [] for node in nodes(description, namespace=namespace))
 
 
 def test_what_moves_the_needle_never_comes_back_by_itself(description):

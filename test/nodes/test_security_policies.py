@@ -141,7 +141,7 @@ def test_the_command_coils_has_on_the_graph_what_its_policies_allow_and_no_more(
 
 
 def test_every_process_has_an_enclave():
-    processes = {SCENE_SERVER, *PROCESSES, *RIG_NODES, "needle_planner", "console", "coil_client"}
+    processes = {SCENE_SERVER, *PROCESSES, *RIG_NODES, "needle_planner", "console", "coil_client", "dish_transform"}
     assert set(enclaves()) == {f"/{name}" for name in processes}
     assert set(enclaves()["/perception"]) == {"vision_tracker", "thread_model"}
 
