@@ -52,7 +52,9 @@ def compile_kernels() -> None:
 
 
 def copy_kernels(package: Path) -> None:
-    """Copy the kernels beside the installed files that they were compiled from."""
+    """Copy the kernels beside the installed files that they were compiled from, where those are not this package."""
+    if package.samefile(PACKAGE):
+        return
     for source in PACKAGE.rglob("*.py"):
         installed = package / source.relative_to(PACKAGE)
         if not installed.exists() or not filecmp.cmp(source, installed, shallow=False):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -83,6 +84,16 @@ def test_workflows_run_what_is_there_for_every_python_that_is_supported():
         assert (ROOT / path).is_file()
     (installed,) = re.findall(r"^pip install ('.*)$", steps, re.MULTILINE)
     assert any(installed in page.read_text() for page in (ROOT / "docs").rglob("installation.md"))
+
+
+def test_kernels_are_handed_to_other_installations_alone():
+    """In a workspace where the installed package is the one that is imported there is nothing to copy."""
+    spec = importlib.util.spec_from_file_location("kernels", ROOT / ".ci" / "kernels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    kernels = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(kernels)
+    kernels.copy_kernels(kernels.PACKAGE)
 
 
 def test_every_message_is_built():
