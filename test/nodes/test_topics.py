@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -14,6 +16,21 @@ from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+
+
+def test_ros2_bag_gets_the_quality_of_service_of_topics_whose_last_message_is_kept():
+    file = Path(__file__).parents[2] / "config" / "ros2_bag" / "qos.yaml"
+    every = {topic.channel.recorded: topic for topic in vars(topics).values() if isinstance(topic, topics.Topic)}
+    assert yaml.safe_load(file.read_text()) == {
+        name: {
+            "history": topic.qos.history.short_key,
+            "depth": topic.qos.depth,
+            "reliability": topic.qos.reliability.short_key,
+            "durability": topic.qos.durability.short_key,
+        }
+        for name, topic in every.items()
+        if topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    }
 
 
 def test_only_camera_and_pose_are_sensor_data():
