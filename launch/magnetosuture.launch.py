@@ -52,10 +52,13 @@ def generate_launch_description() -> LaunchDescription:
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
         planner, enclaves = (LaunchConfiguration(name).perform(context) == "true" for name in ("planner", "enclaves"))
         frame = LaunchConfiguration("parent_frame").perform(context)
-        outer = LaunchConfiguration("namespace").perform(context).strip("/")
+        inner = LaunchConfiguration("namespace").perform(context)
+        # As launch_ros does it: what a group pushes comes before, but not before an absolute namespace.
+        pushed = "" if inner.startswith("/") else context.launch_configurations.get("ros_namespace", "")
+        outer = [part for part in f"{pushed}/{inner}".split("/") if part]
 
         def ros_arguments(name: str) -> list[str]:
-            return ["--enclave", f"/{outer}/{name}" if outer else f"/{name}"] if enclaves else []
+            return ["--enclave", "/" + "/".join([*outer, name])] if enclaves else []
 
         return [*started(str(file.resolve()), planner, ros_arguments), *transforms(frame, ros_arguments)]
 

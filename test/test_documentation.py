@@ -40,7 +40,15 @@ ALL = [*WITH_COMMANDS, ROOT / "CHANGELOG.md"]
 
 # Programs of others, of whose options nothing is known here.
 FOREIGN = {".", "apt", "cd", "chrt", "colcon", "dask", "git", "kill", "pip", "rosdep"}
-FOREIGN_OPTIONS = {"--help", "--qos-durability"}
+FOREIGN_OPTIONS = {
+    "--help",
+    "--qos-durability",
+    "--ros-args",
+    "--enclave",
+    "--qos-profile-overrides-path",
+    "--all",
+    "--topics",
+}
 FOREIGN_WORDS = {
     "set_parameters_atomically",
     "corner_radus",

@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -23,6 +23,12 @@ SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 def kept(kind: str) -> Callable[..., SimpleNamespace]:
     """Return what stands in for a class of launch: it keeps what it is given."""
     return lambda *given, **named: SimpleNamespace(kind=kind, given=given, **named)
+
+
+class Context(dict[str, str]):
+    """Stands in for LaunchContext: the arguments, and what a group around the launch file has set."""
+
+    launch_configurations: ClassVar[dict[str, str]] = {}
 
 
 class Configuration:
@@ -45,7 +51,7 @@ def description(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
             "get_package_share_directory": lambda package: str(ROOT),
             "get_packages_with_prefixes": lambda: INSTALLED,
         },
-        "launch": {"LaunchContext": dict, "LaunchDescription": lambda entries: entries},
+        "launch": {"LaunchContext": Context, "LaunchDescription": lambda entries: entries},
         "launch.actions": {"DeclareLaunchArgument": kept("argument"), "OpaqueFunction": kept("function")},
         "launch.conditions": {"IfCondition": kept("if"), "UnlessCondition": kept("unless")},
         "launch.substitutions": {"LaunchConfiguration": Configuration},
@@ -70,7 +76,7 @@ def nodes(description: list[Any], **arguments: str) -> list[Any]:
     declared = {entry.given[0]: entry for entry in description if entry.kind == "argument"}
     given = {name: arguments.get(name, entry.default_value) for name, entry in declared.items()}
     (function,) = (entry for entry in description if entry.kind == "function")
-    return list(function.function(given))
+    return list(function.function(Context(given)))
 
 
 def test_a_setup_is_one_of_those_that_ship(description):
@@ -120,10 +126,14 @@ def test_the_frame_of_the_dish_is_published_where_tf2_is_installed(description, 
     assert "tf2_ros" not in {node.package for node in nodes(description, parent_frame="")}
 
 
-@pytest.mark.parametrize(("namespace", "outer"), [("", ""), ("left", "/left"), ("/left", "/left")])
+@pytest.mark.parametrize(
+    ("pushed", "namespace", "outer"),
+    [("", "", ""), ("", "left", "/left"), ("", "/left", "/left"), ("/lab", "left", "/lab/left"), ("/lab", "", "/lab")],
+)
 def test_each_process_is_in_the_enclave_of_its_name_where_asked(
-    description, monkeypatch: pytest.MonkeyPatch, namespace: str, outer: str
+    description, monkeypatch: pytest.MonkeyPatch, pushed: str, namespace: str, outer: str
 ):
+    monkeypatch.setitem(Context.launch_configurations, "ros_namespace", pushed)
     monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
     policies = ElementTree.parse(ROOT / "config" / "security" / "policies.xml").getroot()
     enclaves = {f"{outer}{enclave.get('path')}" for enclave in policies.iter("enclave")}
