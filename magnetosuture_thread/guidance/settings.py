@@ -45,6 +45,9 @@ class PathFollowerSettings(Configuration):
         minimum=0.0,
         maximum=60.0,
     )
+    pose_timeout: float = quantity(
+        0.5, "a needle pose that is older on arrival gives no command", unit="s", minimum=0.05, maximum=5.0
+    )
     audience: int = quantity(
         1, "subscribers to its commands that it waits for: the bridge, and any recorder", minimum=1, maximum=100
     )

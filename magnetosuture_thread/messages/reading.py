@@ -94,6 +94,21 @@ def needle_pose(message: Any) -> NeedlePose:
     return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading, deviation)
 
 
+def check_pose_age(stamp: float, now: float, max_age: float) -> None:
+    """Refuse a pose that was too long on its way: a command that it gives would be stamped as of now.
+
+    Args:
+        stamp: of the pose [s].
+        now: the same clock now [s].
+        max_age: of the pose [s].
+
+    Raises:
+        InvalidInputError: it is older.
+    """
+    if now - stamp > max_age:
+        raise InvalidInputError(_STAMP, f"{now - stamp:.3f} s old", f"at most {max_age:g} s")
+
+
 def tracked_pose(
     stamp: Any,
     tail: NDArray[np.float64],

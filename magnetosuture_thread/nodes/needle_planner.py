@@ -48,6 +48,7 @@ class NeedlePlannerNode(PackageNode):
         settings = declare(self, NeedlePlannerSettings)
         scene = initial_scene(settings.scene)
         self._audience, self._planning = settings.audience, ThreadPoolExecutor(1)
+        self._max_pose_age = settings.pose_timeout
         self._session = ProcedureSession(settings, scene, self._planning.submit)
         with self.health.busy("loading the planner's kernels; the first start on a machine compiles them"):
             compile_planning()
@@ -106,6 +107,7 @@ class NeedlePlannerNode(PackageNode):
         """Publish the velocity command of the procedure, if one runs."""
         try:
             pose = reading.needle_pose(message)
+            reading.check_pose_age(pose.stamp, self.get_clock().now().nanoseconds * 1e-9, self._max_pose_age)
         except InvalidInputError as error:
             return self.refuse(error)
         velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())

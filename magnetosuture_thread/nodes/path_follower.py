@@ -59,6 +59,8 @@ class PathFollowerNode(PackageNode):
             return
         try:
             pose = reading.needle_pose(message)
+            now = self.get_clock().now().nanoseconds * 1e-9
+            reading.check_pose_age(pose.stamp, now, self._settings.pose_timeout)
             command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
             self.health.refuse(error)

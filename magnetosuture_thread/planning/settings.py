@@ -29,7 +29,11 @@ class NeedlePlannerSettings(Configuration):
     keep_out: float = shared_parameter("keep_out")
     pose_margin: float = shared_parameter("pose_margin")
     pose_timeout: float = quantity(
-        0.5, "a procedure pauses after this long without a needle pose", unit="s", minimum=0.05, maximum=5.0
+        0.5,
+        "a procedure pauses after this long without a needle pose; one that is older on arrival does not count",
+        unit="s",
+        minimum=0.05,
+        maximum=5.0,
     )
     thread_timeout: float = quantity(
         0.5,

@@ -66,6 +66,7 @@ class Bench:
         self.feedback: list[Any] = []
         self.tail, self.heading = np.array([-0.006, 0.0]), np.array([1.0, 0.0])
         self.frame, self.moved = 0, 0
+        self.begin = int(time.time()) + 3600  # s; late poses are refused, however slowly the test runs
         self.real_time = False  # whether the stamps of poses are those of a clock, for a coil bridge
         self.margins = SafetyMargins(valid=True, slowdown=1.0)
         graph.publish(topics.SCENE, scene_told(scene))
@@ -78,7 +79,7 @@ class Bench:
             along = NEEDLE.body_velocity(self.heading, np.array([velocity.x, velocity.y]))
             self.tail, self.heading = NEEDLE.moved(self.tail, self.heading, *along, 1.0 / RATE)
             self.moved = len(self.commands)
-        stamp = Time(sec=5 + self.frame // 20, nanosec=50_000_000 * (self.frame % 20))
+        stamp = Time(sec=self.begin + self.frame // 20, nanosec=50_000_000 * (self.frame % 20))
         if self.real_time:
             stamp = self.graph.now()
             self.margins.header.stamp = stamp
@@ -327,6 +328,18 @@ def test_without_poses_it_pauses(graph, make_bench, tracker: str):
     assert not bench.commands[-1].twist.linear.x
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_late_poses_are_as_none(graph, make_bench):
+    """As where two hosts' clocks differ, or a network holds them back: their commands would be stamped as of now."""
+    bench = make_bench(pose_timeout=0.2)
+    bench.run()
+    ahead, bench.begin = bench.begin, int(time.time()) - 3600
+    reason = "no needle pose for more than 0.2 s"
+    bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
+    assert not bench.commands[-1].twist.linear.x
+    bench.begin = ahead
+    bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
 
 
 def test_a_needle_that_is_taken_out_of_the_dish_pauses(graph, make_bench):
