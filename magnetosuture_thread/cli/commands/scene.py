@@ -25,7 +25,8 @@ DESCRIPTION = """\
 Check a scene file, or draw it.
 
 FILE is a YAML or GeoJSON file, or the name of a scene that ships with the
-package: dish_35mm, dish_35mm_post, dish_150mm or hernia_ring. Its format is in docs/how_to/scenes.md.
+package, for example dish_35mm or hernia_ring. Its format is in
+docs/how_to/scenes.md.
 """
 
 
