@@ -16,6 +16,7 @@ from magnetosuture_thread.model.estimator.correction import (
     measured_rows,
     normals_of,
     prior_information,
+    robust_weights,
 )
 from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
 from magnetosuture_thread.model.formulations import RodFormulation
@@ -188,6 +189,16 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
 
 
+def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:
+    residual, variance, weights = np.zeros(20), np.full(20, 1e-4), np.full(20, 0.5)
+    residual[4], residual[10:17] = 0.1, -0.1
+    points = MeasuredPoints(np.linspace(0.5, 10.0, 20), residual, variance, np.ones(20))
+    change = robust_weights(points, residual, variance, weights)
+    assert weights[4] == pytest.approx(5.0 / (4.0 + 0.1**2 / 1e-4))
+    np.testing.assert_allclose(np.delete(weights, 4), 1.0)
+    assert change == pytest.approx(0.5)
+
+
 def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> None:
     nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
     variance = np.zeros(10)
@@ -196,6 +207,8 @@ def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> No
     np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
     propagate(nodes + np.array([0.0, 1.0]), nodes, np.full(10, 0.1), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
+    propagate(nodes + np.array([0.3, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
+    np.testing.assert_allclose(variance, 0.7 * np.eye(10)[6] + 0.3 * np.eye(10)[7] + 0.1, atol=1e-12)
 
 
 def test_deviation_matches_the_spread_of_estimates() -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, MeasuredPoints
-from magnetosuture_thread.model.estimator.innovations import WindowSums, take_over, weigh
+from magnetosuture_thread.model.estimator.innovations import WindowSums, weigh
 from magnetosuture_thread.model.estimator.noise import (
     GRID,
     LEARNING_PRIOR,
@@ -25,7 +25,7 @@ from magnetosuture_thread.model.estimator.noise import (
     match_innovations,
     shift_errors,
 )
-from magnetosuture_thread.model.estimator.noise_model import propagate_errors
+from magnetosuture_thread.model.estimator.noise_model import NoiseModel, propagate_errors, take_correction
 
 
 def bank_with(errors: np.ndarray, deviation: float) -> NoiseBank:
@@ -148,8 +148,8 @@ def test_a_correction_leaves_its_covariance_across_the_thread_and_the_informatio
     work.normals[:] = np.column_stack([np.cos(angles), np.sin(angles)])
     work.covariance[:], work.moved[:] = root @ root.transpose(0, 2, 1), rng.normal(size=(13, 2))
     before = rng.uniform(1e-4, 1e-3, 13)
-    density, variance, applied = before.copy(), np.empty(13), np.empty(4)
-    hidden = take_over(points, np.ones(40), work, density, variance, applied)
+    density, variance, bank, unit = before.copy(), np.empty(13), NoiseBank.of(4), 2e-3
+    hidden = take_correction(points, np.ones(40), work, unit, bank, density, variance)
     np.testing.assert_allclose(variance, np.einsum("ia,iab,ib->i", work.normals, work.covariance, work.normals))
     precision, gained = points.share / points.variance, np.zeros(13)
     for place, value in zip(points.place, precision, strict=True):
@@ -159,8 +159,8 @@ def test_a_correction_leaves_its_covariance_across_the_thread_and_the_informatio
     across = np.interp(points.place, np.arange(13), np.einsum("ia,ia->i", work.normals, work.moved))
     for w in range(2):
         inside = (points.place >= 3.0 * w) & (points.place < 3.0 * (w + 1))
-        assert applied[w] == pytest.approx(np.average(across[inside], weights=precision[inside]))
-    np.testing.assert_array_equal(applied[2:], 0.0)
+        np.testing.assert_allclose(bank.error[w], -unit * np.average(across[inside], weights=precision[inside]))
+    np.testing.assert_array_equal(bank.error[2:], 0.0)
     assert hidden == pytest.approx(1.0 - len(set(points.place.astype(int))) / segments)
 
 
@@ -190,3 +190,21 @@ def test_over_a_step_errors_go_with_the_thread_and_grow_by_its_noise() -> None:
     propagate_errors(after, before, unit, np.full(16, 4e-6), interval, 3.0, variance, density)
     np.testing.assert_allclose(variance, expected[0] + added)
     np.testing.assert_allclose(density, expected[1] + 3.0 * added)
+
+
+def test_of_the_first_frame_no_noise_is_known_and_later_ones_count_by_the_time_before() -> None:
+    """Innovations that change sides from frame to frame are those of points ten times worse than the camera says."""
+    model, unit, count, camera = NoiseModel(0.4), 1e-3, 48, 1e-4
+    place, weights, sums, scale = np.linspace(0.1, 11.9, count), np.empty(count), WindowSums.of(WINDOWS), 1.0
+    for k in range(5):
+        innovation = np.full(count, (-1.0) ** k * np.sqrt(10.0 * camera / 2.0 / 3.0))  # 3 points in a window
+        points = MeasuredPoints(place, innovation, np.full(count, camera * model.scale), np.ones(count))
+        variance, density = np.full(13, 1e-9), np.full(13, 1e-9)
+        found, _ = model.learn(points, weights, sums, unit, 0.03, 1.0, variance, density)
+        if k == 0:
+            assert model.ratio == 1.0
+            np.testing.assert_allclose(found.variance, (sums.own + sums.known) * unit**2)
+        else:
+            scale += 0.03 / (0.03 * k + LEARNING_PRIOR) * (10.0 - scale)
+            assert model.ratio != 1.0
+        assert model.scale == pytest.approx(scale, rel=1e-6)
