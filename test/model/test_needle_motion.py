@@ -13,6 +13,8 @@ from magnetosuture_thread import NeedlePose, ThreadPredictor
 from magnetosuture_thread.model.needle_motion import (
     ACCELERATION,
     MAX_INTERVAL,
+    MAX_SPEED,
+    MAX_TURNING,
     TURNING,
     NeedleMotionFilter,
     filter_pose,
@@ -78,6 +80,26 @@ def test_poses_whose_deviation_is_not_known_are_as_they_were():
     for k in range(5):
         pose = on_circle(k / RATE)
         assert motion.update(pose) is pose
+    random = np.random.default_rng(9)
+    for k in range(5, 20):
+        motion.update(measured(on_circle(k / RATE), random))
+    assert motion.update(on_circle(20 / RATE)).motion is None  # and ends what was known
+    pose = measured(on_circle(21 / RATE), random)
+    assert motion.update(pose) is pose
+
+
+def test_after_a_change_of_mind_nothing_of_the_velocity_is_known():
+    """Whatever was known of it, and however well: the covariance is that of a needle that was only just there."""
+    state, measured_at = np.array([0.0, 0.0, 0.3, 4e-3, 0.0, 0.5]), np.array([0.0, 3e-4, 0.3])
+    sizes, found = np.array([1e-5, 1e-5, 5e-3, 1e-4, 1e-4, 1e-2]), []
+    root = sizes[:, None] * np.random.default_rng(10).normal(size=(6, 6))
+    unknown = np.diag([0.0, 0.0, 0.0, MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2])
+    unknown[:3, :3] = (root @ root.T)[:3, :3]
+    for covariance in (root @ root.T, unknown):
+        moved = state.copy()
+        filter_pose(moved, covariance, measured_at, 1.0 / RATE, PLACE**2, ANGLE**2)
+        found.append(np.concatenate([moved, covariance.ravel()]))
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-18)
 
 
 def test_after_a_gap_or_out_of_order_a_pose_stays_as_it_was():

@@ -83,6 +83,20 @@ def test_a_node_that_passed_through_a_segment_is_on_its_wrong_side():
     assert (barrier.rows_after(before, around).value > 0.0).all()
 
 
+def test_a_node_that_passed_through_a_segment_and_far_beyond_has_passed():
+    before = 1e-3 * np.array([(0, 0), (1, 0), (2, 0), (2.5, 0.8), (1.8, 1.4), (1.2, 0.8), (0.5, 0.2)], dtype=float)
+    after = before.copy()
+    after[6] = 1e-3 * np.array([0.5, -4.0])
+    assert SelfContact(soft(6, 0.006)).passed(before, after)
+
+
+def test_a_thread_thicker_than_its_segments_are_long_does_not_touch_itself_next_door():
+    fine = soft(100, 100 * 0.7 * DIAMETER)
+    turn = np.arange(30) * fine.segment_length / (10.0 * DIAMETER)
+    steps = fine.segment_length * np.column_stack([np.cos(turn), np.sin(turn)])
+    assert not len(SelfContact(fine).rows(np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])).value)
+
+
 def test_a_node_that_passes_through_a_segment_and_back_has_passed():
     """Node 4 enters the segment that turns about node 0 at 0.28 of the way and leaves it at 0.72."""
     before = 1e-3 * np.array([(0.0, 0.0), (1.0, 0.0), (1.6, 0.8), (1.0, 1.5), (0.5, 0.1)])

@@ -98,6 +98,8 @@ def test_friction_beside_the_needle_is_of_the_slip_that_its_own_motion_makes():
 
     count = contacts()
     pushed = int(np.flatnonzero(np.isclose(buffers.place[:count], 0.4) & (buffers.node[:count] == 0))[0])
+    np.testing.assert_allclose(buffers.gradient[pushed], [(0.0, 0.0), (0.0, -0.4), (0.0, 0.0)], atol=1e-12)
+    assert buffers.compliance[pushed] > 0.0  # its ends may be held on both sides of a shape
     keep_grips(buffers, 2.0 * np.eye(count)[pushed], 0, rough)
     assert contacts() == count
     assert friction_rows(buffers, 0, count, rough, before, nodes, known, interval) == (1, 1.0)
@@ -114,3 +116,19 @@ def test_friction_beside_the_needle_is_of_the_slip_that_its_own_motion_makes():
     assert buffers.multipliers[count] == pytest.approx(-0.3)
     # A shape that pushes no more rubs no more, which is a change.
     assert friction_rows(buffers, 0, 0, rough, before, nodes, known, interval) == (0, 1.0)
+
+
+def test_a_chord_beside_the_needle_that_gets_too_deep_is_noticed():
+    post = Workspace((Disc((-0.4 * UNIT, 0.45 * UNIT), 0.2 * UNIT),), UNIT).data
+    buffers, nodes, known = (
+        StepBuffers.of(6, 2, 0, 100),
+        np.column_stack([-np.arange(6.0), np.zeros(6)]),
+        np.arange(6) == 0,
+    )
+    contact_rows(buffers, 0, post, nodes, nodes, known, 1.0, UNIT, RADIUS, True)
+    turned = nodes + np.array([(0.0, 0.0), (0.0, 0.8), *[(0.0, 1.2)] * 4])
+    assert not stays_clear(buffers, post, nodes, turned, known, UNIT, RADIUS)
+    contact_rows(buffers, 0, post, nodes, nodes, known, 1.0, UNIT, RADIUS, True)
+    assert stays_clear(buffers, post, nodes, nodes - 0.1, known, UNIT, RADIUS)
+    contact_rows(buffers, 0, post, nodes, nodes, np.arange(6) < 2, 1.0, UNIT, RADIUS, True)
+    assert stays_clear(buffers, post, nodes, turned, np.arange(6) < 2, UNIT, RADIUS)  # which nothing can push
