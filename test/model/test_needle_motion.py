@@ -151,6 +151,10 @@ def test_pose_and_covariance_are_predicted_along_an_arc():
     np.testing.assert_allclose(predicted, after_arc(state, interval), rtol=1e-3)
     own = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(covariance / np.outer(own, own), expected / np.outer(own, own), atol=5e-3)
+    covariance[:] = 0.0
+    filter_pose(state, covariance, np.zeros(3), interval, 1e9, 1e9)
+    np.testing.assert_allclose(covariance[3:, 3:], interval * white[3:, 3:], atol=1e-15)
+    assert covariance[2, 5] == pytest.approx(0.5 * interval**2 * TURNING**2)
 
 
 def test_the_velocity_is_that_in_the_dish_whichever_way_the_needle_heads():
