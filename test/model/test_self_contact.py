@@ -106,8 +106,7 @@ def test_a_thread_thicker_than_its_segments_are_long_does_not_touch_itself_next_
     turn = 2.0 * (np.arange(30) >= 15)  # a kink
     steps = fine.segment_length * np.column_stack([np.cos(turn), np.sin(turn)])
     rows = SelfContact(fine).rows(np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]))
-    assert len(rows.value) > 0
-    assert (rows.value > 0.0).all()
+    assert (rows.value > 0.0).all()  # none, or further on
 
 
 def test_a_node_that_passes_through_a_segment_and_back_has_passed():
