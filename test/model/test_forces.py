@@ -55,6 +55,34 @@ def test_a_thread_held_in_a_flow_is_dragged_by_it():
     assert forces.needle_force == pytest.approx([-drag * thread.length, 0.0], rel=1e-5, abs=1e-12)
 
 
+def test_a_chain_that_hangs_straight_down_carries_its_weight():
+    mass, gravity, length = 1e-5, 9.81, 0.1
+    thread = Thread("chain", length, 10, 1e-4, 0.0, Medium.air(mass, (0.0, -gravity)), Attachment.PINNED)
+    predictor, up = ThreadPredictor(thread), (0.0, 1.0)
+    nodes = np.column_stack([np.zeros(11), np.linspace(0.0, -length, 11)])
+    predictor.start_at(pose(0.0, (0.0, 0.0), up), nodes)
+    for k in range(1, 6):
+        forces = predictor.step(pose(0.01 * k, (0.0, 0.0), up)).forces
+    assert forces is not None
+    below = length * (np.arange(10)[::-1] + 0.5) / 10
+    assert forces.tension == pytest.approx(mass * gravity * below, rel=1e-3)
+    assert forces.needle_force == pytest.approx([0.0, -mass * gravity * length], rel=1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_clamped_thread_in_a_cross_flow_turns_the_needle_as_a_beam_does(side: float):
+    """M = -f L^2 / 2 with the drag f per length: the flow to the left of a needle to the east turns it to the right."""
+    thread = ThreadPredictor.create("polyamide_7_0", length=0.01, segments=10, attachment="clamped").thread
+    load = 0.02 * 8.0 * thread.bending_stiffness / thread.length**3  # bends it by 2 % of its length
+    flow = (0.0, side * load / thread.medium.drag_across)
+    predictor = ThreadPredictor(replace(thread, medium=replace(thread.medium, flow=flow)))
+    predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)))
+    for k in range(1, 11):
+        forces = predictor.step(pose(20.0 * k, (0.0, 0.0), (1.0, 0.0))).forces
+    assert forces is not None
+    assert forces.needle_moment == pytest.approx(-0.5 * side * load * thread.length**2, rel=0.02)
+
+
 def test_a_hanging_chain_has_the_tension_of_a_catenary():
     mass, gravity, length, span, segments = 1e-5, 9.81, 0.1, 0.08, 80
     medium = Medium.air(mass, (0.0, -gravity), drag=2e-4)

@@ -93,6 +93,7 @@ def test_in_space_the_rest_shape_may_lie_any_way():
     rest, nothing = np.full(11, 0.1), np.zeros(3)
     flat, turned = gradient_of(bent, nothing, False, rest), gradient_of(bent @ turn.T, nothing, False, rest)
     np.testing.assert_allclose(flat @ turn.T, turned, atol=1e-13)
+    np.testing.assert_array_equal(gradient_of(bent, nothing, False, -rest), flat)  # there is no left
     np.testing.assert_allclose(flat[:, :2], gradient_of(bent[:, :2].copy(), np.zeros(2), False, rest), atol=1e-13)
 
 
@@ -162,3 +163,33 @@ def test_tension_is_the_slope_of_its_energy(clamped: bool):
         hessian += np.diag(couplings[apart - 1, :-apart], apart) + np.diag(couplings[apart - 1, :-apart], -apart)
     assert np.linalg.eigvalsh(hessian).min() > -1e-12
     np.testing.assert_allclose(hessian.sum(axis=1)[2:], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+def test_the_force_of_tension_is_that_where_the_velocities_lead(clamped: bool):
+    """Implicit in u: q(x + dt u) = q(x) + P u, for turns that are resolved."""
+    random, heading, tension, interval = np.random.default_rng(5), np.array([-1.0, 0.0]), np.linspace(1.0, 2.0, 6), 0.3
+    positions = np.arange(7.0)[:, None] * np.array([1.0, 0.0]) + 0.01 * random.normal(size=(7, 2))
+    velocities, programs = 1e-3 * random.normal(size=(7, 2)), []
+    for at in (positions, positions + interval * velocities):
+        program = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
+        mechanics.tension_stiffness(at, heading, clamped, tension, -1.0, interval, program)
+        programs.append(program)
+    blocks, couplings, linear = programs[0]
+    expected = linear + np.einsum("iab,ib->ia", blocks, velocities)
+    for apart in range(1, 4):
+        coupled = couplings[apart - 1, :-apart, None]
+        expected[:-apart] += coupled * velocities[apart:]
+        expected[apart:] += coupled * velocities[:-apart]
+    np.testing.assert_allclose(programs[1][2], expected, rtol=1e-3, atol=1e-7)
+
+
+def test_a_push_counts_no_more_than_its_bound():
+    positions = np.cumsum([[1.0, 0.1 * (-1.0) ** k] for k in range(7)], axis=0)
+    found = []
+    for tension in (-100.0, -12.0 * 0.3):  # of two segments over 24
+        program = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
+        mechanics.tension_stiffness(positions, np.zeros(2), False, np.full(6, tension), -0.3, 0.5, program)
+        found.append(np.concatenate([part.ravel() for part in program]))
+    np.testing.assert_allclose(found[0], found[1])
+    assert found[0].any()

@@ -81,6 +81,28 @@ def test_the_residuals_see_every_fault(u: np.ndarray, multipliers: list[float], 
     assert getattr(residuals_of(one_node(), u, np.array(multipliers)), which) > 0.03
 
 
+def far_bound(compliance: float = 0.0) -> tuple[ChainProgram, WideRows]:
+    """Return `one_node` with its bound x + y <= 1 as a row over the nodes 0 and 2."""
+    program = one_node()._replace(upper=np.full(2, np.inf))
+    gradient = np.array([[(-1.0, -1.0), (0.0, 0.0)]])
+    return program, WideRows(np.array([[0, 2]]), gradient, np.array([-1.0]), np.array([compliance]))
+
+
+def test_residuals_of_a_row_over_nodes_far_apart_are_those_of_any_other():
+    program, hard = far_bound()
+    assert residuals_of(program, at(0.0, 1.0), np.array([0.0, 0.0, 2.0]), hard).largest < 1e-15
+    _, soft = far_bound(0.5)
+    gives_way = at(1.0 / 3.0, 4.0 / 3.0), np.array([0.0, 0.0, 4.0 / 3.0])
+    assert residuals_of(program, *gives_way, soft).largest < 1e-15
+    assert residuals_of(program, *gives_way, hard).primal > 0.3
+    outside = residuals_of(program, at(0.1, 1.0), np.array([0.0, 0.0, 2.0]), hard)
+    assert outside.primal == pytest.approx(0.1 / 1.1)
+    untouched = residuals_of(program, at(0.0, 0.5), np.array([0.0, 1.0, 3.0]), hard)
+    assert untouched.dual < 1e-15
+    assert untouched.complementarity > 0.3
+    assert residuals_of(program, at(1.0, 2.0), np.array([0.0, 0.0, -1.0]), hard).complementarity > 0.3
+
+
 def rubbing(limit: float, pull: float) -> ChainProgram:
     """Return: minimise x^2 + y^2 - pull x - 6 y with y <= 0, so N = 6, and friction of at most `limit` on x."""
     gradient = np.zeros((2, 3, 2))

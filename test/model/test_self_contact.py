@@ -83,6 +83,32 @@ def test_a_node_that_passed_through_a_segment_is_on_its_wrong_side():
     assert (barrier.rows_after(before, around).value > 0.0).all()
 
 
+def test_segments_that_cross_from_the_beginning_have_rows_but_hold_no_motion_back():
+    nodes = 1e-3 * np.array([(0, 0), (1, 0), (2, 0), (2.5, 0.8), (1.6, 1.0), (1.6, 0.3), (1.6, -0.4)], dtype=float)
+    barrier = SelfContact(soft(6, 0.006))
+    assert barrier.crossings(nodes) == [(1, 5)]
+    assert barrier.rows(nodes).value.min() < -DIAMETER
+    assert (barrier.rows_after(nodes, nodes + np.array([1e-5, 2e-5])).value > -DIAMETER).all()
+    assert not barrier.passed(nodes, nodes + np.array([1e-5, 2e-5]))
+
+
+def test_a_node_that_passed_through_a_segment_and_far_beyond_has_passed():
+    before = 1e-3 * np.array([(0, 0), (1, 0), (2, 0), (2.5, 0.8), (1.8, 1.4), (1.2, 0.8), (0.5, 0.2)], dtype=float)
+    after = before.copy()
+    after[6] = 1e-3 * np.array([0.5, -4.0])
+    rows = SelfContact(soft(6, 0.006)).rows_after(before, after)
+    row = int(np.flatnonzero((rows.nodes == (0, 1, 6)).all(axis=1))[0])
+    assert rows.value[row] == pytest.approx(-4e-3 - DIAMETER)
+
+
+def test_a_thread_thicker_than_its_segments_are_long_does_not_touch_itself_next_door():
+    fine = soft(100, 100 * 0.7 * DIAMETER)
+    turn = 2.0 * (np.arange(30) >= 15)  # a kink
+    steps = fine.segment_length * np.column_stack([np.cos(turn), np.sin(turn)])
+    rows = SelfContact(fine).rows(np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]))
+    assert (rows.value > 0.0).all()  # none, or further on
+
+
 def test_a_node_that_passes_through_a_segment_and_back_has_passed():
     """Node 4 enters the segment that turns about node 0 at 0.28 of the way and leaves it at 0.72."""
     before = 1e-3 * np.array([(0.0, 0.0), (1.0, 0.0), (1.6, 0.8), (1.0, 1.5), (0.5, 0.1)])

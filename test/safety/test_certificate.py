@@ -106,6 +106,86 @@ def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
             assert filtered.safe_share(np.array([0.001, 0.0]), at, EAST)[0] == 1.0
 
 
+def test_one_who_is_too_near_to_a_post_or_the_wall_may_leave_and_goes_no_nearer():
+    post = SceneShape("post", "instrument", Disc((0.002, 0.0), 0.001))
+    filtered = safety(Scene(Dish(0.05), (post,)), 0.0)
+    for at in ((0.0007, 0.0), (0.0015, 0.0), (-0.0248, 0.0)):  # before the post, inside, and before the wall
+        inwards = 0.001 * EAST if at[0] > 0.0 else -0.001 * EAST
+        assert filtered.safe_share(inwards, np.array(at), EAST)[0] < 1e-6
+        assert filtered.safe_share(-inwards, np.array(at), EAST)[0] == 1.0
+    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.0007, 0.0]), EAST)[0] == 1.0
+    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.002, 0.0]), EAST)[0] == 1.0
+
+
+def test_a_point_that_comes_from_beyond_an_edges_end_meets_the_edge():
+    wall = SceneShape("block", "wall", Polygon(((0.0, 0.001), (0.01, 0.001), (0.01, 0.003), (0.0, 0.003))))
+    share, _ = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(
+        np.array([0.03, 0.005]), np.array([-0.002, 0.0]), EAST
+    )
+    assert share * HOLD == pytest.approx(0.1, rel=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.1, 1.7, -2.5])
+def test_far_edges_of_a_shape_of_many_are_met_too(angle: float):
+    turn = np.linspace(-2.9, 2.9, 48).tolist()  # open to the west
+    corners = [(0.004, at) for at in turn] + [(0.005, at) for at in turn[::-1]]
+    ring = Polygon(tuple((radius * math.cos(at), radius * math.sin(at)) for radius, at in corners))
+    scene = Scene(Dish(0.05), (SceneShape("ring", "tissue", ring),))
+    velocity = 0.03 * np.array([math.cos(angle), math.sin(angle)])
+    share, name = safety(scene, 0.0).safe_share(velocity, np.zeros(2), EAST)
+    assert name == "ring"
+    assert 0.004 * math.cos(2.9 / 47) - 5e-4 - 1e-9 <= share * HOLD * 0.03 <= 0.0035 + 1e-5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_certified_for_a_needle_that_drifts_and_turns_fast_keeps_clear_and_little_more_would_not(seed: int):
+    """By up to 7 rad in the hold, beside a post and a block."""
+    random, tight = np.random.default_rng(seed), 0
+    post = SceneShape("post", "instrument", Disc((0.003, 0.003), 0.001))
+    block = SceneShape(
+        "block", "wall", Polygon(((-0.003, -0.004), (0.002, -0.004), (0.002, -0.0025), (-0.003, -0.0025)))
+    )
+    filtered = safety(Scene(Dish(0.03), (block, post)), 0.005)
+
+    def clearance(part: float) -> float:
+        way = (part * along, part * across)
+        times = np.linspace(0.0, HOLD, 101).tolist()
+        return min(filtered.clearance(*filtered.kinematics.moved(tail, heading, *way, t, part * drift)) for t in times)
+
+    for _ in range(40):
+        angle, tail = float(random.uniform(-3.0, 3.0)), random.uniform(-0.006, 0.006, 2)
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        velocity, drift = random.uniform(-0.05, 0.05, 2), float(random.choice([0.0, random.uniform(-0.02, 0.02)]))
+        along, across = filtered.kinematics.body_velocity(heading, velocity)
+        if filtered.clearance(tail, heading) < 6e-4:
+            continue
+        share, _ = filtered.safe_share(velocity, tail, heading, drift)
+        assert clearance(share) > 5e-4 - 1e-9
+        if share < 0.9:
+            tight += clearance(share + 0.03) < 5.1e-4
+    assert tight > 3
+
+
+@pytest.mark.parametrize("angle", [2.0, 3.7])
+def test_a_needle_that_goes_round_is_stopped_by_what_it_meets_within_a_turn(angle: float):
+    """Its middle goes round a circle to its left, and its tip meets a post; past half a turn too."""
+    lever, radius, rate = 0.0035, 0.0042, 14.0
+    ends = math.hypot(lever, radius)
+    at = math.atan2(-radius, lever) + angle
+    post = SceneShape(
+        "post", "instrument", Disc(((ends + 1e-3) * math.cos(at), radius + (ends + 1e-3) * math.sin(at)), 1e-3)
+    )
+    filtered, tail = safety(Scene(Dish(0.05), (post,)), 2.0 * lever), np.array([-lever, 0.0])
+    velocity = rate * np.array([radius, lever])
+    share, name = filtered.safe_share(velocity, tail, EAST)
+    assert name == "post"
+    times = np.linspace(0.0, HOLD, 1501).tolist()
+    gaps = [
+        filtered.clearance(*filtered.kinematics.moved(tail, EAST, rate * radius, rate * lever, time)) for time in times
+    ]
+    assert share * HOLD == pytest.approx(times[int(np.argmax(np.array(gaps) < 5e-4))], abs=1e-3)
+
+
 def test_around_a_dish_both_ends_slide_at_the_bound():
     """The motion is a turn about the dish's centre: nothing gets nearer, whatever rounding says."""
     filtered, radius = safety(Scene(Dish(0.035)), 0.007), 0.0175 - 5e-4

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
 from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
@@ -73,6 +74,27 @@ def test_approach_rate_limits_the_filtered_speed():
     assert found.filtered.tolist() == pytest.approx([1.0 * KEEP, 0.0], rel=0.01)
 
 
+@pytest.mark.parametrize("shape", [POST, BLOCK])
+def test_a_shape_limits_the_speed_before_the_hold_would(shape: SceneShape):
+    """Of a point 9.7 mm before its bound, at a rate of 1 /s: all of the hold would allow 48 mm/s."""
+    gap = 9.7e-3 + KEEP + BAND
+    at = np.array([0.006, 0.002 - gap]) if shape is POST else np.array([0.0, -gap])
+    found = needle_filter(shape, length=0.0, approach_rate=1.0).filter(0.01 * NORTH, at, EAST)
+    assert found.filtered.tolist() == pytest.approx([0.0, 9.7e-3], abs=1e-6)
+    assert found.active == (shape.name,)
+
+
+def test_what_is_left_of_a_command_that_is_next_to_nothing_is_rest():
+    safety = needle_filter(max_speed=0.02)
+    tail, data = np.array([0.0175 - KEEP - LENGTH - BAND - 1e-6, 0.0]), safety.compiled_data()
+    found = safety.filter(0.03 * EAST, tail, EAST)
+    assert found.filtered.tolist() == [0.0, 0.0]
+    assert (found.active, found.reason) == (("speed", "wall"), "stopped by wall")
+    needle = pose_needle(data, float(tail[0]), float(tail[1]), 1.0, 0.0)
+    touched = np.zeros(1, np.bool_)
+    assert filter_velocity(data, needle, (0.03, 0.0), 1.0, (0.0, 0.0), math.inf, touched) == (0.0, 0.0)
+
+
 def test_head_on_it_rests_and_says_why():
     found = needle_filter().filter(0.01 * EAST, np.array([0.0175 - KEEP - LENGTH, 0.0]), EAST)
     assert found.filtered.tolist() == [0.0, 0.0]
@@ -93,11 +115,15 @@ def test_a_point_slides_along_a_block_and_leaves_it():
     assert point.filter(away, *at).filtered.tolist() == away.tolist()
 
 
-def test_beyond_its_bound_a_needle_that_slides_leaves_a_little():
-    at = (np.array([0.0, -0.9 * KEEP]), EAST)
-    x, y = needle_filter(BLOCK, length=0.0).filter(np.array([0.003, 0.004]), *at).filtered
+@pytest.mark.parametrize("commanded", [(0.003, 0.004), (0.003, 0.0)])
+@pytest.mark.parametrize(("depth", "angle"), [(0.1 * KEEP, 0.1), (1e-6, 0.01)])
+def test_beyond_its_bound_a_needle_that_slides_leaves_a_little(
+    commanded: tuple[float, float], depth: float, angle: float
+):
+    at = (np.array([0.0, -KEEP - BAND + depth]), EAST)
+    x, y = needle_filter(BLOCK, length=0.0).filter(np.array(commanded), *at).filtered
     assert x > 0.002
-    assert y / x == pytest.approx(-math.tan(0.1), rel=1e-6)
+    assert y / x == pytest.approx(-math.tan(angle), rel=1e-6)
 
 
 def test_between_two_walls_too_near_a_needle_can_still_leave_along_them():
@@ -154,6 +180,28 @@ def test_a_curved_needle_is_kept_clear_with_its_belly():
     velocity, tail = np.array([0.006, -0.01]), np.array([-0.5 * chord, 0.0])
     assert "post" in needle_filter(post, needle_curvature=250.0).filter(velocity, tail, heading).active
     assert "post" not in needle_filter(post).filter(velocity, tail, EAST).active
+
+
+def test_a_curved_needle_is_kept_clear_of_the_wall_with_its_belly():
+    """Driven forwards and to the right its belly comes 0.4 mm before the wall, though its ends do not."""
+    half = 0.5 * 250.0 * LENGTH
+    chord, belly = 2.0 / 250.0 * math.sin(half), (1.0 - math.cos(half)) / 250.0
+    safety = needle_filter(needle_curvature=250.0)
+    tail, heading = np.array([-0.5 * chord, belly + KEEP + 2e-4 - 0.0175]), np.array([math.cos(half), -math.sin(half)])
+    velocity = np.array([0.0, -0.01])
+    assert safety.clearance(tail, heading) == pytest.approx(KEEP + 2e-4, abs=1e-6)
+    found = safety.filter(velocity, tail, heading)
+    assert found.active == ("wall",)
+    for commanded in (velocity, np.array([0.006, -0.01])):
+        share, name = safety.safe_share(commanded, tail, heading)
+        along, across = safety.kinematics.body_velocity(heading, commanded)
+        for part, clear in ((1.0, True), (1.05, False)):
+            poses = [
+                safety.kinematics.moved(tail, heading, part * share * along, part * share * across, time)
+                for time in np.linspace(0.0, HOLD, 41)
+            ]
+            assert (min(safety.clearance(*pose) for pose in poses) > KEEP - 1e-8) == clear
+        assert name == "wall"
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -219,6 +267,31 @@ def test_a_dish_barely_larger_than_the_needle_is_accepted():
         NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP - 1e-6)), keep_out=KEEP, needle_length=LENGTH)
 
 
+def test_the_distance_from_a_shape_of_many_edges_is_that_of_the_nearest():
+    """Edges are looked at by the dozen."""
+    turn = np.linspace(0.0, 2.0 * math.pi, 60, endpoint=False)
+    star = (4e-3 + 2e-3 * np.cos(5.0 * turn))[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+    point, exact = needle_filter(SceneShape("star", "tissue", Polygon(star)), length=0.0), shapely.Polygon(star)
+    for x, y in np.random.default_rng(5).uniform(-7e-3, 7e-3, (200, 2)):
+        at = shapely.Point(x, y)
+        expected = exact.exterior.distance(at) * (-1.0 if exact.contains(at) else 1.0)
+        assert point.clearance(np.array([x, y]), EAST) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("curvature", [5.0, -200.0])
+def test_between_two_points_of_a_curved_needle_nothing_gets_closer_than_keep_out(curvature: float):
+    """What is as close to two points as may be is as close to the arc between them on either side."""
+    data = needle_filter(length=0.008, keep_out=1e-3, needle_curvature=curvature).compiled_data()
+    radius, turn = 1.0 / abs(curvature), abs(curvature) * 0.008 / (len(data.body.points) - 1)
+    middle, half = radius * math.cos(0.5 * turn), radius * math.sin(0.5 * turn)  # of the points' chord
+    for side in (1.0, -1.0):
+        corner = middle + side * math.sqrt(data.keep**2 - half**2)
+        assert abs(corner - radius) >= 1e-3
+    assert data.keep < 1.04e-3
+    bulge = radius - middle  # towards the wall
+    assert 1e-3 <= data.keep_wall - bulge < 1.001e-3
+
+
 def test_a_long_needle_has_129_points_and_compiled_loops_get_them():
     data = NeedleSafetyFilter(Scene(Dish(0.3)), keep_out=1e-4, needle_length=0.08, needle_curvature=5.0).compiled_data()
     assert len(data.body.points) == 129
@@ -241,6 +314,21 @@ def test_a_needle_beside_a_post_is_taken_off_away_from_it(side: float):
     post = SceneShape("post", "instrument", Disc((float(middle * beside[0]), float(middle * beside[1])), radius))
     step = needle_filter(post).sidestep(-0.5 * LENGTH * heading, heading)
     assert step == pytest.approx(-side * SIDESTEP_RATE * depth, rel=0.01)
+
+
+def test_shapes_are_named_right_whatever_kinds_come_before_them():
+    """Discs come before polygons in compiled code."""
+    safety = needle_filter(BLOCK, POST, length=0.0)
+    data = safety.compiled_data()
+    for name, at, velocity in (
+        ("block", np.array([0.0, -0.001]), 0.02 * NORTH),
+        ("post", np.array([0.006, 0.0071]), -0.02 * NORTH),
+    ):
+        assert safety.safe_share(velocity, at, EAST)[1] == name
+        assert safety.filter(velocity, at, EAST).active == (name,)
+        assert (
+            safety.scene.names[needle_margin(data, pose_needle(data, float(at[0]), float(at[1]), 1.0, 0.0))[1]] == name
+        )
 
 
 @pytest.mark.parametrize("length", [LENGTH, 0.0])

@@ -10,6 +10,7 @@ import pytest
 from magnetosuture_thread import Barrier, ConfigurationError, Disc, Gradient, NeedleSafetyFilter, Scene
 
 HOLD, LENGTH = 0.2, 0.0025
+EAST = np.array([1.0, 0.0])
 
 
 class HalfPlane(Barrier):
@@ -32,6 +33,20 @@ class HalfPlane(Barrier):
         """Return its gradient."""
         count = len(positions)
         return Gradient(np.arange(count)[:, None], np.tile([[[0.0, -1.0]]], (count, 1, 1)))
+
+
+class Appearing(HalfPlane):
+    """The same bound, which there is only from a time on."""
+
+    def value(self, positions: np.ndarray) -> np.ndarray:
+        """Return a row for each point, or none."""
+        return super().value(positions)[: len(positions) if self.time > 0.1 else 0]
+
+    def gradient(self, positions: np.ndarray) -> Gradient:
+        """Return its gradient."""
+        found = super().gradient(positions)
+        count = len(self.value(positions))
+        return Gradient(found.nodes[:count], found.values[:count])
 
 
 class TurnedAway(Barrier):
@@ -150,3 +165,44 @@ def test_the_share_that_keeps_an_added_barrier_includes_the_drift():
     share, name = safety.safe_share(np.zeros(2), tail, east, drift)  # the tip stays, and the tail moves twice as fast
     assert name == "half_plane"
     assert share == pytest.approx(2e-4 / (2.0 * drift * HOLD), abs=0.01)
+
+
+@pytest.mark.parametrize("unit", [1.0, 250.0])
+def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit: float):
+    class Slow(HalfPlane):
+        gain = 2.0
+
+        def value(self, positions: np.ndarray) -> np.ndarray:
+            return unit * super().value(positions)
+
+        def gradient(self, positions: np.ndarray) -> Gradient:
+            found = super().gradient(positions)
+            return Gradient(found.nodes, unit * found.values)
+
+    found = needle(Slow(0.001), length=0.0).filter(np.array([0.0, 0.01]), np.array([0.0, -0.002]), EAST)
+    assert found.filtered.tolist() == pytest.approx([0.0, 2.0 * 0.003])
+    assert found.active == ("half_plane",)
+
+
+def test_beyond_an_added_barrier_a_point_leaves_a_little_as_it_slides():
+    x, y = needle(HalfPlane(0.0), length=0.0).filter(np.array([0.003, 0.004]), np.array([0.0, 1e-3]), EAST).filtered
+    assert x > 0.002
+    assert y / x == pytest.approx(-math.tan(0.1), rel=1e-6)
+
+
+def test_a_barrier_that_appears_within_the_hold_is_kept_too():
+    safety, tail = needle(Appearing(0.0), length=0.0), np.array([0.0, -0.001])
+    assert safety.filter(np.array([0.01, 0.0]), tail, EAST).active == ()
+    found = safety.filter(np.array([0.0, 0.01]), tail, EAST)  # 2 mm in the hold
+    assert found.active == ("half_plane",)
+    assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
+
+
+def test_with_added_barriers_the_share_is_still_that_of_the_wall_and_no_older_reason_is_named():
+    safety, east = needle(HalfPlane(0.002, rate=-0.01)), np.array([0.01, 0.0])
+    at_wall = np.array([0.0175 - LENGTH - 0.0015, -0.002])
+    share, name = safety.safe_share(east, at_wall, EAST)
+    assert name == "wall"
+    assert 0.3 < share < 0.6
+    assert safety.filter(east, at_wall, EAST).active == ("wall",)
+    assert safety.filter(east, np.zeros(2), EAST, time=0.15).active == ("half_plane",)

@@ -42,13 +42,17 @@ def update(
     multipliers: Vector,
     active: NDArray[np.bool_],
 ) -> tuple[int, float]:
-    """Write every multiplier; return how many rows began or ceased to be active, and how far they are from bounds."""
+    """Write every multiplier; return how many rows passed a kink of theirs, and how far they are from bounds.
+
+    A row does where it begins or ceases to be active, or comes from one of its limits to the other.
+    """
     lower, upper, compliance, limit = program.lower, program.upper, program.compliance, program.limit
     changes, gap = 0, 0.0
     for r in range(len(program.first)):
         multiplier = multiplier_of(lower[r], upper[r], compliance[r], limit[r], image[r], weights[r], centre[r])
         now = is_active(limit[r], multiplier)
-        if now != active[r]:
+        # From one limit to the other is a kink too, though the row is active at neither.
+        if now != active[r] or (not now and multiplier * multipliers[r] < 0.0):
             changes += 1
             active[r] = now
         multipliers[r] = multiplier

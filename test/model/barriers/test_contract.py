@@ -15,6 +15,7 @@ from magnetosuture_thread.model.barriers import (
     SquaredObstacleAvoidance,
     Stiffness,
     WallAvoidance,
+    moved_inside,
 )
 
 
@@ -171,3 +172,10 @@ def test_stiffness_is_zero_in_the_rest_shape_and_below_it_elsewhere():
     np.testing.assert_allclose(Stiffness(rest).rows(bent).value, 0.0, atol=1e-30)
     assert Stiffness(rest).rows(straight(1.0)).value[0] < -1e-4
     assert Stiffness(np.array([2.0])).rows(bent).value[0] == pytest.approx(-0.5 * (rest[0] ** 2 - 4.0) ** 2)
+
+
+def test_free_nodes_outside_of_the_wall_are_moved_onto_it_and_no_others():
+    positions = np.array([(0.0, 3.0), (0.6, 0.5), (3.0, -4.0), (-2.1, 0.0)])
+    longest = moved_inside(positions, np.array([True, False, False, False]), 2.0)
+    np.testing.assert_allclose(positions, [(0.0, 3.0), (0.6, 0.5), (1.2, -1.6), (-2.0, 0.0)])
+    assert longest == pytest.approx(3.0)

@@ -9,8 +9,10 @@ import pytest
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.association import (
+    clean_path,
     path_lengths,
     path_without_outliers,
+    project,
     search_start,
     usable_points,
 )
@@ -53,6 +55,51 @@ def test_of_too_many_points_both_ends_are_kept(count: int) -> None:
     np.testing.assert_allclose(kept[[0, -1], 0], [0.0, 19.0])
     steps = np.diff(kept[:, 0])
     assert steps.max() < 2.1 * steps.min()
+
+
+def test_points_that_are_out_of_bounds_or_no_numbers_are_left_out() -> None:
+    points = np.array(
+        [(1e-3, 2e-3), (-20.0, 0.0), (0.0, 20.0), (np.nan, 0.0), (0.0, -20.0), (3e-3, -4e-3), (5e-3, 0.0)]
+    )
+    deviation = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 0.0, -1e-5])
+    kept, deviations, finite = usable_points(points, deviation, 10.0, 2e-6, 1e-3, 100)
+    assert finite == 2
+    np.testing.assert_allclose(kept, [(1.0, 2.0), (3.0, -4.0)])
+    np.testing.assert_allclose(deviations, [1e-2, 2e-3])  # none is as good as 0
+
+
+@pytest.mark.parametrize(("correlation", "share"), [(0.25, 0.4), (0.05, 1.0)])
+def test_points_closer_than_they_err_alike_share_the_information_of_one(correlation: float, share: float) -> None:
+    points = np.column_stack([0.1 * np.arange(30), np.zeros(30)])
+    _, _, arcs, found = clean_path(points, np.full(30, 1e-3), 30.0, 3.0, correlation)
+    np.testing.assert_allclose(arcs, 0.1 * np.arange(30))
+    np.testing.assert_allclose(found, share)
+
+
+@pytest.mark.parametrize("turn", [0.1, -0.1])
+def test_points_on_the_arc_that_the_thread_bends_in_have_no_innovation(turn: float) -> None:
+    """Nodes on a circle, one unit of its arc apart; between two of them it is up to 0.0125 beside their chord."""
+    centre = np.array([0.0, 1.0 / turn])
+
+    def on_arc(arcs: np.ndarray, outwards: float = 0.0) -> np.ndarray:
+        return centre + (1.0 / turn - outwards) * np.column_stack([np.sin(turn * arcs), -np.cos(turn * arcs)])
+
+    nodes, arcs = on_arc(np.arange(20.0)), np.arange(0.0, 12.0, 0.23)
+    for left in (0.0, 0.02, -0.02):
+        place, innovation, count = project(nodes, on_arc(3.1 + arcs, left), arcs, 3.1, 0.1)
+        assert count == len(arcs)
+        np.testing.assert_allclose(place, 3.1 + arcs, atol=0.01)
+        np.testing.assert_allclose(innovation, left, atol=1e-4)
+
+
+def test_beside_a_kink_the_thread_is_straight_and_beyond_its_ends_is_nothing() -> None:
+    nodes = np.array([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)])
+    points = np.array([(1.5, 0.01), (1.8, -0.02), (2.03, 0.4), (2.0, 1.5), (2.0, 5.0)])
+    arcs = np.array([0.0, 0.3, 0.9, 2.0, 5.5])
+    place, innovation, count = project(nodes, points, arcs, 1.5, 0.1)
+    assert count == 4
+    np.testing.assert_allclose(place, [1.5, 1.8, 2.4, 3.5, np.nan])
+    np.testing.assert_allclose(innovation, [0.01, -0.02, -0.03, 0.0, 0.0], atol=1e-12)
 
 
 def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:

@@ -10,12 +10,14 @@ import pytest
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.correction import (
     CORRECTED,
+    NO_ROOM,
     CorrectionBuffers,
     MeasuredPoints,
     correct,
     measured_rows,
     normals_of,
     prior_information,
+    robust_weights,
 )
 from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
 from magnetosuture_thread.model.formulations import RodFormulation
@@ -139,20 +141,19 @@ def test_selected_inverse_matches_the_dense_one() -> None:
         np.testing.assert_allclose(inverse[: 2 * NODES - k, k], np.diagonal(expected, k), rtol=1e-7, atol=1e-10)
 
 
-def test_correction_agrees_with_a_dense_kalman_filter() -> None:
-    """A straight thread has no constraint across it, so that across it the update is the plain one."""
-    rng = np.random.default_rng(4)
+STRAIGHT = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
+
+
+def correct_straight(
+    points: MeasuredPoints, density: float, discs: tuple[Disc, ...] = (), contacts: int = 2 * NODES
+) -> tuple[int, float, float, CorrectionBuffers, np.ndarray]:
+    """Correct a straight thread; return how it ended, how far off the constraints are, residual, memory, weights."""
     segments = NODES - 1
-    estimator = estimator_of(thread_of(segments))
+    estimator = estimator_of(thread_of(segments), discs)
     estimator.start(poses(1)[0])
-    nodes = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
-    points = MeasuredPoints(
-        np.sort(rng.uniform(0.5, segments, 40)), rng.normal(0.0, 1e-4, 40), np.full(40, 1e-4), np.ones(40)
-    )
-    density, noise = np.full(NODES, 3e-4), np.full(NODES, 1.0)
-    buffers, memory = StepBuffers.of(NODES, 2, 3 * segments + 1, 2 * NODES), CorrectionBuffers.of(NODES)
+    buffers, memory = StepBuffers.of(NODES, 2, 3 * segments + 1, contacts), CorrectionBuffers.of(NODES)
     memory.known[0] = True
-    formulation, solver = estimator.predictor.formulation, BandedSolver()
+    formulation, solver, weights = estimator.predictor.formulation, BandedSolver(), np.ones(len(points.place))
     assert isinstance(formulation, RodFormulation)
     code, _, off, residuals, _ = correct(
         (0, 1),
@@ -161,20 +162,31 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
         formulation.workspace.data,
         solver.buffers(NODES, 2, len(buffers.first)),
         memory,
-        nodes,
+        STRAIGHT,
         np.array([1.0, 0.0]),
-        density,
-        noise,
+        np.full(NODES, density),
+        np.full(NODES, 1.0),
         2.0,
         0.5,
         points,
-        np.ones(40),
+        weights,
         (0.0, np.inf),
         1e-6,
     )
+    return code, off, max(residuals), memory, weights
+
+
+def test_correction_agrees_with_a_dense_kalman_filter() -> None:
+    """A straight thread has no constraint across it, so that across it the update is the plain one."""
+    rng, nodes = np.random.default_rng(4), STRAIGHT
+    points = MeasuredPoints(
+        np.sort(rng.uniform(0.5, NODES - 1.0, 40)), rng.normal(0.0, 1e-4, 40), np.full(40, 1e-4), np.ones(40)
+    )
+    density, noise = np.full(NODES, 3e-4), np.full(NODES, 1.0)
+    code, off, residual, memory, _ = correct_straight(points, 3e-4)
     assert code == CORRECTED
     assert off <= 1.0
-    assert max(residuals) < 1e-6
+    assert residual < 1e-6
     check = StepBuffers.of(NODES, 2, 1, 2)
     prior_information(density, noise, 2.0, 0.5, 1.0, False, memory.normals, check)
     information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
@@ -188,6 +200,40 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
 
 
+def test_points_that_the_correction_explains_count_fully() -> None:
+    """Five deviations from the prediction, to both sides, and next to nothing once the thread is corrected."""
+    points = MeasuredPoints(
+        np.array([2.0, 5.0, 8.0, 11.0]), 0.05 * np.array([1, -1, 1, -1.0]), np.full(4, 1e-4), np.ones(4)
+    )
+    code, _, _, memory, weights = correct_straight(points, 10.0)
+    assert code == CORRECTED
+    np.testing.assert_allclose(-memory.moved[[2, 5, 8, 11], 1], points.innovation, rtol=0.1)
+    np.testing.assert_array_equal(weights, 1.0)
+
+
+def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
+    """The points are a tenth of a segment aside, and a disc is a fiftieth of one away from the thread."""
+    thread = thread_of(NODES - 1)
+    unit, radius = thread.segment_length, 2e-3
+    disc = Disc((-6.0 * unit, radius + 0.5 * thread.diameter + 0.02 * unit), radius)
+    points = MeasuredPoints(np.linspace(3.0, 9.0, 25), np.full(25, -0.1), np.full(25, 1e-2), np.ones(25))
+    code, off, _, memory, _ = correct_straight(points, 1e-2, (disc,))
+    assert (code, off <= 1.0) == (CORRECTED, True)
+    away = np.linalg.norm(unit * (STRAIGHT + memory.moved) - np.array(disc.centre), axis=1)
+    assert -2e-7 < away.min() - radius - 0.5 * thread.diameter < 2e-6
+    assert correct_straight(points, 1e-2, (disc,), contacts=1)[0] == NO_ROOM
+
+
+def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:
+    residual, variance, weights = np.zeros(20), np.full(20, 1e-4), np.full(20, 0.5)
+    residual[4], residual[10:17] = 0.1, -0.1
+    points = MeasuredPoints(np.linspace(0.5, 10.0, 20), residual, variance, np.ones(20))
+    change = robust_weights(points, residual, variance, weights)
+    assert weights[4] == pytest.approx(5.0 / (4.0 + 0.1**2 / 1e-4))
+    np.testing.assert_allclose(np.delete(weights, 4), 1.0)
+    assert change == pytest.approx(0.5)
+
+
 def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> None:
     nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
     variance = np.zeros(10)
@@ -196,6 +242,8 @@ def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> No
     np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
     propagate(nodes + np.array([0.0, 1.0]), nodes, np.full(10, 0.1), variance, np.empty(10))
     np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
+    propagate(nodes + np.array([0.3, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
+    np.testing.assert_allclose(variance, 0.7 * np.eye(10)[6] + 0.3 * np.eye(10)[7] + 0.1, atol=1e-12)
 
 
 def test_deviation_matches_the_spread_of_estimates() -> None:

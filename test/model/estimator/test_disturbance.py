@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimator
 from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
-from magnetosuture_thread.model.estimator.relaxation import relax
+from magnetosuture_thread.model.estimator.relaxation import relax, significance
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
@@ -34,6 +34,21 @@ def test_relaxation_solves_its_equation(clamped: bool) -> None:
     residual = relaxed - displacement + amount * curvature.T @ moment
     assert np.abs(residual[1:]).max() < 1e-12
     assert np.array_equal(relaxed[0], displacement[0])
+
+
+def test_the_significance_is_that_of_the_mean_displacement_of_the_worst_window() -> None:
+    """Of four windows over 16 nodes behind the needle, of which the last is not measured."""
+    rng = np.random.default_rng(3)
+    displacement, normals = rng.normal(size=(17, 2)), rng.normal(size=(17, 2))
+    response, deviations, variance = rng.normal(size=(17, 2)), np.array([0.1, 0.2]), np.array([0.3, 0.2, 0.1, np.inf])
+    across, window, expected = np.einsum("ia,ia->i", displacement, normals), np.arange(17) * 4 // 17, []
+    for w in range(3):
+        nodes = np.flatnonzero((window == w) & (np.arange(17) > 0))
+        square = 2.0 * variance[w] + np.sum((response[nodes].mean(axis=0) * deviations) ** 2)
+        expected.append(abs(across[nodes].mean()) / np.sqrt(square))
+    for sign in (1.0, -1.0):
+        found = significance(sign * displacement, normals, variance, response, deviations)
+        assert found == pytest.approx(max(expected))
 
 
 @pytest.mark.parametrize(("material", "attachment"), [("silk_6_0", "pinned"), ("polyamide_7_0", "clamped")])

@@ -160,7 +160,8 @@ def test_no_data_leads_beyond_the_bounds() -> None:
             assert low <= each.low <= each.value <= each.high <= high
 
 
-def test_sensitivities_information_and_score_are_those_of_a_dense_filter() -> None:
+@pytest.mark.parametrize("end", [(0.0, np.inf), (2e-5, 3e-4)])
+def test_sensitivities_information_and_score_are_those_of_a_dense_filter(end: tuple[float, float]) -> None:
     thread, rng = thread_of(12), np.random.default_rng(7)
     predictor = predictor_of(thread)
     formulation = predictor.formulation
@@ -172,15 +173,16 @@ def test_sensitivities_information_and_score_are_those_of_a_dense_filter() -> No
     points = MeasuredPoints(place, rng.normal(0.0, 1e-5, 40), rng.uniform(1e-4, 1e-3, 40), rng.uniform(0.3, 1.0, 40))
     density, noise, length = rng.uniform(0.5e-3, 2e-3, nodes), rng.uniform(0.5e-3, 2e-3, nodes), 1.3
     corrector, weights = Corrector(predictor, formulation, length), np.ones(40)
-    done = corrector.solve(start, np.array([-1.0, 0.0]), density, noise, points, weights, (0.0, np.inf))
+    done = corrector.solve(start, np.array([-1.0, 0.0]), density, noise, points, weights, end)
     assert done.solved
     moved = rng.normal(0.0, 1.0, (2, nodes, 2))
     moved[:, 0] = 0.0
     found = corrector.sensitivities(moved)
     # The chain's chords are not quite those of its arcs, which moves it without innovations too.
-    without = points._replace(innovation=np.zeros(40))
-    corrector.solve(start, np.array([-1.0, 0.0]), density, noise, without, weights.copy(), (0.0, np.inf))
-    score = found.score - corrector.sensitivities(moved).score
+    turned = points._replace(innovation=-points.innovation)
+    corrector.solve(start, np.array([-1.0, 0.0]), density, noise, turned, weights.copy(), (-end[0], end[1]))
+    other = corrector.sensitivities(moved)
+    score, square = 0.5 * (found.score - other.score), 0.5 * (found.square + other.square)
 
     normals, buffers, known = np.zeros((nodes, 2)), StepBuffers.of(nodes, 2, 1, 2), np.zeros(nodes, dtype=np.bool_)
     normals_of(start, normals)
@@ -194,7 +196,14 @@ def test_sensitivities_information_and_score_are_those_of_a_dense_filter() -> No
         along = start[i + 1] - start[i]
         row[2 * i : 2 * i + 2], row[2 * i + 2 : 2 * i + 4] = -along, along
         prior += 1e9 * np.outer(row, row)
-    measured = np.zeros((40, 2 * nodes))
+    innovation, spread = (
+        np.append(points.innovation, end[0]),
+        np.append(points.variance / (weights * points.share), end[1]),
+    )
+    measured = np.zeros((41, 2 * nodes))
+    measured[-1, -2:] = (start[-1] - start[-2]) / np.linalg.norm(start[-1] - start[-2])
+    if np.isinf(end[1]):
+        innovation, spread, measured = innovation[:-1], spread[:-1], measured[:-1]
     for p, at in enumerate(place):
         i = min(int(at), nodes - 2)
         along = start[i + 1] - start[i]
@@ -202,11 +211,13 @@ def test_sensitivities_information_and_score_are_those_of_a_dense_filter() -> No
         measured[p, 2 * i : 2 * i + 2], measured[p, 2 * i + 2 : 2 * i + 4] = (1 - at + i) * normal, (at - i) * normal
     covariance = np.zeros((2 * nodes, 2 * nodes))
     covariance[2:, 2:] = np.linalg.inv(prior[2:, 2:])
-    of_innovations = measured @ covariance @ measured.T + np.diag(points.variance / (weights * points.share))
+    of_innovations = measured @ covariance @ measured.T + np.diag(spread)
     by = measured @ moved.reshape(2, -1).T
     gained = np.linalg.solve(of_innovations, by)
     np.testing.assert_allclose(found.information, by.T @ gained, rtol=2e-3)
-    np.testing.assert_allclose(score, gained.T @ points.innovation, rtol=2e-3, atol=2e-3 * np.abs(score).max())
+    np.testing.assert_allclose(score, gained.T @ innovation, rtol=2e-3, atol=2e-3 * np.abs(score).max())
+    assert square == pytest.approx(innovation @ np.linalg.solve(of_innovations, innovation), rel=2e-3)
+    assert found.independent == pytest.approx((weights * points.share).sum() + np.isfinite(end[1]))
     corrected = moved.reshape(2, -1).T - covariance @ measured.T @ gained
     np.testing.assert_allclose(found.corrected.reshape(2, -1).T, corrected, atol=2e-3)
 

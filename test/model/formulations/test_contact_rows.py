@@ -1,15 +1,17 @@
-"""Rows of contacts: which of them push at first, and when they need not be looked for again."""
+"""Rows of contacts and friction: which of them push at first, when they need not be looked for again, and the slip."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import pytest
 import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, stays_clear
+from magnetosuture_thread.model.formulations.friction_rows import friction_of, friction_rows, keep_grips
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 
 NODES, UNIT, RADIUS = 20, 1e-3, 5e-5
@@ -82,3 +84,51 @@ def test_of_many_corners_beside_a_chord_the_nearest_pushes_first():
     pushing = [c for c in rows if buffers.multipliers[c] > 0.0]
     assert pushing == [min(rows, key=lambda c: buffers.value[c])]
     assert buffers.multipliers[pushing[0]] == 7.0
+
+
+def test_friction_beside_the_needle_is_of_the_slip_that_its_own_motion_makes():
+    """A disc above pushes the first chord down at 0.4 of it; the needle's tail has moved by 0.05 D along x."""
+    rough = Workspace((Disc((-0.4 * UNIT, 1e-3 + RADIUS), 1e-3),), UNIT, friction=(0.3,)).data
+    buffers, nodes = StepBuffers.of(6, 2, 0, 100), np.column_stack([-np.arange(6.0), np.zeros(6)])
+    known, before, interval = np.arange(6) == 0, nodes.copy(), 0.5
+    before[0, 0] -= 0.05
+
+    def contacts() -> int:
+        return contact_rows(buffers, 0, rough, nodes, nodes, known, interval, UNIT, RADIUS, True)[0]
+
+    count = contacts()
+    pushed = int(np.flatnonzero(np.isclose(buffers.place[:count], 0.4) & (buffers.node[:count] == 0))[0])
+    np.testing.assert_allclose(buffers.gradient[pushed], [(0.0, 0.0), (0.0, -0.4), (0.0, 0.0)], atol=1e-12)
+    assert buffers.compliance[pushed] > 0.0  # its ends may be held on both sides of a shape
+    keep_grips(buffers, 2.0 * np.eye(count)[pushed], 0, rough)
+    assert contacts() == count
+    assert friction_rows(buffers, 0, count, rough, before, nodes, known, interval) == (1, 1.0)
+    # The tangent, to the left of the normal (0, -1), is along x; the place of contact moves by 0.6 of the tail.
+    assert buffers.limit[count] == pytest.approx(0.3 * 2.0)
+    assert buffers.lower[count] == buffers.upper[count] == pytest.approx(-0.6 * 0.05 / interval)
+    np.testing.assert_allclose(buffers.gradient[count], [(0.0, 0.0), (0.4, 0.0), (0.0, 0.0)], atol=1e-12)
+    keep_grips(buffers, np.append(2.0 * np.eye(count)[pushed], -0.3), 0, rough)
+    friction, use = friction_of(buffers.grip)
+    np.testing.assert_allclose(friction, [0.6 * 0.3, 0.4 * 0.3, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(use, [0.5, 0.5, 0.0, 0.0, 0.0, 0.0])
+    contacts()
+    assert friction_rows(buffers, 0, count, rough, before, nodes, known, interval) == (1, 0.0)
+    assert buffers.multipliers[count] == pytest.approx(-0.3)
+    # A shape that pushes no more rubs no more, which is a change.
+    assert friction_rows(buffers, 0, 0, rough, before, nodes, known, interval) == (0, 1.0)
+
+
+def test_a_chord_beside_the_needle_that_gets_too_deep_is_noticed():
+    post = Workspace((Disc((-0.4 * UNIT, 0.45 * UNIT), 0.2 * UNIT),), UNIT).data
+    buffers, nodes, known = (
+        StepBuffers.of(6, 2, 0, 100),
+        np.column_stack([-np.arange(6.0), np.zeros(6)]),
+        np.arange(6) == 0,
+    )
+    contact_rows(buffers, 0, post, nodes, nodes, known, 1.0, UNIT, RADIUS, True)
+    turned = nodes + np.array([(0.0, 0.0), (0.0, 0.8), *[(0.0, 1.2)] * 4])
+    assert not stays_clear(buffers, post, nodes, turned, known, UNIT, RADIUS)
+    contact_rows(buffers, 0, post, nodes, nodes, known, 1.0, UNIT, RADIUS, True)
+    assert stays_clear(buffers, post, nodes, nodes - 0.1, known, UNIT, RADIUS)
+    contact_rows(buffers, 0, post, nodes, nodes, np.arange(6) < 2, 1.0, UNIT, RADIUS, True)
+    assert stays_clear(buffers, post, nodes, turned, np.arange(6) < 2, UNIT, RADIUS)  # which nothing can push

@@ -156,6 +156,43 @@ def test_a_long_step_does_not_overshoot_a_barrier(interval: float):
         assert stretch(thread, done.state.positions) < 0.3
 
 
+def test_no_gain_is_higher_than_one_over_the_step_and_the_walls_barrier_is_linear():
+    thread, solver, wall = polyamide(), Listening(), 0.01
+    workspace = Workspace((), 0.01, 2, wall)
+    options = PaperOptions(gain=30.0, stiffness_gain=20.0)
+    formulation = PaperFormulation(thread, workspace, solver, TOLERANCE, options)
+    unit, radius = thread.segment_length, 0.5 * thread.diameter
+    positions = straight(thread) + np.array([0.0095, 0.0])
+    positions[3:6, 1] += 1e-4
+    formulation.step(ThreadState.at_rest(positions), lead(positions[0]), 0.1)
+    program, x = solver.programs[0], positions / unit
+    rows = [Connectivity(1.0).rows(x), EnhancedConnectivity(1.0).rows(x), Stiffness(np.full(24, 2.0)).rows(x)]
+    values = np.concatenate([each.value for each in rows])
+    np.testing.assert_allclose(program.lower[:73], -10.0 * values, atol=1e-9)
+    away = np.linalg.norm(positions[1:], axis=1)
+    near = np.flatnonzero(wall - away < unit)
+    assert len(program.lower) - 73 == len(near) == 1
+    np.testing.assert_allclose(program.lower[73:], -10.0 * (wall - radius - away[near]) / unit, rtol=1e-9)
+
+
+class Lazy(Listening):
+    """Finds every program solved by a thread that stays where it is."""
+
+    def solve(
+        self, program: ChainProgram, velocities: np.ndarray, multipliers: Vector, wide: WideRows | None = None
+    ) -> Solution:
+        """Return no motion."""
+        still = np.zeros_like(velocities), np.zeros(len(program.first))
+        return Solution(*still, self.name, "solved", 1, Residuals(0.0, 0.0, 0.0))
+
+
+def test_a_step_that_does_not_take_a_node_out_of_an_obstacle_has_not_converged():
+    thread, options = polyamide(), PaperOptions(gain=1.0 / DT)
+    formulation = PaperFormulation(thread, Workspace((Disc((-0.009, 0.0), 0.001),), 0.01), Lazy(), TOLERANCE, options)
+    done = formulation.step(ThreadState.at_rest(straight(thread)), lead(np.zeros(2)), DT)
+    assert not done.converged
+
+
 def test_a_step_that_ends_deep_in_an_obstacle_says_so():
     """As printed, a step is judged at its start: a leap lands beyond an edge that was not near then."""
     thread = polyamide()

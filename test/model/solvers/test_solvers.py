@@ -7,7 +7,8 @@ import pytest
 
 from magnetosuture_thread.model.program import ChainProgram, Residuals, Solution, Solver, Vector, WideRows, residuals_of
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, OsqpSolver
-from test.model.test_program import one_node, random_program
+from magnetosuture_thread.model.solvers.low_rank import LowRankSolver
+from test.model.test_program import one_node, random_program, rubbing
 
 
 def solved(solver: Solver, program: ChainProgram) -> Solution:
@@ -26,6 +27,43 @@ def test_both_solvers_agree(dimension: int, soft: bool):
         assert osqp.residuals.largest < 1e-5
         np.testing.assert_allclose(banded.velocities, osqp.velocities, atol=1e-4)
         assert (banded.velocities[program.known] == 0.0).all()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("compliance", [0.0, 0.05])
+def test_rows_over_nodes_far_apart_are_solved_as_by_a_general_solver(dimension: int, compliance: float):
+    """They forbid the solution without them, and allow that of other forces."""
+    nodes, pushed = np.array([[1, 4, 8], [2, 3, 5], [8, 6, 2]]), 0
+    for seed in range(10):
+        program, random = random_program(seed, dimension=dimension), np.random.default_rng(seed)
+        other = program._replace(linear=10.0 * random.normal(size=program.linear.shape))
+        gradient = random.normal(size=(3, 3, dimension))
+        here, there = (
+            np.einsum("rkd,rkd->r", gradient, solved(BandedSolver(), each).velocities[nodes])
+            for each in (program, other)
+        )
+        side = np.sign(there - here)
+        wide = WideRows(
+            nodes, side[:, None, None] * gradient, side * (0.1 * here + 0.9 * there), np.full(3, compliance)
+        )
+        start = np.zeros_like(program.linear), np.zeros(len(program.first) + 3)
+        found, expected = (solver.solve(program, *start, wide) for solver in (LowRankSolver(), OsqpSolver()))
+        assert found.status == expected.status == "solved"
+        assert found.residuals.largest < 1e-7
+        assert expected.residuals.largest < 1e-5
+        np.testing.assert_allclose(found.velocities, expected.velocities, atol=1e-4)
+        pushed += int((found.multipliers[-3:] > 1e-3).sum())
+    assert pushed > 15
+
+
+@pytest.mark.parametrize("pull", [-4.0, -1.0, 1.0, 4.0])
+def test_both_solvers_know_the_limit_of_friction(pull: float):
+    """At most 1.8 of friction against the pull along x: below that the node stays, above it the rest moves it."""
+    moved = 0.5 * float(np.sign(pull)) * max(abs(pull) - 1.8, 0.0)
+    for solver in (BandedSolver(), OsqpSolver()):
+        found = solved(solver, rubbing(1.8, pull))
+        np.testing.assert_allclose(found.velocities[0], [moved, 0.0], atol=1e-5)
+        assert found.residuals.largest < 1e-5
 
 
 def test_residuals_are_those_of_the_program():
