@@ -103,6 +103,24 @@ def test_a_current_at_its_limit_is_no_saturation_while_the_velocity_is_reached()
         assert found.saturated == saturated
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.8, 2.0, 3.1, -2.0, -0.8])
+def test_currents_near_their_limits_change_up_to_these_and_not_beyond(angle: float):
+    velocity = turned(EAST, angle)
+    free = allocation(limit=3.0).allocate(velocity, MIDDLE, EAST).currents
+    assert np.abs(free).max() == pytest.approx(3.0)
+    found = allocation(limit=3.0).allocate(velocity, MIDDLE, EAST, 0.95 * free, 1.0).currents
+    np.testing.assert_allclose(found, free, atol=1e-6)
+
+
+def test_a_turn_is_limited_alike_to_both_sides():
+    """However fast the turn that is commanded, the field stays within the angle that turns the needle fastest."""
+    left, right = (allocation(limit=1e4).allocate(np.array([0.002, vy]), MIDDLE, EAST) for vy in (1.0, -1.0))
+    np.testing.assert_allclose(right.currents, left.currents[[0, 3, 2, 1]], atol=1e-6)
+    np.testing.assert_allclose(right.velocity, left.velocity * (1.0, -1.0), atol=1e-9)
+    fastest = allocation(limit=1e4).allocate(np.array([0.002, 0.5]), MIDDLE, EAST)
+    np.testing.assert_allclose(left.currents, fastest.currents, atol=1e-6)
+
+
 @given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))
 def test_currents_never_leave_their_limits(vx: float, vy: float, x: float, angle: float):
     found = allocation(limit=3.0).allocate(np.array([vx, vy]), np.array([x, 0.5 * x]), turned(EAST, angle))

@@ -122,6 +122,29 @@ def test_a_concave_corner_is_two_contacts():
     np.testing.assert_allclose(contacts.normal[contacts.node == 2], [[np.sqrt(0.5), np.sqrt(0.5)]])
 
 
+def test_edges_one_behind_the_other_are_two_contacts_and_the_nearer_one_is_named():
+    """A point above the upper arm of a C; the lower arm's upper edge faces it too."""
+    outline = (
+        (0.0, 0.0),
+        (0.03, 0.0),
+        (0.03, 0.01),
+        (0.01, 0.01),
+        (0.01, 0.02),
+        (0.03, 0.02),
+        (0.03, 0.03),
+        (0.0, 0.03),
+    )
+    contacts = Workspace([Polygon(outline)], 0.05).near(np.array([[0.02, 0.033]]))
+    assert sorted(contacts.distance.tolist()) == pytest.approx([0.003, 0.023])
+    assert contacts.distance[contacts.nearest].tolist() == pytest.approx([0.003])
+
+
+def test_a_disc_is_near_by_its_edge_and_not_by_its_centre():
+    contacts = Workspace([Disc((0.0, 0.0), 0.02)], 0.003).near(np.array([[0.022, 0.0], [0.0, -0.0231], [0.0, -0.0229]]))
+    assert contacts.node.tolist() == [0, 2]
+    np.testing.assert_allclose(contacts.distance, [0.002, 0.0029], atol=1e-15)
+
+
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
 def test_a_hole_is_outside_and_the_deep_inside_is_never_free(reach: float):
     ring = Workspace([RING], reach)
