@@ -29,7 +29,8 @@ def test_a_heading_comes_back_from_its_quaternion(angle: float):
 def test_of_a_tilted_needle_the_heading_is_that_of_its_projection(size: float):
     rotations = Rotation.random(20, rng=np.random.default_rng(1))
     for quaternion, along in zip(rotations.as_quat(), rotations.apply([1.0, 0.0, 0.0])[:, :2], strict=True):
-        heading = heading_from_quaternion(*(size * quaternion).tolist(), "field")
+        x, y, z, w = (size * quaternion).tolist()
+        heading = heading_from_quaternion(x, y, z, w, "field")
         assert math.hypot(*heading) == pytest.approx(1.0, abs=1e-12)
         assert heading == pytest.approx(along / np.linalg.norm(along), abs=1e-12 if size == 1.0 else 0.01)
 

@@ -96,6 +96,28 @@ def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, .
     np.testing.assert_allclose(normal, east(len(centre)), atol=1e-12)
 
 
+@pytest.mark.parametrize(("bend", "beyond"), [(0.03, 1.0 / 0.03), (0.01, 1.0 / 0.02), (-0.03, 0.0)])
+def test_from_a_disc_an_arc_is_as_far_as_it_bulges_but_no_farther_than_one_on_the_surface(bend: float, beyond: float):
+    """Nodes on a circle beside the disc, around its side or, where the radius is negative, away from it."""
+    half = 0.5 * SEGMENT / abs(bend)
+    angles = half * np.array([-3.0, -1.0, 1.0, 3.0])
+    nodes = np.column_stack([bend * np.cos(angles), abs(bend) * np.sin(angles)])
+    nodes[:, 0] += 0.0201 - nodes[1, 0]  # the chord in the middle is 0.1 mm from a disc of 20 mm
+    found = [c for c in contacts_of(Disc((0.0, 0.0), 0.02), nodes) if c[1] == pytest.approx(0.5)]
+    assert len(found) == 1
+    assert found[0][0] == pytest.approx(1e-4 + beyond * SEGMENT**2 / 8.0, rel=0.02)
+
+
+def test_a_contact_of_a_chord_names_its_segment_and_its_obstacle():
+    discs = Disc((0.01, -0.0021), 0.002), Disc((0.002, -0.0021), 0.002)
+    square = Polygon(((0.0135, 0.0001), (0.0145, 0.0011), (0.0135, 0.0021), (0.0125, 0.0011)))
+    points = np.column_stack([SEGMENT * np.arange(5.0), np.zeros(5)])
+    to = ChordContacts(np.zeros(9, np.int64), np.zeros(9, np.int64), np.zeros(9), np.zeros((9, 2)), np.zeros(9))
+    data = Workspace((*discs, square), REACH).data
+    count = find_chord_contacts(points, data, SEGMENT, 0.0, np.full(5, -np.inf), 0, to)
+    assert set(zip(to.node[:count].tolist(), to.obstacle[:count].tolist(), strict=True)) == {(0, 1), (2, 0), (3, 2)}
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.4])
 def test_a_chord_over_an_edge_of_a_mesh_has_its_distance(turn: float):
     cube = box((0.0, 0.0, 0.0), 0.005)

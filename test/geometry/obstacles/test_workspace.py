@@ -143,6 +143,8 @@ def test_a_disc_is_near_by_its_edge_and_not_by_its_centre():
     contacts = Workspace([Disc((0.0, 0.0), 0.02)], 0.003).near(np.array([[0.022, 0.0], [0.0, -0.0231], [0.0, -0.0229]]))
     assert contacts.node.tolist() == [0, 2]
     np.testing.assert_allclose(contacts.distance, [0.002, 0.0029], atol=1e-15)
+    small = Workspace([Disc((0.0, 0.0), 0.001)], 0.005).near(np.array([[0.0055, 0.0], [-0.004, -0.004]]))
+    np.testing.assert_allclose(small.distance, [0.0045, np.hypot(0.004, 0.004) - 0.001], atol=1e-15)
 
 
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
