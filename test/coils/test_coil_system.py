@@ -85,8 +85,10 @@ def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, swit
     elif switch == "reset":
         system.reset()
     elif switch == "fault":
+        system.driver.close()
         system.latch.trip("of a board")
         system.step(500.0, 100.0)
+        system.driver.open()
         system.latch.reset("")
     else:
         settings = CoilBridgeSettings()

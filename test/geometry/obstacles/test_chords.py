@@ -73,6 +73,26 @@ def test_a_chord_that_cuts_a_corner_is_as_deep_as_the_corner_sticks_out():
     np.testing.assert_allclose(found[2], [math.sqrt(0.5), math.sqrt(0.5)], atol=1e-12)
 
 
+DENTED = Polygon((*SQUARE.outline[:3], (0.005, 0.0099), SQUARE.outline[3]))
+
+
+@pytest.mark.parametrize(
+    ("polygon", "middle", "degrees"),
+    [
+        (SQUARE, (0.006, 0.0105), 0.0),  # ends before the corner
+        (SQUARE, (0.0098, 0.0105), 20.0),  # its lower end is the nearest, to the edge on top ...
+        (SQUARE, (0.0105, 0.0098), 70.0),  # ... and to the right one
+        (SQUARE, (0.00845, 0.00845), -45.0),  # deeper than half of its length
+        (DENTED, (0.005, 0.0101), 0.0),  # over a shallow dent
+    ],
+)
+def test_a_corner_that_is_not_the_nearest_of_a_chord_is_no_contact(
+    polygon: Polygon, middle: tuple[float, float], degrees: float
+):
+    along = 0.5 * SEGMENT * np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees))])
+    assert not contacts(polygon, np.array(middle) - along, np.array(middle) + along)
+
+
 def test_a_concave_corner_is_no_contact_of_a_chord():
     corner = Polygon(((0.0, 0.0), (0.02, 0.0), (0.02, 0.01), (0.01, 0.01), (0.01, 0.02), (0.0, 0.02)))
     assert not contacts(corner, np.array([0.0105, 0.013]), np.array([0.013, 0.0105]))
@@ -133,6 +153,22 @@ def test_a_chord_over_an_edge_of_a_mesh_has_its_distance(turn: float):
     assert not contacts(cube, middle - flat, middle + flat)
     inside_a_face = np.array([0.001, 0.0005, 0.0055])  # over the diagonal of a flat side, which sticks out nowhere
     assert not contacts(cube, inside_a_face - 0.001 * east(3), inside_a_face + 0.001 * east(3))
+
+
+@pytest.mark.parametrize(
+    ("across", "degrees", "near"),
+    [(0.0045, 45.0, True), (-0.0045, 45.0, True), (0.007, 45.0, False), (0.001, -20.0, False), (0.001, 110.0, False)],
+)
+def test_a_chord_over_an_edge_is_a_contact_only_between_its_ends_and_its_faces(
+    across: float, degrees: float, near: bool
+):
+    """A chord that falls by some degrees over the upper right edge of a cube, and turns to one of its ends."""
+    fall = math.radians(degrees)
+    along = np.array([math.cos(fall), math.copysign(0.4, across) if near else 0.0, -math.sin(fall)])
+    along *= 0.5 * SEGMENT / np.linalg.norm(along)
+    middle = np.array([0.0055, across, 0.0055])
+    found = contacts(box((0.0, 0.0, 0.0), 0.005), middle - along, middle + along)
+    assert len(found) == near
 
 
 def deepest(obstacle: Polygon, positions: np.ndarray, radius: float) -> float:

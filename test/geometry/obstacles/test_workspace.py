@@ -9,7 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Workspace, find_contacts
+from magnetosuture_thread.geometry.obstacles import (
+    FRICTION,
+    WALL,
+    Disc,
+    Mesh,
+    Obstacle,
+    Polygon,
+    Workspace,
+    find_contacts,
+)
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).
@@ -254,6 +263,29 @@ def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
 def test_a_wall_must_have_a_radius(radius: float):
     with pytest.raises(ConfigurationError, match="wall_radius"):
         Workspace([], 0.1, 2, radius)
+
+
+def test_each_shape_and_the_wall_has_its_own_friction():
+    workspace = Workspace(
+        [SQUARE, Disc((0.02, 0.0), 1e-3)], 0.1, wall_radius=0.05, friction=(0.2, 0.5), wall_friction=0.1
+    )
+    assert workspace.data.frames[:, FRICTION].tolist() == [0.1, 0.2, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("dimension", "friction", "wall", "reason"),
+    [
+        (2, (0.1, 0.2), 0.0, "one for each of 1"),
+        (2, (2.1,), 0.0, r"friction\[0\]: got 2\.1"),
+        (2, (-0.1,), 0.0, r"friction\[0\]"),
+        (2, (np.nan,), 0.0, r"friction\[0\]"),
+        (2, (0.0,), 2.1, "wall_friction"),
+        (3, (0.1,), 0.0, "friction is of the plane"),
+    ],
+)
+def test_a_friction_that_cannot_be_is_refused(dimension: int, friction: tuple[float, ...], wall: float, reason: str):
+    with pytest.raises(ConfigurationError, match=reason):
+        Workspace([Disc((0.0,) * dimension, 1e-3)], 0.1, dimension, friction=friction, wall_friction=wall)
 
 
 def test_points_must_fit():
