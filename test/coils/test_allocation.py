@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
+from magnetosuture_thread.coils.allocation import Allocation, CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -101,6 +101,52 @@ def test_a_current_at_its_limit_is_no_saturation_while_the_velocity_is_reached()
         assert np.abs(found.currents).max() == pytest.approx(share * free)
         assert np.linalg.norm(found.velocity - 0.005 * EAST) < error * 0.005
         assert found.saturated == saturated
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.8, 2.0, 3.1, -2.0, -0.8])
+def test_currents_near_their_limits_change_up_to_these_and_not_beyond(angle: float):
+    velocity = turned(EAST, angle)
+    free = allocation(limit=3.0).allocate(velocity, MIDDLE, EAST).currents
+    assert np.abs(free).max() == pytest.approx(3.0)
+    found = allocation(limit=3.0).allocate(velocity, MIDDLE, EAST, 0.95 * free, 1.0).currents
+    np.testing.assert_allclose(found, free, atol=1e-6)
+
+
+@pytest.mark.parametrize("pulled", [None, MotionDisturbance(0.0005, 0.001)])
+def test_a_gain_is_a_factor_on_the_field_of_its_coil(pulled: MotionDisturbance | None):
+    gains, heading = np.array([1.1, 0.9, 0.95, 1.2]), turned(EAST, 0.4)
+    coils = [
+        dataclasses.replace(coil, field_per_current=float(gain) * coil.field_per_current)
+        for coil, gain in zip(
+            coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3), gains, strict=True
+        )
+    ]
+    made, expected = allocation(), CoilAllocation(LoopCoils(coils), NEEDLE, 0.008, 10.0)
+    made.gains = gains
+    found, wanted = (
+        one.allocate(0.004 * heading, np.array([0.003, -0.002]), heading, disturbance=pulled, age=0.05)
+        for one in (made, expected)
+    )
+    np.testing.assert_allclose(found.currents, wanted.currents, rtol=1e-9)
+    np.testing.assert_allclose(found.velocity, wanted.velocity, rtol=1e-9)
+    assert found.drift == pytest.approx(wanted.drift, rel=1e-9)
+
+
+def test_what_currents_give_the_needle_is_scaled_and_mixed_as_they_are():
+    one = Allocation(np.array([1.0, -2.0]), np.array([0.1, 0.3]), False, 0.5)
+    other = Allocation(np.array([3.0, 2.0]), np.array([0.5, -0.1]), True, -0.3)
+    half, mixed = one.scaled(0.5), one.towards(other, 0.25)
+    assert (*half.currents, *half.velocity, half.drift) == pytest.approx((0.5, -1.0, 0.05, 0.15, 0.25))
+    assert (*mixed.currents, *mixed.velocity, mixed.drift) == pytest.approx((1.5, -1.0, 0.2, 0.2, 0.3))
+
+
+def test_a_turn_is_limited_alike_to_both_sides():
+    """However fast the turn that is commanded, the field stays within the angle that turns the needle fastest."""
+    left, right = (allocation(limit=1e4).allocate(np.array([0.002, vy]), MIDDLE, EAST) for vy in (1.0, -1.0))
+    np.testing.assert_allclose(right.currents, left.currents[[0, 3, 2, 1]], atol=1e-6)
+    np.testing.assert_allclose(right.velocity, left.velocity * (1.0, -1.0), atol=1e-9)
+    fastest = allocation(limit=1e4).allocate(np.array([0.002, 0.5]), MIDDLE, EAST)
+    np.testing.assert_allclose(left.currents, fastest.currents, atol=1e-6)
 
 
 @given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))

@@ -143,6 +143,25 @@ def test_a_lost_pose_stops_while_commands_go_on():
     assert stopped_after(plant, last) <= 0.2 - PERIOD + 1e-9
 
 
+@pytest.mark.parametrize(("lost", "timeout"), [("command", 0.3), ("pose", 0.2)])
+def test_an_input_ends_by_the_monotonic_clock_though_that_of_the_stamps_stands_still(lost: str, timeout: float):
+    plant = Plant(CoilBridgeSettings(command_timeout=0.3, pose_timeout=0.2)).ready()
+    plant.run(0.5)
+    plant.command((0.005, 0.002))
+    plant.bridge.extrapolator.update(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
+    moved = 0.0
+    for k in range(1, 100):
+        stamp, arrival = plant.time, plant.time + k * PERIOD
+        if lost == "command":
+            plant.bridge.extrapolator.update(TAIL, EAST, stamp, plant.poses + 1 + k, stamp, arrival)
+        else:
+            plant.bridge.command("needle", np.array([0.005, 0.002]), stamp, plant.commands + k, stamp, arrival)
+        plant.bridge.on_margins(stamp, True, 1.0, plant.bridge.scene_version, arrival)
+        if not still(plant.bridge.step(stamp, arrival, plant.driver)):
+            moved = k * PERIOD
+    assert timeout - 3 * PERIOD < moved + PERIOD <= timeout - PERIOD + 1e-9
+
+
 @pytest.mark.parametrize("lost", ["velocity", "tail"])
 def test_source_returns_and_time_to_resume(lost: str):
     plant = Plant().ready()

@@ -105,6 +105,28 @@ def test_currents_are_certified_with_the_predicted_pull_and_without_it(pull: flo
     assert found.velocity @ E == pytest.approx((0.75 if limit else 1.0) * (wanted - pull), rel=0.04)
 
 
+def test_currents_against_a_pull_give_the_needle_no_more_than_its_greatest_speed():
+    safety, coils = SETTINGS.safety_filter(Scene(Dish(0.05))), CertifiedAllocation(SETTINGS.allocation(), 2e-3)
+    pose = Pose(-1.25e-3 * E, E)
+    found, _ = coils.allocate(1.5e-3 * E, pose, safety, coils.zero(), math.inf, None, -1e-3 * E)
+    assert np.linalg.norm(found.velocity) == pytest.approx(2e-3, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(20, 60))
+def test_where_currents_are_not_certified_with_what_is_measured_they_are_without_it(seed: int):
+    random = np.random.default_rng(seed)
+    left, right = random.uniform(2.4e-4, 5e-4, 2)
+    safety = SETTINGS.safety_filter(blocks(left, -right))
+    coils, pose = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
+    disturbance, wanted = MotionDisturbance(*random.uniform(-3e-3, 3e-3, 2)), random.uniform(-4e-3, 4e-3, 2)
+    found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, disturbance, np.zeros(2))
+    shares = [
+        safety.safe_share(found.velocity + more.velocity(E), pose.tail, pose.heading, found.drift + more.drift)[0]
+        for more in (disturbance, MotionDisturbance())
+    ]
+    assert max(shares) >= MIN_SHARE
+
+
 @pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])
 def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to_the_wall(place: float, gap: float):
     """Their drift cannot be avoided close to a coil's axis: the needle turns away from the wall by as much."""

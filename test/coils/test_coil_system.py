@@ -76,6 +76,37 @@ def test_it_arms_only_on_request(system):
         assert system.latch.armed == asked
 
 
+@pytest.mark.parametrize("switch", ["disarm", "reset", "fault", "close"])
+def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, switch: str):
+    system.latch.activate()
+    system.arm_when_ready()
+    if switch == "disarm":
+        system.arm(False)
+    elif switch == "reset":
+        system.reset()
+    elif switch == "fault":
+        system.driver.close()
+        system.latch.trip("of a board")
+        system.step(500.0, 100.0)
+        system.driver.open()
+        system.latch.reset("")
+    else:
+        settings = CoilBridgeSettings()
+        system.close()
+        system.open(settings, CoilBridge(settings, system.latch, Scene()), TimedDriver(4))
+    system.step(500.0, 100.01)
+    assert not system.latch.armed
+
+
+def test_what_a_running_bridge_recorded_itself_is_no_unclean_end(system, tmp_path: Path):
+    system.recall(StopRecord(tmp_path / "bridge.stop"))
+    system.latch.activate()
+    system.arm(True)
+    system.recall(StopRecord(tmp_path / "bridge.stop"))
+    assert system.latch.armed
+    assert not system.latch.fault
+
+
 def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_taken(system):
     named, imported, neither = "not_installed_yet:Bound", "magnetosuture_thread.barrier:Barrier", "antigravity:Bound"
     system.import_barriers([named])

@@ -69,16 +69,23 @@ def test_gains_are_bounded():
 
 
 def test_without_currents_or_before_them_nothing_is_learned():
-    heading = np.array([0.6, 0.8])
+    currents = np.array([1.0, 0.5, 0.0, 0.0])
+    field = COILS.per_current(np.zeros(2)) @ currents
+    angle = math.atan2(field[1], field[0]) + 0.03  # so little beside the field that it is learned from
+    heading = np.array([math.cos(angle), math.sin(angle)])
+    tail = -0.5 * NEEDLE.chord * heading
     estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    estimator.update(np.zeros(2), heading, 1.0)
-    estimator.apply(2.0, np.array([1.0, 0.5, 0.0, 0.0]))
-    estimator.update(np.zeros(2), heading, 1.5)
+    estimator.update(tail, heading, 1.0)
+    estimator.apply(2.0, currents)
+    estimator.update(tail, heading, 1.5)
     estimator.stop()
-    estimator.update(np.zeros(2), heading, 2.5)
+    estimator.update(tail, heading, 2.5)
     estimator.apply(3.0, np.zeros(4))
-    estimator.update(np.zeros(2), heading, 3.5)
+    estimator.update(tail, heading, 3.5)
     np.testing.assert_array_equal(estimator.gains, 1.0)
+    estimator.apply(4.0, currents)
+    estimator.update(tail, heading, 4.5)
+    assert np.abs(estimator.gains - 1.0).max() > 0.01
     assert np.all(np.isfinite(estimator.gains))
 
 

@@ -79,6 +79,33 @@ def test_a_time_with_zero_currents_counts():
     assert np.abs(observer.disturbance(e)).max() < 1e-9
 
 
+def test_currents_that_were_set_before_the_last_pose_count_since_then():
+    """They were set once, ten seconds ago; the needle goes by them."""
+    observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
+    observer.apply(1.0, e, 2e-3, 1e-3)
+    n = np.array([-e[1], e[0]])
+    for k in range(40):
+        observer.update((2e-3 * e + 1e-3 * n) * 0.05 * k, e, 11.0 + 0.05 * k)
+    assert np.abs(observer.disturbance(e)).max() < 1e-9
+
+
+def test_however_long_the_currents_are_zero_the_rest_is_known():
+    observer, e = MotionObserver(NEEDLE.kinematics, min_hold=0.1), direction(0.3)
+    observer.rest(1.0)
+    for k in range(100):
+        observer.update(1e-3 * e * 0.05 * k, e, 11.0 + 0.05 * k)
+    assert observer.disturbance(e).along == pytest.approx(1e-3, rel=0.01)
+
+
+def test_poses_from_before_and_after_time_was_set_back_are_not_compared():
+    observer, e = MotionObserver(NEEDLE.kinematics), direction(0.3)
+    observer.update(np.zeros(2), e, 1.0)
+    for now in (1.02, 1.01):
+        observer.apply(now, e, 0.0, 0.0)
+    observer.update(1e-3 * e, e, 1.03)
+    assert observer.disturbance(e) == (0.0, 0.0)
+
+
 def test_a_pose_is_compared_with_the_currents_of_its_time_however_late_it_comes():
     """The currents change all the time, and poses come 0.15 s late: all of the motion is explained by them."""
     observer, e, tail, waiting = MotionObserver(NEEDLE.kinematics), direction(0.3), np.zeros(2), []

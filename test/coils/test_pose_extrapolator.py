@@ -152,6 +152,21 @@ def test_after_a_longer_stall_only_a_pose_from_after_the_coils_stopped_counts():
     np.testing.assert_allclose(pose.tail, [0.0015, 0.0], atol=1e-12)  # it rests since
 
 
+def test_the_coils_hold_the_last_velocity_of_several():
+    extrapolator = stalled()
+    extrapolator.apply_velocity(np.array([0.01, 0.0]), 1.09, 50.09)
+    for stamp, number in ((1.28, 2), (1.3, 3)):
+        with nullcontext() if stamp > 1.29 else pytest.raises(InvalidInputError, match="stall of the loop"):
+            extrapolator.update(np.array([0.002, 0.0]), EAST, stamp, number, 1.35, 50.35)
+
+
+def test_a_stall_ends_where_time_is_set_back():
+    extrapolator = stalled()
+    assert extrapolator.pose(1.3, 50.3) is None
+    extrapolator.update(np.zeros(2), EAST, 0.5, 2, 0.5, 50.4)
+    assert extrapolator.pose(0.5, 50.4) is not None
+
+
 def test_a_stall_of_a_needle_at_rest_costs_nothing():
     extrapolator = stalled()
     extrapolator.apply_velocity(np.zeros(2), 1.05, 50.05)
@@ -207,6 +222,46 @@ def test_a_tracker_that_says_how_uncertain_it_is_may_be_off_by_three_sigma():
         extrapolator, covariance = doubter(), np.diag([sigma**2, 0.0, 0.0])
         with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
             extrapolator.update(np.array([0.0025, 0.0]), EAST, 1.02, 2, 1.02, 50.02, covariance)
+
+
+@pytest.mark.parametrize(
+    ("variances", "jump", "believed"),
+    [
+        ([0.0, 1e-6, 0.0], 0.0025, True),
+        ([1.0, 0.0, 0.0], 0.0028, True),
+        ([1.0, 0.0, 0.0], 0.003, False),
+        ([np.inf, 0.0, 0.0], 0.0025, False),
+    ],
+)
+def test_no_uncertainty_excuses_more_than_2_mm_and_an_infinite_one_says_nothing(
+    variances: list[float], jump: float, believed: bool
+):
+    with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
+        doubter().update(np.array([0.0, jump]), EAST, 1.02, 2, 1.02, 50.02, np.diag(variances))
+
+
+def test_the_uncertainty_of_the_pose_before_counts_too():
+    for sigma, believed in ((1e-3, True), (1e-4, False)):
+        extrapolator = doubter()
+        extrapolator.update(np.zeros(2), EAST, 1.02, 2, 1.02, 50.02, np.diag([sigma**2, 0.0, 0.0]))
+        with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
+            extrapolator.update(np.array([0.0025, 0.0]), EAST, 1.04, 3, 1.04, 50.04)
+
+
+def test_a_needle_that_turned_too_fast_about_its_tail_is_not_believed():
+    turned = np.array([np.cos(0.3), np.sin(0.3)])
+    with pytest.raises(InvalidInputError, match="its tip jumped"):
+        doubter().update(np.zeros(2), turned, 1.02, 2, 1.02, 50.02)
+
+
+def test_an_end_may_be_outside_of_the_dish_by_three_sigma():
+    """The tip is 0.7 mm outside of the dish, of which 0.5 mm are always forgiven."""
+    for sigma, believed in ((1e-4, True), (5e-5, False)):
+        extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045, uncertainty=0.0005)
+        extrapolator.dish_radius = 0.0175
+        tail, covariance = np.array([0.0182 - NEEDLE.chord, 0.0]), np.diag([sigma**2, 0.0, 0.0])
+        with nullcontext() if believed else pytest.raises(InvalidInputError, match=r"its tip is 0\.0182 m"):
+            extrapolator.update(tail, EAST, 1.02, 2, 1.02, 50.02, covariance)
 
 
 def test_an_uncertain_heading_moves_the_tip_by_the_chord_times_its_angle():

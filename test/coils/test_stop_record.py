@@ -47,6 +47,14 @@ def test_it_is_on_the_disk_before_the_file_of_before_is_replaced(path, monkeypat
     assert calls == ["sync", "replace", "sync"]
 
 
+def test_a_state_that_the_file_holds_is_not_written_again(path):
+    record = StopRecord(path)
+    record.write(RecordedState.ARMED)
+    before = path.stat().st_ino
+    record.write(RecordedState.ARMED)
+    assert path.stat().st_ino == before
+
+
 @pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"stop", b"x" * 100_000])
 def test_a_damaged_file_is_an_emergency_stop(path, damage):
     path.parent.mkdir()

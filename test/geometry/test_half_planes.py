@@ -73,7 +73,9 @@ def test_a_point_within_is_left_bit_for_bit():
 
 def test_half_planes_without_a_common_point_have_none():
     rows = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    assert nearest_in_half_planes(np.zeros(2), rows, np.array([1.0, 1.0])) is None
+    for size in (1.0, 1e-20):
+        assert nearest_in_half_planes(np.zeros(2), rows, size * np.array([1.0, 1.0])) is None
+    assert nearest_in_half_planes(np.array([2.0, 0.0]), rows, np.array([1.0, -1.0 + 1e-6])) is None  # by so little
 
 
 def test_a_slot_lets_what_is_along_it_through():

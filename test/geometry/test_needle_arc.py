@@ -52,8 +52,17 @@ def test_points_of_the_body_reach_from_tail_to_tip_and_move_as_a_rigid_body(curv
     np.testing.assert_allclose(moved / (0.5 * length * angle), turning, atol=1e-6)
 
 
+@pytest.mark.parametrize(("length", "pieces"), [(0.006, 10), (0.0066, 11), (0.0054, 9), (0.0054, 18), (0.007, 1)])
+def test_the_middle_is_among_the_points_also_where_the_spacing_divides_the_length(length: float, pieces: int):
+    points = needle_points(length, 200.0, length / pieces).points
+    assert len(points) == pieces + pieces % 2 + 1
+    middle, _ = needle_axis(np.zeros(2), 0.0, length, 200.0, np.array([0.5]))
+    np.testing.assert_allclose(points[len(points) // 2], middle[0], atol=1e-15)
+    assert len(needle_points(0.006, 0.0, 0.0006).points) == 11  # of a quotient that rounding makes more than 10
+
+
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_needle_may_turn_by_a_half_circle_and_no_more(side: float):
     check_needle("rig", LENGTH, side * math.pi / LENGTH)
-    with pytest.raises(ConfigurationError, match=r"rig\.needle_curvature"):
+    with pytest.raises(ConfigurationError, match=r"rig\.needle_curvature.* at most 458 1/m"):
         check_needle("rig", LENGTH, side * 1.03 * math.pi / LENGTH)

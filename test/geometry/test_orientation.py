@@ -6,9 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.orientation import heading_angle, heading_from_quaternion, yaw_quaternion
+from magnetosuture_thread.geometry.orientation import (
+    heading_angle,
+    heading_from_quaternion,
+    round_trip_heading,
+    yaw_quaternion,
+)
 
 
 @pytest.mark.parametrize("angle", np.linspace(-3.0, 3.0, 13).tolist())
@@ -19,11 +25,29 @@ def test_a_heading_comes_back_from_its_quaternion(angle: float):
     assert heading_angle(heading) == pytest.approx(angle, abs=1e-15)
 
 
+@pytest.mark.parametrize("size", [1.0, 0.9993, 1.0007])
+def test_of_a_tilted_needle_the_heading_is_that_of_its_projection(size: float):
+    rotations = Rotation.random(20, rng=np.random.default_rng(1))
+    for quaternion, along in zip(rotations.as_quat(), rotations.apply([1.0, 0.0, 0.0])[:, :2], strict=True):
+        x, y, z, w = (size * quaternion).tolist()
+        heading = heading_from_quaternion(x, y, z, w, "field")
+        assert math.hypot(*heading) == pytest.approx(1.0, abs=1e-12)
+        assert heading == pytest.approx(along / np.linalg.norm(along), abs=1e-12 if size == 1.0 else 0.01)
+
+
+@pytest.mark.parametrize("angle", [0.3, -2.0, math.pi])
+def test_a_round_trip_is_that_through_a_message(angle: float):
+    heading = np.array([math.cos(angle), math.sin(angle)])
+    assert round_trip_heading(heading, "field") == pytest.approx(heading, abs=1e-15)
+
+
 @pytest.mark.parametrize(
     ("quaternion", "words"),
     [
         ((0.0, 0.0, 0.0, 0.0), "norm 0"),
         ((0.0, 0.0, 0.0, float("nan")), "norm nan"),
+        ((0.0, 0.0, 0.0, 1.002), "norm 1.002"),
+        ((0.0, 0.0, 0.998, 0.0), "norm 0.998"),
         ((1e300, 0.0, 0.0, 1e300), "expected a unit quaternion"),
         ((0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)), "upright"),
     ],

@@ -41,6 +41,11 @@ def test_a_chain_has_equal_segments_and_lies_on_the_polyline(steps, segments):
     assert max(distance) < 2e-3
 
 
+def test_a_vertex_that_repeats_the_one_before_is_passed_over():
+    path = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.5], [1.0, 0.5]])
+    np.testing.assert_array_equal(chain_along(path, 9, 0.25), chain_along(path[[0, 2, 4]], 9, 0.25))
+
+
 def test_a_chain_in_space():
     helix = np.column_stack([np.cos(np.linspace(0, 6, 200)), np.sin(np.linspace(0, 6, 200)), np.linspace(0, 1, 200)])
     chain = chain_along(helix, 10, 0.4)
@@ -90,3 +95,21 @@ def test_what_is_laid_behind_a_needle_turns_in_before_the_circle():
     np.testing.assert_allclose(edges[0] / np.linalg.norm(edges[0]), -heading, atol=1e-12)
     for length, radius in ((0.01, CIRCLE), (0.15, math.inf)):
         np.testing.assert_array_equal(lay_behind_needle(tail, heading, length, radius), [tail, tail - length * heading])
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_what_is_laid_turns_to_the_side_of_the_centre_and_comes_to_lie_along_the_circle(side: float):
+    """The thread goes along x; the centre is to its left where the side is 1."""
+    laid = lay_behind_needle(np.array([-0.002, -0.006 * side]), np.array([-1.0, 0.0]), 0.06, CIRCLE)
+    edges = np.diff(laid, axis=0)
+    turns = side * (edges[:-1, 0] * edges[1:, 1] - edges[:-1, 1] * edges[1:, 0]) / np.linalg.norm(edges[0]) ** 2
+    assert turns.min() > -1e-9
+    away = np.linalg.norm(laid, axis=1)
+    assert away.max() < CIRCLE
+    assert away[-20:].min() > 0.97 * CIRCLE
+
+
+def test_a_chain_does_not_turn_back_where_its_path_leaves_the_circle_aslant():
+    path = np.array([[-0.0091, -0.0016], [-0.0148, -0.0098], [-0.0248, -0.0099], [-0.0329, -0.004]])
+    edges = np.diff(chain_inside(path, 60, 8e-4, CIRCLE), axis=0)
+    assert (edges[1:] * edges[:-1]).sum(axis=1).min() > 0.0

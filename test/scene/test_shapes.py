@@ -130,6 +130,20 @@ def test_a_polygon_keeps_its_points_bit_for_bit_and_its_holes():
     assert len(soft.outline) > 20
 
 
+def test_rounded_corners_are_as_close_to_circles_as_other_arcs():
+    """The chords of a fourth of a circle of 4 mm lie 15 um off it at 10 degrees each."""
+    shape = polygon(rectangle={"center": [0.0, 0.0], "width": 0.01, "height": 0.01}, corner_radius=0.004)
+    exact = 1e-4 - (4.0 - math.pi) * 0.004**2
+    assert shape.area == pytest.approx(exact, abs=ARC_TOLERANCE * 2.0 * math.pi * 0.004)
+
+
+def test_a_corner_radius_has_to_fit_into_the_outline_and_not_beside_its_holes():
+    hole = [[0.001, 0.001], [0.009, 0.001], [0.009, 0.009], [0.001, 0.009]]
+    frame = polygon(polygon={"outline": SQUARE, "holes": [hole]}, corner_radius=0.002)
+    # What the outline's corners lose, those of the hole give back.
+    assert frame.area == pytest.approx(1e-4 - 6.4e-5, abs=ARC_TOLERANCE * 4.0 * math.pi * 0.002)
+
+
 RING = {"center": [0.0, 0.0], "inner_radius": 0.001, "outer_radius": 0.002}
 SECTOR = {**RING, "start_angle": 0.0, "end_angle": 1.0}
 SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]

@@ -105,6 +105,14 @@ def test_radii_shrink_where_edges_are_short():
     assert Polygon(SQUARE).area * math.pi / 4.0 - 1e-6 < smooth.area < Polygon(SQUARE).area * 0.85
 
 
+def test_an_arc_may_use_nearly_all_of_an_edge_whose_other_end_stays_as_it_is():
+    """The edges at the origin are 1 mm long and end at vertices that hardly turn."""
+    outline = ((0.0, 0.0), (0.001, -1e-6), *SQUARE[1:], (-1e-6, 0.001))
+    radius = 0.0009
+    away = np.linalg.norm(Polygon(outline).smoothed(radius).outline, axis=1)
+    assert away.min() == pytest.approx((math.sqrt(2.0) - 1.0) * radius, rel=0.05)
+
+
 def test_an_arc_that_meets_a_hole_is_made_smaller():
     shape = Polygon(SQUARE, (((0.0002, 0.0002), (0.0012, 0.0004), (0.0004, 0.0012)),))
     smooth = shape.smoothed(0.004)

@@ -9,7 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Workspace, find_contacts
+from magnetosuture_thread.geometry.obstacles import (
+    FRICTION,
+    WALL,
+    Disc,
+    Mesh,
+    Obstacle,
+    Polygon,
+    Workspace,
+    find_contacts,
+)
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).
@@ -122,6 +131,31 @@ def test_a_concave_corner_is_two_contacts():
     np.testing.assert_allclose(contacts.normal[contacts.node == 2], [[np.sqrt(0.5), np.sqrt(0.5)]])
 
 
+def test_edges_one_behind_the_other_are_two_contacts_and_the_nearer_one_is_named():
+    """A point above the upper arm of a C; the lower arm's upper edge faces it too."""
+    outline = (
+        (0.0, 0.0),
+        (0.03, 0.0),
+        (0.03, 0.01),
+        (0.01, 0.01),
+        (0.01, 0.02),
+        (0.03, 0.02),
+        (0.03, 0.03),
+        (0.0, 0.03),
+    )
+    contacts = Workspace([Polygon(outline)], 0.05).near(np.array([[0.02, 0.033]]))
+    assert sorted(contacts.distance.tolist()) == pytest.approx([0.003, 0.023])
+    assert contacts.distance[contacts.nearest].tolist() == pytest.approx([0.003])
+
+
+def test_a_disc_is_near_by_its_edge_and_not_by_its_centre():
+    contacts = Workspace([Disc((0.0, 0.0), 0.02)], 0.003).near(np.array([[0.022, 0.0], [0.0, -0.0231], [0.0, -0.0229]]))
+    assert contacts.node.tolist() == [0, 2]
+    np.testing.assert_allclose(contacts.distance, [0.002, 0.0029], atol=1e-15)
+    small = Workspace([Disc((0.0, 0.0), 0.001)], 0.005).near(np.array([[0.0055, 0.0], [-0.004, -0.004]]))
+    np.testing.assert_allclose(small.distance, [0.0045, np.hypot(0.004, 0.004) - 0.001], atol=1e-15)
+
+
 @pytest.mark.parametrize("reach", [0.0, 1e-4, 0.004, 1.0])
 def test_a_hole_is_outside_and_the_deep_inside_is_never_free(reach: float):
     ring = Workspace([RING], reach)
@@ -229,6 +263,29 @@ def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
 def test_a_wall_must_have_a_radius(radius: float):
     with pytest.raises(ConfigurationError, match="wall_radius"):
         Workspace([], 0.1, 2, radius)
+
+
+def test_each_shape_and_the_wall_has_its_own_friction():
+    workspace = Workspace(
+        [SQUARE, Disc((0.02, 0.0), 1e-3)], 0.1, wall_radius=0.05, friction=(0.2, 0.5), wall_friction=0.1
+    )
+    assert workspace.data.frames[:, FRICTION].tolist() == [0.1, 0.2, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("dimension", "friction", "wall", "reason"),
+    [
+        (2, (0.1, 0.2), 0.0, "one for each of 1"),
+        (2, (2.1,), 0.0, r"friction\[0\]: got 2\.1"),
+        (2, (-0.1,), 0.0, r"friction\[0\]"),
+        (2, (np.nan,), 0.0, r"friction\[0\]"),
+        (2, (0.0,), 2.1, "wall_friction"),
+        (3, (0.1,), 0.0, "friction is of the plane"),
+    ],
+)
+def test_a_friction_that_cannot_be_is_refused(dimension: int, friction: tuple[float, ...], wall: float, reason: str):
+    with pytest.raises(ConfigurationError, match=reason):
+        Workspace([Disc((0.0,) * dimension, 1e-3)], 0.1, dimension, friction=friction, wall_friction=wall)
 
 
 def test_points_must_fit():

@@ -115,6 +115,9 @@ def test_an_inner_corner_is_two_contacts_and_an_inner_edge_none():
     # Inside, the inner edge is the nearest, and the way out goes to it.
     np.testing.assert_allclose(contacts.distance[2], -np.sqrt(2.0) * 0.001)
     np.testing.assert_allclose(contacts.normal[2], [np.sqrt(0.5), np.sqrt(0.5), 0.0], atol=1e-12)
+    aslant = workspace.near(np.array([[0.0095, 0.009, 0.01]]))
+    np.testing.assert_allclose(aslant.distance, -np.hypot(0.0005, 0.001))
+    np.testing.assert_allclose(aslant.normal, [np.array([0.5, 1.0, 0.0]) / np.hypot(0.5, 1.0)], atol=1e-12)
 
 
 def test_a_hollow_is_outside():

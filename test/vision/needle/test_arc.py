@@ -42,3 +42,17 @@ def test_walked_back_an_arc_is_the_same(curvature: float):
     back = arc.reversed_at(50.0)
     np.testing.assert_allclose(back.at(np.array([0.0, 20.0, 50.0])), arc.at(np.array([50.0, 30.0, 0.0])), atol=1e-9)
     np.testing.assert_allclose(back.direction(50.0), -arc.direction(), atol=1e-12)
+
+
+@pytest.mark.parametrize("curvature", [0.0, 0.02, -0.03])
+def test_a_moved_arc_has_offset_slope_and_second_derivative_where_it_leaves(curvature: float):
+    arc = Arc(np.array([10.0, 20.0]), 0.7, curvature)
+    beside = arc.moved(15.0, 4.0, 0.0, 0.0).at(np.linspace(0.0, 30.0, 7))
+    np.testing.assert_allclose(arc.coordinates(beside)[1], 4.0, atol=1e-9)
+    for offset, slope, bend in ((4.0, 0.3, 0.0), (-4.0, 0.3, 0.0), (0.0, 0.0, 0.01)):
+        step = 0.1
+        along, aside = arc.coordinates(arc.moved(15.0, offset, slope, bend).at(np.array([-step, 0.0, step])))
+        assert (along[1], aside[1]) == pytest.approx((15.0, offset))
+        assert (aside[2] - aside[0]) / (along[2] - along[0]) == pytest.approx(slope, abs=1e-4)
+        if not slope:
+            assert (aside[2] - 2.0 * aside[1] + aside[0]) / step**2 == pytest.approx(bend, abs=1e-4)
