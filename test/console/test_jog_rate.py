@@ -57,8 +57,8 @@ def test_the_rate_is_kept_where_each_command_is_late_and_is_not_made_up_for_afte
     controller = JogController(lambda velocity: sent.append(loop.now), rate=10.0, timeout=5.0)
     controller.acquire_control(1)
     controller.jog(1, (0.001, 0.0))
-    for number in range(1, 5):
-        loop.now = 0.1 * number + 0.03
+    for _ in range(4):
+        loop.now = loop.scheduled[0][0] + 0.03
         loop.run_next()
     assert sent == pytest.approx([0.0, 0.13, 0.23, 0.33, 0.43])
     loop.now = 1.0

@@ -134,7 +134,7 @@ def test_a_refusal_is_told():
     run(test)
 
 
-def test_requests_of_the_page_with_control_reach_the_host():
+def test_requests_of_the_page_with_control_reach_the_host_and_the_graph():
     async def test(here: Console) -> None:
         page = await here.page()
         await page.acquire_control()
@@ -144,6 +144,9 @@ def test_requests_of_the_page_with_control_reach_the_host():
         await until(lambda: len(here.host.requests) == 3)
         assert here.host.requests == [("select_setup", "petri_35mm_polyamide"), ("pause", True), ("record", True)]
         await until(lambda: page.of("state")[-1]["host"]["recording"] != "")
+        here.graph.refusal = "no planner"
+        await page.send(type="procedure", action="plan", procedure="slalom", hold_to_run=True)
+        await until(lambda: here.graph.procedures == [("plan", "slalom", True)])
 
     run(test)
 
@@ -454,6 +457,7 @@ def test_a_first_message_other_than_hello_closes_the_connection_with_the_reason(
 def test_states_come_at_the_frame_rate_and_not_faster(monkeypatch: pytest.MonkeyPatch):
     async def test(here: Console) -> None:
         loop = asyncio.get_running_loop()
+        await asyncio.sleep(0.0)  # the server has begun to wait for the first page
         clock = loop.time
         monkeypatch.setattr(loop, "time", lambda: clock() + 60.0)  # a minute without any page is not made up for
         page = await here.page()
@@ -615,6 +619,7 @@ def test_a_connection_that_says_nothing_is_closed(monkeypatch: pytest.MonkeyPatc
         assert (await socket.receive(timeout=WAIT_TIMEOUT)).type is aiohttp.WSMsgType.CLOSE
 
     monkeypatch.setattr("magnetosuture_thread.console.client.HELLO_TIMEOUT", 0.05)
+    monkeypatch.setattr("magnetosuture_thread.console.server.HEARTBEAT_PERIOD", 1000.0)
     run(test)
 
 

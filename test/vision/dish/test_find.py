@@ -98,10 +98,29 @@ def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     assert reasons[-1] == ""
 
 
+def test_a_bright_rim_around_a_bright_floor_is_no_dark_field():
+    clear = np.full((480, 640), 150, np.uint8)
+    cv2.circle(clear, (322, 238), 217, 180, -1, cv2.LINE_AA)
+    cv2.circle(clear, (322, 238), 220, 255, 6, cv2.LINE_AA)
+    assert find_dish(255 - clear, 0.035) is not None  # its negative looks like a dish
+    found = see_dish(clear, VisionTrackerSettings(), 0.035)
+    assert found is None or not found.dark_field
+
+
 def test_what_is_all_texture_shows_no_dish():
     for seed in range(3):
         noise = np.random.default_rng(seed).integers(0, 256, (480, 640)).astype(np.uint8)
         assert find_dish(noise, 0.035) is None
+
+
+def test_too_little_of_a_dish_that_the_frame_cuts_off_tells_nothing():
+    gray = gray_of((322.0, 238.0), 8e-5, 0)
+    circle = 322.0, 238.0, 217.0
+    assert find_cut_dish(np.ascontiguousarray(gray[:, :240]), circle, 0.035) is None  # a third of its rim
+    for share, is_found in ((0.1, True), (0.45, False)):
+        hidden = gray.copy()
+        hidden[: round(480 * share)] = gray[238, 400]  # as bright as the floor: there is no rim
+        assert (find_cut_dish(hidden, circle, 0.035) is not None) == is_found
 
 
 def test_a_given_view_needs_no_dish():
