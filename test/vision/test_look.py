@@ -337,3 +337,9 @@ def test_a_scale_that_is_not_given_makes_a_thread_less_sure_across_it_the_farthe
     across = np.abs(found.points[1:, 0] * along[:, 1] - found.points[1:, 1] * along[:, 0])
     more = np.mean(found.deviation**2) - np.mean(given.deviation**2)
     assert more == pytest.approx(np.mean((0.001 * across) ** 2), rel=0.1)
+
+
+@pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])
+def test_frames_are_shrunk_until_the_needle_is_five_pixels_wide_or_the_frame_small(scale: float, factor: int):
+    """By the scale that is given: 0.4 mm are then 20 px, and 400 px of a frame of 480 rows, of which 64 are left."""
+    assert VisionTrackerSettings(needle_width=4e-4, metres_per_pixel=scale).working_factor((480, 640), 0.035) == factor
