@@ -99,6 +99,15 @@ def test_a_needle_that_is_elsewhere_in_each_frame_is_not_tracked():
         assert (seen.state, seen.reason) == (State.SEARCHING, "a needle seen in 1 of 3 frames")
 
 
+@pytest.mark.parametrize("gain", [1.0, 0.0], ids=["no needle", "no dish"])
+def test_frames_that_agree_on_a_needle_are_in_a_row(gain: float):
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+    frame, between = render(moving(0)), render(Pose(np.array([0.5, 0.5]), 0.0), gain=gain)
+    for index, image in enumerate((frame, frame, between)):
+        assert tracker.track(image, index / RATE).state is not State.TRACKED
+    assert tracker.track(frame, 3 / RATE).reason == "a needle seen in 1 of 3 frames"
+
+
 def test_a_needle_nearly_as_fast_as_the_settings_permit_is_tracked_in_each_frame():
     settings = VisionTrackerSettings(max_needle_speed=0.05, max_turn_rate=6.0)
     tracker = VisionTracker(settings, SCENE)
