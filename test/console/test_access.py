@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.console.access import (
+    RateCounter,
     host_refusal,
     is_loopback,
     new_token,
@@ -13,7 +14,7 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.outbox import MAX_UNACKNOWLEDGED, Outbox
+from magnetosuture_thread.console.outbox import MAX_REPLIES, MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 
@@ -93,7 +94,10 @@ def test_other_names_are_refused(host: str):
 def test_where_every_address_is_bound_only_figures_are_good():
     assert host_refusal("192.168.1.5:8090", "0.0.0.0", 8090) == ""
     assert host_refusal("evil.example:8090", "0.0.0.0", 8090) != ""
+    assert host_refusal("[fd00::5]:8090", "::", 8090) == ""
     assert host_refusal("Rig.example:8090", "rig.example", 8090) == ""
+    for host in ("127.0.0.1:8090", "localhost:8090", "192.168.1.6:8090"):
+        assert host_refusal(host, "192.168.1.5", 8090) != ""
 
 
 def test_the_name_of_a_certificate_or_a_proxy_is_good_besides():
@@ -151,6 +155,13 @@ def test_frames_do_not_wait_for_states_and_answers_come_first():
     assert [outbox.next() for _ in range(4)] == ["first", "second", b"picture", None]
 
 
+def test_of_too_many_replies_the_latest_are_kept():
+    outbox = Outbox()
+    for number in range(MAX_REPLIES + 10):
+        outbox.reply(str(number))
+    assert [outbox.next() for _ in range(MAX_REPLIES + 1)] == [*map(str, range(10, MAX_REPLIES + 10)), None]
+
+
 def test_got_what_was_not_sent_lets_no_more_through():
     outbox = Outbox()
     for _ in range(10):
@@ -165,3 +176,10 @@ def test_the_refusal_of_a_rate_says_which_would_do():
     with pytest.raises(ConfigurationError, match=r"console\.rate: got 10\.0, expected at least 20 Hz, 2 commands in"):
         ConsoleSettings(rate=10.0, hold_timeout=0.1)
     ConsoleSettings(rate=20.0, hold_timeout=0.1)
+
+
+def test_what_comes_is_counted_by_address_and_anew_in_each_second():
+    rate = RateCounter()
+    assert [rate.count("10.0.0.1", now) for now in (7.0, 7.5, 7.999)] == [1, 2, 3]
+    assert rate.count("10.0.0.2", 7.999) == 1
+    assert [rate.count("10.0.0.1", now) for now in (8.0, 8.1)] == [1, 2]

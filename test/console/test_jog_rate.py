@@ -48,6 +48,25 @@ def test_a_held_jog_is_repeated_at_the_rate_until_nobody_holds_it(monkeypatch: p
     assert [velocity for _, velocity in sent] == [(0.001, 0.0)] * 4 + [(0.0, 0.0)]
 
 
+def test_the_rate_is_kept_where_each_command_is_late_and_is_not_made_up_for_after_a_pause(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    loop = ManualLoop()
+    monkeypatch.setattr(asyncio, "get_running_loop", lambda: loop)
+    sent: list[float] = []
+    controller = JogController(lambda velocity: sent.append(loop.now), rate=10.0, timeout=5.0)
+    controller.acquire_control(1)
+    controller.jog(1, (0.001, 0.0))
+    for _ in range(4):
+        loop.now = loop.scheduled[0][0] + 0.03
+        loop.run_next()
+    assert sent == pytest.approx([0.0, 0.13, 0.23, 0.33, 0.43])
+    loop.now = 1.0
+    while loop.now < 1.25:
+        loop.run_next()
+    assert sent.count(1.0) <= 2
+
+
 def test_a_disarmed_bridge_ends_a_jog_at_once_and_one_that_stays_disarmed_ends_none(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
     sent: list[Any] = []
@@ -74,7 +93,9 @@ def test_another_page_neither_ends_a_jog_nor_takes_control_of_it(monkeypatch: py
     for other in (1, 3):
         controller.interrupt(other)
         controller.end_jog(other)
+        controller.set_visible(other, False)
         assert controller.acquire_control(other) != ""
+    assert controller.acquire_control(2) == ""  # which has it already
     assert sent == [(0.001, 0.0)]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import aiohttp
 import pytest
+from aiohttp import web
 
 from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
 from magnetosuture_thread.console.server import HEADERS, ConsoleServer
@@ -38,6 +39,8 @@ def test_the_page_is_served_whole_and_lets_nothing_else_in():
                 assert response.status == 404
         async with here.session.post(here.url) as response:
             assert response.status == 405
+        async with here.session.head(here.url) as response:
+            assert response.status == 200
 
     run(test)
 
@@ -131,7 +134,7 @@ def test_a_refusal_is_told():
     run(test)
 
 
-def test_requests_of_the_page_with_control_reach_the_host():
+def test_requests_of_the_page_with_control_reach_the_host_and_the_graph():
     async def test(here: Console) -> None:
         page = await here.page()
         await page.acquire_control()
@@ -141,6 +144,9 @@ def test_requests_of_the_page_with_control_reach_the_host():
         await until(lambda: len(here.host.requests) == 3)
         assert here.host.requests == [("select_setup", "petri_35mm_polyamide"), ("pause", True), ("record", True)]
         await until(lambda: page.of("state")[-1]["host"]["recording"] != "")
+        here.graph.refusal = "no planner"
+        await page.send(type="procedure", action="plan", procedure="slalom", hold_to_run=True)
+        await until(lambda: here.graph.procedures == [("plan", "slalom", True)])
 
     run(test)
 
@@ -448,10 +454,13 @@ def test_a_first_message_other_than_hello_closes_the_connection_with_the_reason(
     assert not caplog.records
 
 
-def test_states_come_at_the_frame_rate_and_not_faster():
+def test_states_come_at_the_frame_rate_and_not_faster(monkeypatch: pytest.MonkeyPatch):
     async def test(here: Console) -> None:
-        page = await here.page()
         loop = asyncio.get_running_loop()
+        await asyncio.sleep(0.0)  # the server has begun to wait for the first page
+        clock = loop.time
+        monkeypatch.setattr(loop, "time", lambda: clock() + 60.0)  # a minute without any page is not made up for
+        page = await here.page()
         since, before = loop.time(), len(page.of("state"))
         await until(lambda: len(page.of("state")) >= before + 8)
         assert loop.time() - since > 5.0 / 20.0  # two more may have been on their way
@@ -556,6 +565,20 @@ def test_a_frame_is_sent_once_and_nothing_is_compressed():
     run(test)
 
 
+def test_where_all_addresses_are_bound_the_url_names_one_that_a_browser_opens(monkeypatch: pytest.MonkeyPatch):
+    class Local(web.TCPSite):
+        """Binds to this machine alone, whatever it is to bind to."""
+
+        def __init__(self, runner: Any, host: str, *given: Any, **options: Any) -> None:
+            super().__init__(runner, "127.0.0.1", *given, **options)
+
+    async def test(here: Console) -> None:
+        assert here.url.startswith("http://127.0.0.1:")
+
+    monkeypatch.setattr(web, "TCPSite", Local)
+    run(test, address="0.0.0.0")
+
+
 def test_it_is_served_at_the_address_that_is_set():
     async def test(here: Console) -> None:
         assert here.url.startswith("http://127.0.0.2:")
@@ -563,3 +586,64 @@ def test_it_is_served_at_the_address_that_is_set():
             assert response.status == 200
 
     run(test, address="127.0.0.2")
+
+
+def test_places_are_limited_for_each_address_that_watches_for_all_of_them_and_for_those_with_the_token(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    async def test(here: Console) -> None:
+        async with contextlib.AsyncExitStack() as sessions:
+
+            async def status(address: str, query: str = "") -> int:
+                connector = aiohttp.TCPConnector(local_addr=(address, 0))
+                session = await sessions.enter_async_context(aiohttp.ClientSession(connector=connector))
+                try:
+                    here.sockets.append(await session.ws_connect(f"{here.url}socket{query}"))
+                except aiohttp.WSServerHandshakeError as refused:
+                    return refused.status
+                return 101
+
+            first, second, third = (f"127.0.0.{number}" for number in (2, 3, 4))
+            watching = [await status(address) for address in (first, first, first, second, second, third)]
+            assert watching == [101, 101, 503, 101, 101, 503]  # two of each address, and four in all
+            assert [await status(third, f"?token={TOKEN}") for _ in range(4)] == [101, 101, 101, 503]
+
+    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_WATCHERS", 2)
+    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_CLIENTS", 3)
+    run(test)
+
+
+def test_a_connection_that_says_nothing_is_closed(monkeypatch: pytest.MonkeyPatch):
+    async def test(here: Console) -> None:
+        socket = await here.connect()
+        assert (await socket.receive(timeout=WAIT_TIMEOUT)).type is aiohttp.WSMsgType.CLOSE
+
+    monkeypatch.setattr("magnetosuture_thread.console.client.HELLO_TIMEOUT", 0.05)
+    monkeypatch.setattr("magnetosuture_thread.console.server.HEARTBEAT_PERIOD", 1000.0)
+    run(test)
+
+
+def test_beyond_the_message_rate_nothing_but_an_emergency_stop_is_accepted(monkeypatch: pytest.MonkeyPatch):
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.acquire_control()
+        monkeypatch.setattr("magnetosuture_thread.console.client.MAX_MESSAGE_RATE", 0)
+        for action in ("arm", "reset", "disarm", "stop"):
+            await page.send(type="bridge_action", action=action)
+        await until(lambda: here.graph.actions)
+        assert here.graph.actions == ["stop"]
+
+    run(test)
+
+
+def test_a_page_gets_the_speeds_of_the_settings_and_may_say_that_it_is_hidden_without_the_token():
+    async def test(here: Console) -> None:
+        page = await here.page("")
+        welcome = page.of("welcome")[0]
+        assert (welcome["speed"], welcome["max_speed"]) == (0.002, 0.008)
+        await page.send(type="visibility", visible=False)
+        await page.send(type="end_jog")
+        await until(lambda: page.of("error"))
+        assert len(page.of("error")) == 1
+
+    run(test, speed=0.002, max_speed=0.008)

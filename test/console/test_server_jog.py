@@ -9,6 +9,18 @@ from typing import Any
 
 import pytest
 
+from magnetosuture_thread.console.client import RequestHandler
+from magnetosuture_thread.console.client_messages import (
+    BridgeAction,
+    ClientMessage,
+    Pause,
+    ProcedureRequest,
+    RecordBag,
+    SelectSetup,
+)
+from magnetosuture_thread.console.jog_controller import JogController
+from magnetosuture_thread.errors import InvalidInputError
+from test.console.scene import RecordingGraph, RecordingHost
 from test.console.visitor import EAST, NORTH, REST, Console, run, until
 
 
@@ -29,7 +41,7 @@ def test_jog_sends_commands_until_its_end():
         await until(lambda: len(page.received) > states + 3)
         assert len(here.graph.commands) == count
 
-    run(test)
+    run(test, max_speed=0.02)
 
 
 def test_first_command_is_sent_at_once():
@@ -94,7 +106,7 @@ def test_late_jog_messages_are_rejected_and_a_late_page_is_disconnected():
         page = await here.page()
         await page.acquire_control()
         await page.jog(1, 0, sent=100.0)
-        await page.jog(0, 1, sent=99.0)
+        await page.jog(0, 1, sent=99.84)
         await until(lambda: here.graph.last == REST)
         assert "late" in page.of("error")[0]["text"]
         assert NORTH not in here.graph.velocities
@@ -202,6 +214,7 @@ def test_disarming_elsewhere_requires_a_release():
         page = await here.jogging_page()
         here.graph.shown["bridge"].update(armed=False, emergency_stopped=True)
         await until(lambda: here.graph.last == REST)
+        await until(lambda: page.lease["release_first"])
         here.graph.shown["bridge"].update(armed=True, emergency_stopped=False)
         count = len(here.graph.commands)
         await page.jog(1, 0)
@@ -249,3 +262,103 @@ def test_a_procedure_is_held_by_the_page_with_control_alone_and_not_by_late_mess
         assert len(here.graph.holds) == 1
 
     run(test)
+
+
+def requests_and_jog() -> tuple[RequestHandler, JogController, RecordingGraph]:
+    """Return a handler of requests, and the jog controller and the graph that it acts on."""
+    graph = RecordingGraph()
+    jog = JogController(graph.publish_velocity, rate=50.0, timeout=0.15)
+    return RequestHandler(graph, RecordingHost(), jog), jog, graph
+
+
+def start(requests: RequestHandler, client: int, message: ClientMessage) -> None:
+    """Start a request of a page."""
+    requests.start(client, message, "an operator", lambda name, refusal: None)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        *(BridgeAction(action) for action in ("stop", "disarm", "arm", "reset")),
+        *(ProcedureRequest(action, "", False) for action in ("pause", "abort", "plan", "resume")),
+        *(SelectSetup("hernia_ring"), Pause(True), RecordBag(True)),
+    ],
+)
+def test_a_page_without_control_ends_what_moves_and_requests_nothing_else(message: ClientMessage):
+    async def test() -> None:
+        requests, _, _ = requests_and_jog()
+        ends = getattr(message, "action", "") in ("stop", "disarm", "pause", "abort")
+        with contextlib.nullcontext() if ends else pytest.raises(InvalidInputError, match="take control first"):
+            start(requests, 7, message)
+        await requests.close()
+
+    asyncio.run(test())
+
+
+@pytest.mark.parametrize(
+    ("message", "ends"),
+    [
+        (RecordBag(True), False),
+        (BridgeAction("arm"), False),
+        *((BridgeAction(action), True) for action in ("stop", "disarm", "reset")),
+        *((other, True) for other in (Pause(True), SelectSetup("hernia_ring"), ProcedureRequest("plan", "", False))),
+    ],
+)
+def test_a_jog_goes_on_while_a_recording_begins_and_ends_with_all_that_changes_what_runs(
+    message: ClientMessage, ends: bool
+):
+    async def test() -> None:
+        requests, jog, graph = requests_and_jog()
+        jog.acquire_control(1)
+        jog.jog(1, EAST)
+        start(requests, 1, message)
+        assert graph.velocities == ([EAST, REST] if ends else [EAST])
+        assert jog.must_release is ends
+        await requests.close()
+
+    asyncio.run(test())
+
+
+def test_a_page_has_four_requests_pending_at_most_and_stops_all_the_same():
+    async def test() -> None:
+        requests, jog, graph = requests_and_jog()
+        jog.acquire_control(1)
+        for _ in range(4):
+            start(requests, 1, Pause(True))
+        with pytest.raises(InvalidInputError, match="4 pending requests"):
+            start(requests, 1, Pause(True))
+        start(requests, 1, BridgeAction("stop"))
+        jog.release_control(1)
+        jog.acquire_control(2)
+        start(requests, 2, Pause(True))  # those of another page count apart
+        await until(lambda: not requests._pending)
+        assert graph.actions == ["stop"]
+        jog.release_control(2)
+        jog.acquire_control(1)
+        start(requests, 1, Pause(True))
+        await requests.close()
+
+    asyncio.run(test())
+
+
+def test_any_message_of_the_page_with_control_keeps_it():
+    async def test(here: Console) -> None:
+        page = await here.page()
+        await page.acquire_control()
+        here.server._jog._lease._last_message = -math.inf  # as after a long silence
+        await page.send(type="visibility", visible=True)
+        await until(lambda: not here.server._jog.available)
+
+    run(test)
+
+
+def test_a_late_jog_message_ends_the_motion_at_once_and_one_alone_disconnects_nobody():
+    async def test(here: Console) -> None:
+        page = await here.jogging_page()
+        await page.jog(1, 0, sent=0.0)
+        await until(lambda: page.of("error"))
+        assert here.graph.last == REST
+        await page.jog(0, 1)
+        await until(lambda: here.graph.last == NORTH)
+
+    run(test, hold_timeout=1.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import load_setup
 from magnetosuture_thread.vision.calibration import (
     CORNERS,
+    _homography,
     calibrate_by_dish,
     calibrate_by_markers,
     measure_needle_length,
@@ -58,6 +60,8 @@ def test_dishes_that_differ_or_are_missing_are_refused():
         calibrate_by_dish([frame, np.roll(frame, 6, axis=1)], 0.035)
     with pytest.raises(InvalidInputError, match="0 of 1 with a dish"):
         calibrate_by_dish([np.zeros((480, 640), np.uint8)], 0.035)
+    with pytest.raises(InvalidInputError, match="1 of 3 with a dish"):
+        calibrate_by_dish([frame, 0 * frame, 0 * frame], 0.035)
     with pytest.raises(InvalidInputError, match="frames of one size"):
         calibrate_by_dish([frame, frame[::2].copy()], 0.035)
     with pytest.raises(InvalidInputError, match="none"):
@@ -177,3 +181,29 @@ def test_a_needle_under_a_tilted_camera_is_measured_with_its_homography(factor: 
     off, turn = pose.error(found)
     assert off < 0.7
     assert abs(turn) < np.radians(1.0)
+
+
+def test_a_homography_gives_the_view_at_the_dishes_centre_and_is_that_of_a_camera_above_it():
+    square = np.array(CORNERS, dtype=float)
+    points = np.vstack([0.5 * SPACING * centre + 0.5 * SIDE * square for centre in square])
+
+    def seen(points: np.ndarray, tilt: float, mirror: float = 1.0) -> np.ndarray:
+        """Return the pixels of points under a pinhole camera, 0.3 m away and tilted."""
+        depth = 0.3 + points[:, 1] * math.sin(tilt)
+        return np.column_stack(
+            [320.0 + 3700.0 * mirror * points[:, 0] / depth, 240.0 - 3700.0 * points[:, 1] * math.cos(tilt) / depth]
+        )
+
+    found = _homography(points, seen(points, 0.5))
+    assert found is not None
+    view, homography, residual = found
+    assert residual < 1e-4
+    np.testing.assert_allclose(view.centre_px, (320.0, 240.0), atol=1e-6)
+    pixel = 1e-6 * square  # of 4e-12 m^2 in the dish, whose area in the image tells the scale
+    u, v = seen(pixel, 0.5).T
+    area = 0.5 * abs(u @ np.roll(v, 1) - v @ np.roll(u, 1))
+    assert view.metres_per_pixel == pytest.approx(math.sqrt(4e-12 / area), rel=1e-4)
+    straight = np.column_stack([seen(points, 0.5), np.ones(len(points))]) @ homography.T
+    np.testing.assert_allclose(straight[:, :2] / straight[:, 2:], view.to_pixels(points), atol=1e-4)
+    assert _homography(points, seen(points, 0.7)) is None  # 40 degrees
+    assert _homography(points, seen(points, 0.3, mirror=-1.0)) is None

@@ -126,6 +126,14 @@ def test_a_second_needle_is_not_chosen_between():
     assert seen.reason == "2 needles in the dish"
 
 
+def test_of_two_needles_the_one_with_a_thread_is_taken_and_none_if_both_have_one():
+    one, other = Pose(np.array([0.002, 0.006]), 0.4), Pose(np.array([-0.004, -0.007]), 0.4)
+    threads = [each.tail - np.linspace(0.0, 0.01, 40)[:, None] * np.array([1.0, 0.1]) for each in (one, other)]
+    with_thread = render(one, threads[0])
+    assert check(one, np.minimum(with_thread, render(other))) == ""
+    assert TRACKER.look(np.minimum(with_thread, render(other, threads[1]))).reason == "2 needles in the dish"
+
+
 def test_a_second_dark_thing_is_passed_over():
     pose = Pose(np.array([0.002, 0.004]), 0.4)
     frame = render(pose)

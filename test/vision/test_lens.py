@@ -33,6 +33,15 @@ distortion_coefficients: {rows: 1, cols: 5, data: [-0.25, 0.08, 0.001, -0.001, 0
 """
 
 
+def test_a_lens_takes_frames_that_are_shrunk_by_another_factor_than_those_before():
+    frame = render(Pose(np.zeros(2), 0.3))
+    lens, other = (Lens(SIZE, "plumb_bob", LENSES["plumb_bob"], MATRIX) for _ in range(2))
+    for factor in (1, 2, 1):
+        small = np.ascontiguousarray(frame[::factor, ::factor])
+        assert lens.undistorted(small, factor).shape == small.shape
+    np.testing.assert_array_equal(lens.undistorted(small, 1), other.undistorted(small, 1))
+
+
 @pytest.mark.parametrize("model", LENSES)
 def test_what_the_lens_does_is_undone(model: str):
     v, u = np.mgrid[:480, :640].astype(np.float32)

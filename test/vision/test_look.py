@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,7 +17,11 @@ from magnetosuture_thread.rig.camera.dish_camera import DishCamera
 from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
-from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.vision.dish.tilt import Tilt
+from magnetosuture_thread.vision.look import FoundDish, State, _in_dish, see_dish, tilted
+from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import (
@@ -256,3 +262,84 @@ def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str,
             followed += end != "tail" and line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[1] > 0.9
     assert end == "tail" or followed + lost == 8
     assert lost <= (end == "side" and gap == 0.0)  # as 1 of 240 others was
+
+
+def test_a_wrong_scale_leaves_unknown_how_far_out_a_tail_is_and_nothing_else():
+    outward, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
+    covariance = FoundDish(VIEW, scale_error=0.02).covariance(0.01 * outward, across, 0.0175)
+    place = covariance[:2, :2]
+    assert math.sqrt(outward @ place @ outward) == pytest.approx(0.02 * 0.01)
+    np.testing.assert_allclose(place @ across, 0.0, atol=1e-15)
+    np.testing.assert_allclose(covariance[2], 0.0, atol=1e-15)
+
+
+def test_the_scale_is_known_only_where_it_is_given_and_the_dish_agrees():
+    gray = render(Pose(np.zeros(2), 0.3))
+    errors = {}
+    for scale in (0.0, 8e-5, 8.4e-5):
+        found = see_dish(gray, VisionTrackerSettings(metres_per_pixel=scale), 0.035)
+        assert found is not None
+        assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
+        errors[scale] = found.scale_error
+    assert errors[8e-5] == 0.0 < errors[0.0] == errors[8.4e-5]
+
+
+def test_a_covariance_in_the_image_is_that_of_what_it_moves_in_the_dish():
+    """By differences: the needle is moved along and aside of its axis and turned, and looked at in the dish."""
+    view = DishView((322.0, 238.0), 8e-5, rotation=0.4)
+    arc = Arc(np.array([350.0, 200.0]), 0.7, 0.0)
+    along, aside = np.array([math.cos(0.7), math.sin(0.7)]), np.array([-math.sin(0.7), math.cos(0.7)])
+    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.003], [0.0, 0.003, 0.0004]])
+    needle = MeasuredNeedle(arc, 87.0, 5.0, covariance=covariance)
+
+    def pose(arc: Arc) -> np.ndarray:
+        moved = replace(needle, arc=arc)
+        heading = view.directions_to_dish(moved.direction_px)
+        return np.array([*view.to_dish(moved.tail_edge_px), math.atan2(heading[1], heading[0])])
+
+    step = 1e-4
+    changed = [replace(arc, start=arc.start + step * way) for way in (along, aside)] + [replace(arc, angle=0.7 + step)]
+    moves = np.column_stack([(pose(each) - pose(arc)) / step for each in changed])
+    np.testing.assert_allclose(_in_dish(needle, view), moves @ covariance @ moves.T, rtol=1e-3, atol=1e-16)
+
+
+def test_under_a_tilted_camera_pieces_of_thread_are_as_unsure_as_the_view_is_at_their_farthest_point():
+    points = np.array([[0.002, 0.001], [0.006, 0.009], [0.004, 0.003]])
+    piece = ThreadPiece(points, np.array([3e-5, 4e-5, 5e-5]), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), True, 1.0)
+    seen = replace(TRACKER.look(render(Pose(np.zeros(2), 0.3))), observation=ThreadObservation((piece,)))
+    dish = FoundDish(VIEW, tilt=Tilt(0.2, 0.4))
+    track = tilted(seen, dish, 0.0175)
+    assert track.warning == "the camera is tilted by 11 degrees"
+    (less_sure,) = track.observation.pieces
+    assert dish.tilt is not None
+    unsure = dish.tilt.covariance(points[1], np.array([1.0, 0.0]), 0.0175)[:2, :2]
+    ways = np.column_stack([np.cos(turns := np.linspace(0.0, np.pi, 2000)), np.sin(turns)])
+    greatest = np.einsum("ki,ij,kj->k", ways, unsure, ways).max()
+    np.testing.assert_allclose(less_sure.deviation**2, piece.deviation**2 + greatest, rtol=1e-5)
+
+
+def test_a_dark_frame_is_taken_for_a_negative_only_where_its_negative_shows_the_dish():
+    settings = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel)
+    frame = render(Pose(np.zeros(2), 0.3))
+    for image, negative in ((frame, False), (255 - frame, True), (np.full_like(frame, 40), False)):
+        found = see_dish(image, settings, 0.035)
+        assert found is not None
+        assert found.dark_field == negative
+
+
+def test_a_scale_that_is_not_given_makes_a_thread_less_sure_across_it_the_farther_out_it_is():
+    """An error s of the scale moves a point p by s p, and across a thread with the tangent t by s |p x t|."""
+    pose = Pose(np.array([0.012, -0.004]), -1.5)
+    frame = render(pose, pose.tail + np.linspace(0.0, 0.011, 60)[:, None] * np.array([0.05, 1.0]))
+    (given, *_), (found, *_) = (tracker.look(frame).observation.pieces for tracker in (GIVEN_VIEW, TRACKER))
+    along = np.diff(found.points, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = np.abs(found.points[1:, 0] * along[:, 1] - found.points[1:, 1] * along[:, 0])
+    more = np.mean(found.deviation**2) - np.mean(given.deviation**2)
+    assert more == pytest.approx(np.mean((0.001 * across) ** 2), rel=0.1)
+
+
+@pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])
+def test_frames_are_shrunk_until_the_needle_is_five_pixels_wide_or_the_frame_small(scale: float, factor: int):
+    """By the scale that is given: 0.4 mm are then 20 px, and 400 px of a frame of 480 rows, of which 64 are left."""
+    assert VisionTrackerSettings(needle_width=4e-4, metres_per_pixel=scale).working_factor((480, 640), 0.035) == factor

@@ -164,6 +164,10 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
     assert np.abs(mask.depths(pixels) - exact).max() < 1.5
     part = mask.part(160, 96, 501, 401)
     np.testing.assert_array_equal(part.depths(pixels - (160, 96)), mask.depths(pixels))
+    np.testing.assert_allclose(part.rim[:, :2] + (160, 96), mask.rim[:, :2])
+    cells = random.integers(0, 255, (60, 80)).astype(np.uint8)
+    near = mask.part(80, 40, 601, 441)  # around all shapes, so that it shows the floor beside them
+    np.testing.assert_array_equal(near.show_floor(cells[5:55, 10:75]), mask.show_floor(cells)[5:55, 10:75])
     inside = mask.solid[tuple(pixels.astype(int).T[::-1] // factor)] > 0
     assert (exact[inside] > 3e-4 / view.metres_per_pixel - 1.5).all()
     assert inside.sum() > 20

@@ -83,10 +83,38 @@ def test_a_needle_elsewhere_is_an_outlier_until_it_is_seen_again_and_again():
     assert far.is_right(third)
 
 
-def test_a_needle_turned_on_the_spot_is_an_outlier():
+@pytest.mark.parametrize("after", [1 / RATE, 0.9])
+def test_a_needle_turned_on_the_spot_is_an_outlier(after: float):
+    """Also after a time in which it could have turned so far: it would have been seen on the way."""
     tracker = started()
     pose = moving(4)
-    assert tracker.track(render(Pose(pose.at(1.0), pose.heading + np.pi)), 4 / RATE).state is State.LOST
+    assert tracker.track(render(Pose(pose.at(1.0), pose.heading + np.pi)), 3 / RATE + after).state is State.LOST
+
+
+def test_a_needle_that_is_elsewhere_in_each_frame_is_not_tracked():
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+    frames = [render(Pose(np.array(tail), 2.0)) for tail in ((-0.008, -0.006), (0.008, 0.004))]
+    for index in range(6):
+        seen = tracker.track(frames[index % 2], index / RATE)
+        assert (seen.state, seen.reason) == (State.SEARCHING, "a needle seen in 1 of 3 frames")
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.0], ids=["no needle", "no dish"])
+def test_frames_that_agree_on_a_needle_are_in_a_row(gain: float):
+    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
+    frame, between = render(moving(0)), render(Pose(np.array([0.5, 0.5]), 0.0), gain=gain)
+    for index, image in enumerate((frame, frame, between)):
+        assert tracker.track(image, index / RATE).state is not State.TRACKED
+    assert tracker.track(frame, 3 / RATE).reason == "a needle seen in 1 of 3 frames"
+
+
+def test_a_needle_nearly_as_fast_as_the_settings_permit_is_tracked_in_each_frame():
+    settings = VisionTrackerSettings(max_needle_speed=0.05, max_turn_rate=6.0)
+    tracker = VisionTracker(settings, SCENE)
+    for index in range(10):
+        pose = moving(index, turn_rate=5.4, speed=0.045)
+        seen = tracker.track(render(pose), index / RATE)
+        assert index < 2 or (seen.state is State.TRACKED and pose.is_right(seen))
 
 
 def test_of_two_needles_the_one_that_was_followed_is_taken():

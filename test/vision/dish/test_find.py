@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_cut_dish, find_dish, rim_shift
 from magnetosuture_thread.vision.dish.tilt import Tilt
 from magnetosuture_thread.vision.dish.watch import AGREEING, LONG_SEARCH, DishWatch
-from magnetosuture_thread.vision.look import see_dish
+from magnetosuture_thread.vision.look import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import NOWHERE, Pose, finger, render
 
@@ -76,6 +77,23 @@ def test_a_bumped_camera_is_believed_only_after_several_frames():
     assert seen is not None
 
 
+def test_a_camera_that_is_bumped_again_and_again_is_not_believed():
+    before = gray_of((322.0, 238.0), 8e-5, 3)
+    after = [np.roll(before, moved, axis=1) for moved in (8, -6)]
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    assert watch.look(before)[0] == ""
+    for index in range(AGREEING + 1):
+        assert watch.look(after[index % 2])[0] == "the dish is not where it was"
+
+
+def test_two_dishes_agree_as_far_as_is_known_of_each():
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    for error, agree in ((0.001, False), (0.01, True)):
+        dish = FoundDish(DishView((320.0, 240.0), 8e-5), scale_error=error)
+        for moved in (replace(dish.view, centre_px=(322.0, 240.0)), replace(dish.view, metres_per_pixel=8.1e-5)):
+            assert watch._agree(dish, replace(dish, view=moved)) == agree
+
+
 def test_a_dark_frame_gives_no_view_and_changes_none():
     gray = gray_of((322.0, 238.0), 8e-5, 3)
     watch = DishWatch(VisionTrackerSettings(), 0.035)
@@ -91,6 +109,8 @@ def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     cv2.circle(bright, (322, 238), 200, 255, -1, cv2.LINE_AA)  # saturated, so that the rim's dark is not told
     assert see_dish(bright, VisionTrackerSettings(), 0.035, photographed=False) is None
     watch = DishWatch(VisionTrackerSettings(), 0.035)
+    assert watch.look(bright)[0] == ""  # in the first frame at once
+    watch.forget()
     for _ in range(2):
         assert watch.look(0 * bright)[0] != ""
     reasons = [watch.look(bright)[0] for _ in range(LONG_SEARCH)]
@@ -98,10 +118,29 @@ def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     assert reasons[-1] == ""
 
 
+def test_a_bright_rim_around_a_bright_floor_is_no_dark_field():
+    clear = np.full((480, 640), 240, np.uint8)
+    cv2.circle(clear, (322, 238), 217, 180, -1, cv2.LINE_AA)
+    cv2.circle(clear, (322, 238), 220, 255, 6, cv2.LINE_AA)
+    assert find_dish(255 - clear, 0.035) is not None  # its negative looks like a dish
+    found = see_dish(clear, VisionTrackerSettings(), 0.035)
+    assert found is None or not found.dark_field
+
+
 def test_what_is_all_texture_shows_no_dish():
     for seed in range(3):
         noise = np.random.default_rng(seed).integers(0, 256, (480, 640)).astype(np.uint8)
         assert find_dish(noise, 0.035) is None
+
+
+def test_too_little_of_a_dish_that_the_frame_cuts_off_tells_nothing():
+    gray = gray_of((322.0, 238.0), 8e-5, 0)
+    circle = 322.0, 238.0, 217.0
+    assert find_cut_dish(np.ascontiguousarray(gray[:, :240]), circle, 0.035) is None  # a third of its rim
+    for share, is_found in ((0.1, True), (0.45, False)):
+        hidden = gray.copy()
+        hidden[: round(480 * share)] = gray[238, 400]  # as bright as the floor: there is no rim
+        assert (find_cut_dish(hidden, circle, 0.035) is not None) == is_found
 
 
 def test_a_given_view_needs_no_dish():

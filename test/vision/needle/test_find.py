@@ -20,8 +20,8 @@ from magnetosuture_thread.vision.needle import measure
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.ends import leaves_tail
 from magnetosuture_thread.vision.needle.find import find_needles
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.needle.size import NeedleSize
+from magnetosuture_thread.vision.needle.measured_needle import REVERSED_PX, MeasuredNeedle
+from magnetosuture_thread.vision.needle.size import LengthEstimator, NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.template import TemplateFit
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
@@ -136,15 +136,33 @@ def test_speckles_are_not_searched_for_long():
 
 def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_other_end():
     needle = MeasuredNeedle(Arc(np.array([10.0, 20.0]), 0.5, 0.0), 30.0, 4.0, covariance=np.diag([0.01, 0.04, 0.001]))
+    needle = replace(needle, tail_shift_px=0.4, size_measured=True)
     other = needle.reversed()
+    np.testing.assert_allclose(other.tail_edge_px, needle.tip_px)
+    assert not other.size_measured
     np.testing.assert_allclose(other.tail_px, needle.tip_px)
     np.testing.assert_allclose(other.tip_px, needle.tail_px)
     np.testing.assert_allclose(other.direction_px, -needle.direction_px)
     assert other.covariance is not None
     assert other.covariance[1, 1] == pytest.approx(0.04 + 30.0**2 * 0.001), "the tip swings by the heading's error"
     assert other.covariance[1, 2] == pytest.approx(-30.0 * 0.001)
-    assert other.covariance[0, 0] > 1.0, "it is not known where along the axis it ends"
+    assert other.covariance[0, 0] == pytest.approx(0.01 + REVERSED_PX**2), "it is not known where along it ends"
     assert other.covariance[2, 2] == 0.001
+
+
+def test_a_length_is_measured_once_eight_confident_frames_in_a_row_agree():
+    estimator = LengthEstimator()
+    for _ in range(9):
+        estimator.add(0.009, confidence=0.2)
+    for length in (*[0.007] * 7, 0.0072, *[0.007] * 7):
+        estimator.add(length, confidence=0.9)
+        assert estimator.length is None
+    assert estimator.size(0.0068, 4e-4, 1e-4).length_px == pytest.approx(68.0)
+    estimator.add(0.007, confidence=0.9)  # the eighth after the one that was another
+    assert estimator.length == 0.007
+    measured, given = estimator.size(0.0068, 4e-4, 1e-4), LengthEstimator().size(0.0068, 4e-4, 1e-4)
+    assert (measured.length_px, measured.width_px) == pytest.approx((70.0, 4.0))
+    assert measured.tolerance < given.tolerance
 
 
 @pytest.mark.parametrize(("cost", "decided"), [(100.0, True), (120.0, True), (130.0, False)])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -12,10 +14,16 @@ from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import FollowedThread, find_centreline, follow_thread
+from magnetosuture_thread.vision.thread.centreline import (
+    FollowedThread,
+    certain_points,
+    find_centreline,
+    follow_thread,
+)
+from magnetosuture_thread.vision.thread.crossings import Crossing
 from magnetosuture_thread.vision.thread.loose import has_loose_thread
 from magnetosuture_thread.vision.thread.ridge import ZERO, darker_than_around, faint_ridge
-from magnetosuture_thread.vision.thread.search import WALL_PX
+from magnetosuture_thread.vision.thread.search import WALL_PX, ThreadSearch, Walk
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
 
@@ -229,3 +237,22 @@ def test_a_faint_ridge_shows_what_is_darker_or_what_is_paler_by_units_of_noise(p
     assert above[2] == pytest.approx(0.0, abs=0.5)
     np.testing.assert_allclose(above[[0, 1, 3]], -above[4] * np.array([1.0, 0.5, -0.5]), atol=1.0)
     assert (above[4] < 0.0) == pale
+
+
+def test_a_thread_is_told_up_to_the_first_crossing_where_its_way_is_in_doubt():
+    points, path = np.column_stack([np.arange(101.0), np.zeros(101)]), np.zeros((51, 6))
+    path[:, 5] = np.arange(51.0)  # in an image of half the size
+    no_ridge: Any = None
+    for confidences, length in (((0.95, 0.99), 100.0), ((0.95, 0.5), 60.0), ((0.5, 0.5), 40.0)):
+        crossings = tuple(Crossing(first, first + 3, each) for first, each in zip((20, 30), confidences, strict=True))
+        walk = Walk(points, 100.0, 50.0, no_ridge, path, np.ones(51, np.bool_), crossings)
+        assert arc_lengths(certain_points(walk))[-1] == pytest.approx(length, abs=2.0)
+
+
+def test_a_tail_at_the_border_of_the_frame_is_walked_from():
+    for tail, angle in (((639.0, 240.0), np.pi), ((0.0, 240.0), 0.0), ((320.0, 479.0), -0.5 * np.pi)):
+        needle = MeasuredNeedle(Arc(np.array(tail), angle, 0.0), 87.0, 5.0)
+        search = ThreadSearch(
+            prepare(drawn(np.array([[0.0, 0.0], [1.0, 0.0]])), 2), needle, 400.0, (320.0, 240.0), 400.0
+        )
+        assert len(search.wide().points) >= 1

@@ -141,11 +141,12 @@ def test_the_straight_way_below_a_cover_is_taken_and_a_piece_beside_is_left():
     assert order.length == pytest.approx((69.0 + 102.0 + 79.0, high + 79.0))
 
 
-def test_where_two_ways_are_as_good_none_is_taken():
+@pytest.mark.parametrize("worse", [0.0, 3.0])
+def test_where_two_ways_are_nearly_as_good_none_is_taken(worse: float):
     tail = Piece(line((80.0, 200.0), (149.0, 200.0)), (0, 1))
     left = Piece(line((251.0, 180.0), (330.0, 160.0)), (1, 0))
-    right = Piece(line((251.0, 220.0), (330.0, 240.0)), (1, 0))
-    order = find_order([tail, left, right], bare_dish(), (400.0, 420.0), SCALE)
+    right = Piece(line((251.0, 220.0 + worse), (330.0, 240.0 + worse)), (1, 0))
+    order = find_order([tail, left, right], bare_dish(), (240.0, 270.0), SCALE)  # each way is as long as the thread
     assert [placed.index for placed in order.placed] == [0]
     assert order.wide == ()
 
@@ -161,6 +162,14 @@ def test_a_gap_on_bare_floor_is_no_reason_to_join():
     tail = Piece(line((80.0, 100.0), (149.0, 100.0)), (0, 0))
     beyond = Piece(line((170.0, 100.0), (260.0, 100.0)), (0, 0))
     assert len(find_order([tail, beyond], bare_dish(), (150.0, 260.0), SCALE).placed) == 1
+
+
+@pytest.mark.parametrize(("row", "area", "joined"), [(200.0, 1, True), (200.0, 2, False), (140.0, 1, False)])
+def test_a_thread_goes_on_below_the_object_that_it_went_below_and_not_beside_it(row: float, area: int, joined: bool):
+    tail = Piece(line((80.0, row), (149.0, row)), (0, 1))
+    beyond = Piece(line((251.0, row), (330.0, row)), (area, 0))
+    order = find_order([tail, beyond], bare_dish(), (240.0, 260.0), SCALE)
+    assert (len(order.placed) == 2) == joined
 
 
 def test_hidden_outlines_surround_what_covers_the_thread():
@@ -252,6 +261,22 @@ def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_
     assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, NEEDLE) == bare
 
 
+@pytest.mark.parametrize("side", range(4))
+@pytest.mark.parametrize("left", [40, 6])
+def test_an_end_beside_the_border_of_the_frame_is_not_bare(side: int, left: int):
+    image = np.full((160, 160), 180, np.uint8)
+    image[79:82, left:140] = 120
+    along = np.arange(139.0, left, -2.0)
+    points = np.column_stack([along, np.full_like(along, 80.0)])
+    for _ in range(side):  # a quarter turn
+        image = np.ascontiguousarray(np.rot90(image))
+        points = np.column_stack([points[:, 1], 159.0 - points[:, 0]])
+    picture = prepare(image, 1)
+    strand = Strand(points, np.full(len(points), DARK.strength), np.ones(len(points), np.bool_))
+    away = MeasuredNeedle(Arc(np.array([500.0, 500.0]), 0.0, 0.0), 40.0, 5.0)
+    assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, away) == (left == 40)
+
+
 @pytest.mark.parametrize("covered", [False, True])
 def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: bool):
     needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
@@ -267,3 +292,31 @@ def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: b
     u = np.concatenate([view.to_pixels(piece.points)[:, 0] for piece in seen.pieces])
     assert ((u > 220.0) & (u < 250.0)).any() == (not covered)
     assert seen.complete == (not covered)
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_thread_seen_whole_is_complete_only_if_bare_floor_lies_beyond_its_end(bare: bool):
+    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+    image = np.full((480, 640), 225, np.uint8)
+    cv2.line(image, (300, 240), (387, 240), 50, 5)
+    cv2.line(image, (300, 240), (150, 240), 100, 2)
+    image[:, :149] = 225 if bare else 190  # another floor, that the thread may go on below
+    view, walk = DishView((320.0, 240.0), SCALE), line((300.0, 240.0), (151.0, 240.0))
+    seen = observe(prepare(image, 2), needle, walk, view, 0.0172, 150.0 * SCALE, scale_known=True)
+    assert seen.complete == bare
+    assert [piece.last_end for piece in seen.pieces] == [PieceEnd.FREE if bare else PieceEnd.UNKNOWN]
+
+
+def test_a_piece_whose_place_is_unknown_has_no_direction():
+    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+    image = np.full((480, 640), 225, np.uint8)
+    cv2.line(image, (300, 240), (387, 240), 50, 5)
+    cv2.line(image, (300, 240), (220, 240), 100, 2)
+    cv2.line(image, (240, 330), (320, 340), 100, 2)  # in no way from the other
+    image[200:300, 160:221] = 140
+    view, walk = DishView((320.0, 240.0), SCALE), line((300.0, 240.0), (221.0, 240.0))
+    seen = observe(prepare(image, 2), needle, walk, view, 0.0172, 260.0 * SCALE, scale_known=True)
+    first, *others = seen.pieces
+    assert (first.arc_length, first.direction_known) == ((0.0, 0.0), True)
+    assert [np.isnan(piece.arc_length[0]) for piece in others] == [True]
+    assert not others[0].direction_known
