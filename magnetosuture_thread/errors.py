@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from magnetosuture_thread.texts import shortened
 
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
@@ -19,6 +21,16 @@ def missing_module(error: ModuleNotFoundError) -> str:
 
 class MagnetosutureError(Exception):
     """Base of every error that this package raises on purpose; its text is one line for a person."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what it is unpickled from, as from a worker: `__init__` takes others than what is in `args`."""
+        return _unpickled, (type(self), self.args, vars(self))
+
+
+def _unpickled(kind: type[MagnetosutureError], args: tuple[Any, ...], attributes: dict[str, Any]) -> MagnetosutureError:
+    error = kind.__new__(kind, *args)
+    vars(error).update(attributes)
+    return error
 
 
 class ConfigurationError(MagnetosutureError):

@@ -78,11 +78,11 @@ def find_bag_files(path: Path) -> BagFiles:
         path.stat()
         inside = [path] if path.is_file() else sorted(path.iterdir(), key=_by_number)
         files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
-    except FileNotFoundError:
-        raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from None
+    except FileNotFoundError as error:
+        raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from error
     except Exception as error:  # The file system of a URL raises whatever its library does.
         problem = getattr(error, "strerror", None) or error
-        raise BagError(path, f"cannot be read: {problem}") from None
+        raise BagError(path, f"cannot be read: {problem}") from error
     if path.is_file():
         if path.name.endswith(COMPRESSED_SUFFIXES):
             raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {path.name}")

@@ -36,6 +36,7 @@ from magnetosuture_thread.bags.storage import (
     merge_reports,
 )
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import is_url
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 Progress = Callable[[float], None]
@@ -260,9 +261,14 @@ class Bag:
 
 
 def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list[CorruptRegion]]:
-    """Open the files of a bag; of several, unreadable ones are returned as corrupt regions."""
+    """Open the files of a bag; of several, unreadable ones are returned as corrupt regions.
+
+    Raises:
+        BagError: none can be read, or one cannot be fetched: a network that fails is no damage.
+    """
     storages: list[BagStorage] = []
     problems: list[CorruptRegion] = []
+    cause: BaseException | None = None
     total, done = sum(_file_size(file) for file in files), 0
     budget = UnpackBudget(total)
 
@@ -275,11 +281,12 @@ def _open(files: list[Path], progress: Progress) -> tuple[list[BagStorage], list
         try:
             storages.append(SqliteFile(file, report) if file.suffix == ".db3" else McapFile(file, budget, report))
         except BagError as error:
-            if len(files) == 1:
+            if len(files) == 1 or (is_url(file) and isinstance(error.__cause__, OSError)):
                 raise
             problems.append(CorruptRegion(file.name, 0, _file_size(file), error.problem))
+            cause = cause or error.__cause__
     if not storages:
-        raise BagError(files[0].parent, f"holds no file that can be read; {problems[0]}")
+        raise BagError(files[0].parent, f"holds no file that can be read; {problems[0]}") from cause
     return storages, problems
 
 

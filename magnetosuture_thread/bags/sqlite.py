@@ -79,7 +79,7 @@ class SqliteFile:
             with path.open("rb") as stream:
                 magic = stream.read(len(_MAGIC))
         except OSError as error:
-            raise BagError(path, f"cannot be read: {error.strerror or error}") from None
+            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
         if magic != _MAGIC:
             raise BagError(path, "is no sqlite3 file" if magic else "is empty, expected a sqlite3 file")
         self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size

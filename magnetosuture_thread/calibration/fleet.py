@@ -19,7 +19,7 @@ it out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,11 +89,12 @@ class FleetBag:
 
     Attributes:
         name: of the bag.
-        simulated: what of it is simulated; empty if nothing says so.
+        simulated: what of it is simulated; empty if nothing says so, or it could not be fitted.
         stiffness_over_drag: B_k by this bag alone [m^4/s]; not a number where it tells none.
         viscosity: of its liquid over the fleet's mean, and the ends of its 95 % interval; None where it tells none.
         reason: why it tells none; else empty.
-        error: of the prediction, calibrated by this bag alone, mean over time [% of length].
+        error: of the prediction, calibrated by this bag alone, mean over time [% of length]; not a number where it
+            could not be fitted.
     """
 
     name: str
@@ -102,6 +103,11 @@ class FleetBag:
     viscosity: tuple[float, float, float] | None
     reason: str
     error: float
+
+    @classmethod
+    def unfitted(cls, name: str, reason: str) -> FleetBag:
+        """Return a bag that could not be read or fitted, with the reason."""
+        return cls(name, "", math.nan, None, reason, math.nan)
 
 
 @dataclass(frozen=True)
@@ -128,19 +134,23 @@ class FleetResult:
         }
 
 
-def calibrate_fleet(results: Sequence[CalibrationResult]) -> FleetResult:
+def calibrate_fleet(fits: Sequence[CalibrationResult | FleetBag]) -> FleetResult:
     """Return what bags tell together, each of which was calibrated by itself.
 
     Args:
-        results: of one bag each, all from the same settings, with the stiffness over drag among what was fitted.
+        fits: of one bag each, all from the same settings, with the stiffness over drag among what was fitted; for a
+            bag that could not be fitted `FleetBag.unfitted`, which is kept as it is.
 
     Raises:
         InvalidInputError: fewer than `MIN_BAGS` bags tell a stiffness.
     """
+    results = [fit for fit in fits if isinstance(fit, CalibrationResult)]
     found = [next(e for e in result.estimates if e.name == STIFFNESS_OVER_DRAG.name) for result in results]
     told = [index for index, estimate in enumerate(found) if math.isfinite(estimate.low) and estimate.low > 0.0]
     if len(told) < MIN_BAGS:
-        reasons = "; ".join(dict.fromkeys(estimate.reason for estimate in found if estimate.reason))
+        unfitted = {bag.name: bag.reason for bag in fits if isinstance(bag, FleetBag)}
+        told_none = {result.scores[0].name: each.reason for result, each in zip(results, found, strict=True)}
+        reasons = _by_reason({**unfitted, **told_none})
         expected = f"at least {MIN_BAGS}" + (f": {reasons}" if reasons else "")
         raise InvalidInputError("bags", f"{len(told)} that tell the stiffness over drag", expected)
     low, high = (np.log([getattr(found[index], end) for index in told]) for end in ("low", "high"))
@@ -161,7 +171,7 @@ def calibrate_fleet(results: Sequence[CalibrationResult]) -> FleetResult:
         *ends,
         logarithmic=True,
     )
-    bags = []
+    fitted = []
     for index, (result, each) in enumerate(zip(results, found, strict=True)):
         value, viscosity = math.nan, None
         if index in told:
@@ -170,5 +180,16 @@ def calibrate_fleet(results: Sequence[CalibrationResult]) -> FleetResult:
             offset, around = float(pooled.offsets[place]), float(pooled.offset_halves[place])
             viscosity = (math.exp(-offset), math.exp(-offset - around), math.exp(around - offset))
         reason = "" if viscosity else each.reason
-        bags.append(FleetBag(result.scores[0].name, result.simulated[0], value, viscosity, reason, result.error))
-    return FleetResult(estimate, pooled.scatter, tuple(bags))
+        fitted.append(FleetBag(result.scores[0].name, result.simulated[0], value, viscosity, reason, result.error))
+    in_order = iter(fitted)
+    bags = tuple(fit if isinstance(fit, FleetBag) else next(in_order) for fit in fits)
+    return FleetResult(estimate, pooled.scatter, bags)
+
+
+def _by_reason(reasons: Mapping[str, str]) -> str:
+    """Return the reasons of bags in words, each once with the names of its bags; those without one are left out."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        if reason:
+            names.setdefault(reason, []).append(name)
+    return "; ".join(f"{', '.join(those)}: {reason}" for reason, those in names.items())

@@ -66,6 +66,9 @@ def fleet_yaml(fleet: FleetResult, start: ThreadModelSettings) -> str:
     """
     words = [FLEET]
     for bag in fleet.bags:
+        if math.isnan(bag.error):
+            words.append(f"{bag.name}: not used: {bag.reason}.")
+            continue
         source = f"simulated: {bag.simulated}" if bag.simulated else "nothing in it says that it is simulated"
         told = f"not used: {bag.reason}"
         if bag.viscosity is not None:
@@ -101,7 +104,7 @@ def fleet_table(fleet: FleetResult) -> Table:
         if bag.viscosity is not None:
             value, low, high = bag.viscosity
             cells = (f"{bag.stiffness_over_drag:.4g}", f"{value:.3f}", f"{low:.3f} to {high:.3f}")
-        table.add_row(bag.name, *cells, f"{bag.error:.3g}")
+        table.add_row(bag.name, *cells, "-" if math.isnan(bag.error) else f"{bag.error:.3g}")
     return table
 
 

@@ -7,7 +7,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from magnetosuture_thread import MagnetosutureError
+from magnetosuture_thread import MagnetosutureError, __version__
 from magnetosuture_thread.bags.bag_folder import METADATA_FILE
 from magnetosuture_thread.catalog.series import second_rows
 from magnetosuture_thread.catalog.tables import Catalog
@@ -29,7 +29,7 @@ class CatalogUpdate:
 
     Attributes:
         unchanged: bags that were in it already.
-        added: bags that are new or have changed.
+        added: bags that are new or have changed, or could not be read the last time.
         failed: of these, the bags that cannot be evaluated; their rows say why.
         gone: bags that were in it and are no longer there.
     """
@@ -46,7 +46,7 @@ class _Task:
 
     Attributes:
         path: of the bag.
-        version: of its files.
+        version: of its files and of this package.
         size: of its files [bytes].
     """
 
@@ -66,8 +66,10 @@ def update_catalog(
 ) -> CatalogUpdate:
     """Bring a catalog up to date: add bags that are new or have changed, drop those that are gone.
 
-    A bag has changed where the name, size or time of change of one of its files has (of a URL the ETag). Whatever ends
-    this process, what was done stays, and the next update goes on from there.
+    A bag has changed where the name, size or time of change of one of its files has (of a URL the ETag); another
+    version of this package evaluates all anew. A bag whose worker ended, or whose file system or network failed, is
+    tried again by the next update. Whatever ends this process, what was done stays, and the next update goes on from
+    there.
 
     Args:
         root: folder or URL with the bags, in itself or in folders below.
@@ -95,13 +97,11 @@ def update_catalog(
     with make_runner(_figures_of, workers, scheduler) as runner:
         for index, result in runner.run(tasks, log, progress):
             task = tasks[index]
-            row, seconds = (_failed(task, str(result)), []) if isinstance(result, WorkerDiedError) else result
+            row, seconds = (_failed(task, str(result), ""), []) if isinstance(result, WorkerDiedError) else result
             if row["problem"]:
                 failed += 1
                 log(f"{task.path}: {row['problem']}")
-            # A bag that ended its worker is tried again the next time.
-            version = "" if isinstance(result, WorkerDiedError) else task.version
-            catalog.append({**row, "version": version, "bytes": task.size}, seconds)
+            catalog.append(row, seconds)
     catalog.write(gone)
     return CatalogUpdate(len(paths) - len(tasks), len(tasks), failed, len(gone))
 
@@ -111,11 +111,11 @@ def _is_below(path: str, root: str) -> bool:
 
 
 def _version(bag: Path) -> tuple[str, int]:
-    """Return what changes with the files of a bag, and their size in bytes."""
+    """Return what changes with the files of a bag and with this package, and the files' size in bytes."""
     inside = [bag] if bag.is_file() else sorted(bag.iterdir(), key=lambda path: path.name)
     files = [path for path in inside if path.name.endswith((*STORAGE_SUFFIXES, METADATA_FILE))]
     found = [(path.name, *version_of(path)) for path in files]
-    digest = blake2b(repr(found).encode(), digest_size=12).hexdigest()
+    digest = blake2b(repr((__version__, found)).encode(), digest_size=12).hexdigest()
     return digest, sum(size for _, size, _ in found)
 
 
@@ -124,15 +124,29 @@ def _figures_of(task: _Task, log: Log, progress: Progress) -> tuple[dict[str, An
     try:
         with open_bag(task.path, lambda text: None) as given:
             measured = measure_bag(given, name_of(task.path), "auto", "", progress)
-            return {**flat(row_of(measured.about, measured.figures)), **_facts(given)}, second_rows(measured.metrics)
-    except MagnetosutureError as error:
-        return _failed(task, str(error)), []
-    except Exception as error:  # A mistake of ours, or of a package: this bag's alone.
-        return _failed(task, f"{type(error).__name__}: {error}"), []
+            row = {**flat(row_of(measured.about, measured.figures)), **_facts(given), **_facts_of_files(task)}
+            return row, second_rows(measured.metrics)
+    except Exception as error:  # A mistake of ours, or of a package, is this bag's alone too.
+        problem = str(error) if isinstance(error, MagnetosutureError) else f"{type(error).__name__}: {error}"
+        return _failed(task, problem, "" if _may_pass(error, task.path) else task.version), []
 
 
-def _failed(task: _Task, problem: str) -> dict[str, Any]:
-    return flat(failed_row(name_of(task.path), str(task.path), one_line(" ".join(problem.split()))))
+def _may_pass(error: BaseException | None, bag: Path) -> bool:
+    """Return whether a file system or a network failed, so that the same bag may be readable the next time."""
+    while isinstance(error, MagnetosutureError):
+        error = error.__cause__
+    # The file system of a URL raises whatever its library does.
+    return isinstance(error, OSError) or (error is not None and is_url(bag))
+
+
+def _failed(task: _Task, problem: str, version: str) -> dict[str, Any]:
+    """Return the row of a bag with a problem; with an empty version the next update tries it again."""
+    row = flat(failed_row(name_of(task.path), str(task.path), one_line(" ".join(problem.split()))))
+    return {**row, **_facts_of_files(task), "version": version}
+
+
+def _facts_of_files(task: _Task) -> dict[str, Any]:
+    return {"version": task.version, "bytes": task.size}
 
 
 def _facts(given: BagInput) -> dict[str, Any]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import pickle
+import platform
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import dask
-from distributed import Client, KilledWorker, as_completed
+from distributed import Client, KilledWorker, as_completed, get_worker
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.workers.runner import Log, Progress, Work, WorkerDiedError
@@ -28,7 +30,8 @@ class ClusterRunner:
     A worker that is lost takes nothing with it: Dask repeats its tasks on others. Dask gives up a task that was on
     four lost workers, whichever task ended them: each such task is repeated alone, and gives a `WorkerDiedError` only
     where it ends workers then too. Log lines of a task come when it ends. Whatever ends the context cancels what has
-    not begun; what a worker has begun it still ends, for nobody.
+    not begun; what a worker has begun it still ends, for nobody. The software of a worker is compared with this
+    process's on entering and again with each task, as a worker may join later, or come back with another version.
 
     Args:
         work: called with task, log and progress; can be pickled.
@@ -36,7 +39,7 @@ class ClusterRunner:
 
     Raises:
         ConfigurationError: on entering: there is no scheduler or no worker, or a worker has other software than this
-            process, so that its results may differ.
+            process (`SOFTWARE`, or another minor version of Python), so that its results may differ.
     """
 
     def __init__(self, work: Work, address: str) -> None:
@@ -49,6 +52,7 @@ class ClusterRunner:
             self._client = Client(self._address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, asyncio.TimeoutError) as error:
             raise self._refused("the address of a running Dask scheduler", error) from None
+        self._software = _software()
         try:
             self._check_workers()
             with dask.config.set({"distributed.admin.large-graph-warning-threshold": MAX_WORK_BYTES}):
@@ -69,7 +73,7 @@ class ClusterRunner:
         """Run tasks; see `TaskRunner`.
 
         Raises:
-            ConfigurationError: the scheduler is gone.
+            ConfigurationError: the scheduler is gone, or a worker that joined has other software.
         """
         done, suspects = 0, list[int]()
         for index, result in self._run_at_once(tasks, range(len(tasks)), log):
@@ -86,7 +90,10 @@ class ClusterRunner:
                 yield index, result
 
     def _run_at_once(self, tasks: Sequence[Any], indices: Sequence[int], log: Log) -> Iterator[tuple[int, Any]]:
-        futures = {self._client.submit(_run_task, self._loaded, tasks[index], pure=False): index for index in indices}
+        futures = {
+            self._client.submit(_run_task, self._loaded, tasks[index], self._software, pure=False): index
+            for index in indices
+        }
         try:
             for future in as_completed(list(futures), loop=self._client.loop):
                 yield futures.pop(future), self._result_of(future, log)  # what nobody names the cluster forgets
@@ -96,6 +103,8 @@ class ClusterRunner:
     def _result_of(self, future: Any, log: Log) -> Any:
         try:
             result, lines = future.result()
+        except _OtherSoftwareError as error:
+            raise self._refused(*error.args) from None
         except KilledWorker as error:
             return WorkerDiedError(" ".join(str(error).split()))
         except (asyncio.CancelledError, OSError) as error:
@@ -115,30 +124,57 @@ class ClusterRunner:
             found = self._client.run(_software)
         except ModuleNotFoundError as error:
             raise self._refused("workers with the same packages as here", error) from None
-        ours = _software()
         for worker, theirs in found.items():
-            for name, own in ours.items():
-                if theirs[name] != own:
-                    problem = f"worker {worker} has {theirs[name] or 'none'}"
-                    raise self._refused(f"workers with {name} {own}, as here", problem)
+            try:
+                _require_same(self._software, theirs, worker)
+            except _OtherSoftwareError as error:
+                raise self._refused(*error.args) from None
 
     def _refused(self, expectation: str, problem: object) -> ConfigurationError:
         words = " ".join(str(problem).split())
         return ConfigurationError("scheduler", self._address, f"{expectation} ({words})" if words else expectation)
 
 
-def _run_task(work: Work, task: Any) -> tuple[Any, list[str]]:
-    """Run a task on a worker; return its result and the lines that it logged."""
+class _OtherSoftwareError(Exception):
+    """A worker has other software than the process that gives the tasks: what was expected, and what it has."""
+
+
+def _run_task(work: Work, task: Any, software: Mapping[str, str]) -> tuple[Any, list[str]]:
+    """Run a task on a worker; return its result and the lines that it logged.
+
+    Args:
+        work: as for `ClusterRunner`.
+        task: its argument.
+        software: of the process that gives the task.
+
+    Raises:
+        _OtherSoftwareError: that of this worker is another.
+    """
+    _require_same(software, _software_of_process(), get_worker().address)
     lines: list[str] = []
     with _ONE_AT_A_TIME:
         return work(task, lines.append, lambda share: None), lines
 
 
+def _require_same(ours: Mapping[str, str], theirs: Mapping[str, str], worker: str) -> None:
+    for name, own in ours.items():
+        if theirs.get(name) != own:
+            raise _OtherSoftwareError(
+                f"workers with {name} {own}, as here", f"worker {worker} has {theirs.get(name) or 'none'}"
+            )
+
+
 def _software() -> dict[str, str]:
-    found = {}
+    found = {"Python": ".".join(platform.python_version_tuple()[:2])}
     for name in SOFTWARE:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             found[name] = ""
     return found
+
+
+@cache
+def _software_of_process() -> dict[str, str]:
+    """Return the software of a worker's process, looked up once: that takes 5 ms, and what is imported stays."""
+    return _software()

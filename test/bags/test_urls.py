@@ -18,7 +18,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import TIMES
-from magnetosuture_thread.files import RANGE_BYTES, parse_location
+from magnetosuture_thread.files import RANGE_BYTES, open_ranges, parse_location
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from test.bags.bags import (
@@ -186,6 +186,24 @@ def test_a_damaged_chunk_is_an_error_where_it_is_read_and_not_before(tmp_path: P
         messages.extend(record.time for record in bag.records())
     before = [time for _, _, inside in list(chunks_of(path))[:20] for _, time, _ in inside]
     assert messages == sorted(before)
+
+
+def test_a_file_of_a_bag_that_cannot_be_fetched_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for number in range(2):
+        write_mcap(folder / f"run_{number}.mcap", texts(3), {"/text": STRING})
+        in_memory((folder / f"run_{number}.mcap").read_bytes(), f"run/run_{number}.mcap")
+
+    def open_first(path: Path) -> Any:
+        if path.name == "run_1.mcap":
+            raise OSError(5, "Input/output error")
+        return open_ranges(path)
+
+    monkeypatch.setattr("magnetosuture_thread.bags.mcap.file.open_ranges", open_first)
+    assert "Input/output error" in str(Bag(folder).damage)
+    with pytest.raises(BagError, match=r"run_1\.mcap: cannot be read: Input/output error"):
+        Bag(parse_location("memory://run"))
 
 
 @pytest.mark.parametrize("kind", ["truncated", "no checksums", "no chunks", "whole"])

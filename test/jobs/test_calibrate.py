@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,9 +18,11 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
+from magnetosuture_thread.jobs import calibrate_fleet as fleet_job
 from magnetosuture_thread.jobs.calibrate import calibrate_bags, material_named, settings_of
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.workers import WorkerDiedError
 from test.bags.bags import copy_with_notes
 from test.calibration.runs import LENGTH, rig_run
 
@@ -234,6 +237,45 @@ def test_a_fleet_shares_its_stiffness_and_each_bag_has_its_viscosity(tmp_path: P
     both = read_setup(str(tmp_path / "lab.yaml")).model
     modulus = float(text.split("elastic_modulus: ")[1].split()[0])
     assert stiffness_over_drag(replace(both, elastic_modulus=modulus)) == pytest.approx(shared["value"], rel=1e-4)
+
+
+def test_a_fleet_goes_on_without_a_bag_that_cannot_be_read_or_ends_its_worker(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    first, *others = fleet_bags(tmp_path, (0.8, 1.0, 1.25))
+    broken, fatal = tmp_path / "broken.mcap", tmp_path / "fatal"
+    broken.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    fit_bag = fleet_job._fit_bag
+
+    def ended_by_one(*given: Any) -> Any:
+        return WorkerDiedError("its process ended with -9") if fatal in given else fit_bag(*given)
+
+    monkeypatch.setattr(fleet_job, "_fit_bag", ended_by_one)
+    output, figures = tmp_path / "found.yaml", tmp_path / "found.json"
+    bags = [first, str(broken), *others, str(fatal)]
+    assert run(tmp_path, *bags, "--fleet", *ONE, "--output", str(output), "--json", str(figures)) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "is left out: its process ended with -9" in shown
+    found = json.loads(figures.read_text())["bags"]
+    assert [bag["name"] for bag in found] == bags
+    assert [bag["viscosity"] is None for bag in found] == [False, True, False, False, True]
+    assert "nothing intact" in found[1]["reason"]
+    assert (found[4]["reason"], found[4]["error"]) == ("its process ended with -9", None)
+    text = " ".join(line.strip("# ") for line in output.read_text().splitlines())
+    assert f"{fatal}: not used: its process ended with -9." in text
+
+
+def test_a_fleet_of_which_too_few_bags_are_left_names_the_others(folder: Path, tmp_path: Path, capsys):
+    broken = [tmp_path / "broken.mcap", tmp_path / "nowhere.mcap"]
+    broken[0].write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    output = tmp_path / "x.yaml"
+    bags = [*broken, folder / "one", folder / "two"]
+    assert run(folder, *map(str, bags), *ONE, "--fleet", "--output", str(output), "--workers", "2") == 1
+    shown = capsys.readouterr().err
+    assert "2 that tell the stiffness over drag, expected at least 3: " in shown
+    assert f"{broken[0]}: " in shown
+    assert f"{broken[1]}: does not exist" in shown
+    assert not output.exists()
 
 
 def test_a_fleet_of_too_few_bags_or_without_what_they_share_is_refused(folder: Path, tmp_path: Path, capsys):

@@ -91,6 +91,39 @@ def test_a_bag_that_ends_its_worker_is_tried_again(root: Path, tmp_path: Path, m
     assert update_catalog(root, file) == CatalogUpdate(unchanged=0, added=3, failed=1, gone=0)
 
 
+class UnreachableError(Exception):
+    """What a library of a file system raises, for example botocore's, which is no `OSError`."""
+
+
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), UnreachableError("could not connect")])
+def test_a_bag_that_could_not_be_read_is_tried_again(
+    error: Exception, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "catalog.parquet"
+    fsspec.filesystem("memory").put(str(root), f"/{tmp_path.name}", recursive=True)
+    place = parse_location(f"memory://{tmp_path.name}")
+
+    def fail(path: Path) -> Any:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("magnetosuture_thread.bags.mcap.file.open_ranges", fail)
+        assert update_catalog(place, file) == CatalogUpdate(unchanged=0, added=3, failed=3, gone=0)
+    assert rows(file, f"SELECT count(*) FROM bags WHERE problem LIKE '%{error.args[-1]}%'") == [(3,)]
+    assert update_catalog(place, file) == CatalogUpdate(unchanged=0, added=3, failed=1, gone=0)
+    assert update_catalog(place, file) == CatalogUpdate(unchanged=3, added=0, failed=0, gone=0)
+
+
+def test_another_version_of_the_package_evaluates_bags_anew(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "catalog.parquet"
+    update_catalog(root, file)
+    monkeypatch.setattr(job, "__version__", "0.0.1")
+    assert update_catalog(root, file) == CatalogUpdate(unchanged=0, added=3, failed=1, gone=0)
+    assert update_catalog(root, file) == CatalogUpdate(unchanged=3, added=0, failed=0, gone=0)
+
+
 def test_bags_by_url_are_catalogued_with_those_of_this_machine(root: Path, tmp_path: Path):
     file = tmp_path / "catalog.parquet"
     fsspec.filesystem("memory").put(str(root), "/fleet", recursive=True)

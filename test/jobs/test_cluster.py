@@ -151,6 +151,22 @@ def test_workers_with_other_software_are_refused(scheduler: str, monkeypatch: py
         make_runner(print, 1, scheduler).__enter__()
 
 
+def test_a_worker_that_has_other_software_later_is_refused_too(mortal: str, tmp_path: Path):
+    work = importlib.import_module("work_of_tests").work
+    with make_runner(work, 1, mortal) as runner:
+        # On the path of the workers, before the NumPy that is there, as if it had been replaced.
+        (tmp_path / "numpy-0.9.dist-info").mkdir()
+        (tmp_path / "numpy-0.9.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 0.9\n")
+        with pytest.raises(ConfigurationError, match=r"workers with numpy .*, as here \(worker tcp://.* has 0\.9\)"):
+            list(runner.run([1]))
+
+
+def test_workers_with_another_python_are_refused(scheduler: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("platform.python_version_tuple", lambda: ("3", "9", "1"))
+    with pytest.raises(ConfigurationError, match=r"workers with Python 3\.9, as here"):
+        make_runner(print, 1, scheduler).__enter__()
+
+
 def test_an_absent_scheduler_gives_one_line(capfd: pytest.CaptureFixture[str], tmp_path: Path, short_bag: Path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

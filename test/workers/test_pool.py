@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.workers import WorkerDiedError
 from magnetosuture_thread.workers.pool import ONE_THREAD, WorkerPool
 
 SOURCE = """
 import os
+from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.workers.pool import ONE_THREAD
 
 def work(task, log, progress):
@@ -22,6 +24,8 @@ def work(task, log, progress):
     progress(0.5)
     if task == 3:
         os._exit(9)
+    if task == 6:
+        raise BagError("a.mcap", "is no mcap file")
     return task * task, os.getpid(), [os.environ.get(name) for name in ONE_THREAD]
 """
 BEFORE = {name for name in ONE_THREAD if name in os.environ}
@@ -29,7 +33,7 @@ BEFORE = {name for name in ONE_THREAD if name in os.environ}
 
 @pytest.fixture
 def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return work of a module that other processes find too: square a number; 3 ends the process."""
+    """Return work of a module that other processes find too: square a number; 3 ends the process, 6 raises."""
     name = f"work_{tmp_path.name.replace('-', '_')}"
     (tmp_path / f"{name}.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -71,3 +75,9 @@ def test_processes_serve_again_and_an_error_of_a_task_is_raised_here(work: Any):
         assert {process for _, process, _ in second.values()} <= {process for _, process, _ in first.values()}
         with pytest.raises(TypeError):
             list(pool.run(["no number", 1]))
+
+
+def test_an_error_of_this_package_is_raised_as_it_is(work: Any):
+    with WorkerPool(work, 2) as pool, pytest.raises(BagError, match=r"^a\.mcap: is no mcap file$") as raised:
+        list(pool.run([1, 6]))
+    assert (raised.value.path, raised.value.problem) == ("a.mcap", "is no mcap file")

@@ -66,7 +66,7 @@ class McapFile:
                         raise BagError(path, "is no mcap file")
                     salvaged = salvage(path.name, size, scan, summary, partial(_count_messages, stream))
         except OSError as error:
-            raise BagError(path, f"cannot be read: {error.strerror or error}") from None
+            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
         except BudgetError as error:
             raise BagError(path, str(error)) from None
         self._scan, self._verified = scan, scan.data_crc_matches or salvaged.damage is None
@@ -109,7 +109,7 @@ class McapFile:
                     if block.start <= end and block.end >= start and block.holds(wanted)
                 )
         except OSError as error:
-            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from None
+            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from error
 
     def _read_block(
         self, stream: BinaryIO, block: Block, wanted: frozenset[int], start: int, end: int
@@ -160,7 +160,7 @@ class McapFile:
                     else:
                         yield attachment
         except OSError as error:
-            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from None
+            raise BagError(self.path, f"cannot be read: {error.strerror or error}") from error
 
 
 def _load(stream: BinaryIO, block: Block) -> bytes:
