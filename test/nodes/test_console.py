@@ -447,7 +447,8 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     tell(graph, topics.SCENE, told, lambda: console.state()["procedures"] == ["slalom"], "what the scene allows")
     graph.add(NeedlePlannerNode, scene="dish_35mm", needle_length=0.0025, settle=0.0, pose_timeout=5.0)
     commands, holds = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.PROCEDURE_HOLD)
-    pose = MESSAGES.pose_message(1_000_000_000, np.zeros(2), np.array([1.0, 0.0]))
+    later = int(1e9 * (time.time() + 3600.0))  # ns; late poses are refused, however slowly the test runs
+    pose = MESSAGES.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
     near = "goals: [{go_to: {position: [0.008, 0.0]}}]"
     refusal = asyncio.run(console.execute_procedure("resume", "", False))
     assert "no procedure" in refusal
