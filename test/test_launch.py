@@ -130,7 +130,7 @@ def test_the_frame_of_the_dish_is_published_where_tf2_is_installed(description, 
     ("pushed", "namespace", "outer"),
     [("", "", ""), ("", "left", "/left"), ("", "/left", "/left"), ("/lab", "left", "/lab/left"), ("/lab", "", "/lab")],
 )
-def test_each_process_is_in_the_enclave_of_its_name_where_asked(
+def test_enclaves_have_the_names_of_processes_below_their_namespace(
     description, monkeypatch: pytest.MonkeyPatch, pushed: str, namespace: str, outer: str
 ):
     monkeypatch.setitem(Context.launch_configurations, "ros_namespace", pushed)

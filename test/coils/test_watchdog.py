@@ -134,7 +134,7 @@ def test_the_minimum_age_of_the_last_seconds_is_kept_for_each_topic():
     assert ages.minimum(3.5 + AGE_WINDOW) == {}
 
 
-def test_a_model_with_another_scene_is_told_of_until_it_is_silent_for_its_timeout():
+def test_a_model_with_another_scene_is_reported_until_its_timeout():
     monitor = PredictionMonitor(2.0)
     monitor.update(1.0, True, 1.0, "a", 1.0)
     assert monitor.scene_mismatch("a", 1.0) == ""

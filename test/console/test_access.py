@@ -178,7 +178,7 @@ def test_the_refusal_of_a_rate_says_which_would_do():
     ConsoleSettings(rate=20.0, hold_timeout=0.1)
 
 
-def test_what_comes_is_counted_by_address_and_anew_in_each_second():
+def test_messages_are_counted_by_address_and_second():
     rate = RateCounter()
     assert [rate.count("10.0.0.1", now) for now in (7.0, 7.5, 7.999)] == [1, 2, 3]
     assert rate.count("10.0.0.2", 7.999) == 1

@@ -114,7 +114,7 @@ def test_a_bag_that_could_not_be_read_is_tried_again(
     assert update_catalog(place, file) == CatalogUpdate(unchanged=3, added=0, failed=0, gone=0)
 
 
-def test_another_version_of_the_package_evaluates_bags_anew(
+def test_another_version_of_the_package_evaluates_all_bags_again(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     file = tmp_path / "catalog.parquet"

@@ -187,23 +187,23 @@ def test_a_homography_gives_the_view_at_the_dishes_centre_and_is_that_of_a_camer
     square = np.array(CORNERS, dtype=float)
     points = np.vstack([0.5 * SPACING * centre + 0.5 * SIDE * square for centre in square])
 
-    def seen(points: np.ndarray, tilt: float, mirror: float = 1.0) -> np.ndarray:
+    def projected(points: np.ndarray, tilt: float, mirror: float = 1.0) -> np.ndarray:
         """Return the pixels of points under a pinhole camera, 0.3 m away and tilted."""
         depth = 0.3 + points[:, 1] * math.sin(tilt)
         return np.column_stack(
             [320.0 + 3700.0 * mirror * points[:, 0] / depth, 240.0 - 3700.0 * points[:, 1] * math.cos(tilt) / depth]
         )
 
-    found = _homography(points, seen(points, 0.5))
+    found = _homography(points, projected(points, 0.5))
     assert found is not None
     view, homography, residual = found
     assert residual < 1e-4
     np.testing.assert_allclose(view.centre_px, (320.0, 240.0), atol=1e-6)
     pixel = 1e-6 * square  # of 4e-12 m^2 in the dish, whose area in the image tells the scale
-    u, v = seen(pixel, 0.5).T
+    u, v = projected(pixel, 0.5).T
     area = 0.5 * abs(u @ np.roll(v, 1) - v @ np.roll(u, 1))
     assert view.metres_per_pixel == pytest.approx(math.sqrt(4e-12 / area), rel=1e-4)
-    straight = np.column_stack([seen(points, 0.5), np.ones(len(points))]) @ homography.T
+    straight = np.column_stack([projected(points, 0.5), np.ones(len(points))]) @ homography.T
     np.testing.assert_allclose(straight[:, :2] / straight[:, 2:], view.to_pixels(points), atol=1e-4)
-    assert _homography(points, seen(points, 0.7)) is None  # 40 degrees
-    assert _homography(points, seen(points, 0.3, mirror=-1.0)) is None
+    assert _homography(points, projected(points, 0.7)) is None  # 40 degrees
+    assert _homography(points, projected(points, 0.3, mirror=-1.0)) is None

@@ -133,7 +133,7 @@ def test_what_is_all_texture_shows_no_dish():
         assert find_dish(noise, 0.035) is None
 
 
-def test_too_little_of_a_dish_that_the_frame_cuts_off_tells_nothing():
+def test_a_dish_that_the_frame_cuts_off_too_far_is_not_found():
     gray = gray_of((322.0, 238.0), 8e-5, 0)
     circle = 322.0, 238.0, 217.0
     assert find_cut_dish(np.ascontiguousarray(gray[:, :240]), circle, 0.035) is None  # a third of its rim

@@ -239,7 +239,7 @@ def test_a_faint_ridge_shows_what_is_darker_or_what_is_paler_by_units_of_noise(p
     assert (above[4] < 0.0) == pale
 
 
-def test_a_thread_is_told_up_to_the_first_crossing_where_its_way_is_in_doubt():
+def test_a_thread_is_measured_up_to_the_first_ambiguous_crossing():
     points, path = np.column_stack([np.arange(101.0), np.zeros(101)]), np.zeros((51, 6))
     path[:, 5] = np.arange(51.0)  # in an image of half the size
     no_ridge: Any = None

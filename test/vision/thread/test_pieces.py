@@ -295,7 +295,7 @@ def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: b
 
 
 @pytest.mark.parametrize("bare", [False, True])
-def test_a_thread_seen_whole_is_complete_only_if_bare_floor_lies_beyond_its_end(bare: bool):
+def test_a_thread_is_complete_only_if_bare_floor_lies_beyond_its_end(bare: bool):
     needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
     image = np.full((480, 640), 225, np.uint8)
     cv2.line(image, (300, 240), (387, 240), 50, 5)
