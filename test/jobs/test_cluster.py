@@ -6,15 +6,16 @@ import importlib
 import json
 import os
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from unittest import mock
+from typing import cast
 
-import dask
 import pytest
-from distributed import LocalCluster
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
@@ -26,6 +27,7 @@ from magnetosuture_thread.jobs.evaluate import evaluate_bags
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.workers import WorkerDiedError, cluster, make_runner
+from magnetosuture_thread.workers.runner import Work
 from test.jobs.test_calibrate import SETUP, trajectory
 
 SOURCE = """
@@ -43,6 +45,7 @@ def work(task, log, progress):
         os._exit(9)
     return str(task), os.getpid()
 """
+ENDED_WORKERS = 5  # one by the task that ends its first worker, two by each of two tries of a fatal one
 PROCEDURE = """\
 setup: hernia_ring
 goals:
@@ -51,38 +54,57 @@ goals:
 
 
 @contextmanager
-def cluster_of_two(folder: Path) -> Iterator[str]:
-    """Give the address of a cluster of two processes, which find the module `work_of_tests`."""
+def cluster_of(workers: int, folder: Path) -> Iterator[str]:
+    """Give the address of a cluster of some processes, which find the module `work_of_tests`.
+
+    Nothing starts a worker again: Dask's nannies may fail at that where another one ends meanwhile.
+    """
     (folder / "work_of_tests.py").write_text(SOURCE)
-    once = dask.config.set({"distributed.scheduler.allowed-failures": 1})
-    # Dask leaves the environment of its workers in this process.
-    with mock.patch.dict(os.environ), pytest.MonkeyPatch.context() as patch, once:
-        patch.syspath_prepend(str(folder))
-        patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
-        with LocalCluster(n_workers=2, threads_per_worker=2, processes=True, dashboard_address="127.0.0.1:0") as local:
-            yield local.scheduler_address
+    paths = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
+    once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
+    environment = {**os.environ, **once, "PYTHONPATH": os.pathsep.join(paths)}
+    with (folder / "dask.log").open("wb") as log, ExitStack() as stack:
+        stack.enter_context(pytest.MonkeyPatch.context()).syspath_prepend(str(folder))
+
+        def start(name: str, *options: str) -> subprocess.Popen[bytes]:
+            command = [sys.executable, "-m", f"distributed.cli.{name}", *options, "--no-dashboard"]
+            process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            return process
+
+        # Should this process be killed, they end by themselves.
+        where = ("--host", "127.0.0.1", "--port", "0", "--idle-timeout", "10 minutes")
+        scheduler = start("dask_scheduler", *where, "--scheduler-file", str(folder / "scheduler"))
+        address = ""
+        while not address:
+            assert scheduler.poll() is None, (folder / "dask.log").read_text()
+            time.sleep(0.05)
+            with suppress(OSError, ValueError):  # not there yet, or only a part of it
+                address = str(json.loads((folder / "scheduler").read_text())["address"])
+        beside = ("--no-nanny", "--nthreads", "2", "--death-timeout", "60", "--local-directory", str(folder))
+        for _ in range(workers):
+            start("dask_worker", address, *beside)
+        yield address
+
+
+def work() -> Work:
+    """Return the function of `SOURCE`, by the name that workers find it by."""
+    return cast(Work, importlib.import_module("work_of_tests").work)
 
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Return the address of a cluster whose workers nothing ends."""
-    with cluster_of_two(tmp_path_factory.mktemp("work")) as address:
+    with cluster_of(2, tmp_path_factory.mktemp("work")) as address:
         yield address
 
 
-@pytest.fixture
-def mortal(tmp_path: Path) -> Iterator[str]:
-    """Return the address of a cluster whose workers tasks end; Dask may start no others after several of them."""
-    with cluster_of_two(tmp_path) as address:
-        yield address
-
-
-def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(mortal: str, tmp_path: Path):
-    work = importlib.import_module("work_of_tests").work
+def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(tmp_path: Path):
     lines: list[str] = []
     shares: list[float] = []
     tasks = [1, 2, tmp_path / "begun", 4]
-    with make_runner(work, 1, mortal) as runner:
+    with cluster_of(ENDED_WORKERS + 1, tmp_path) as address, make_runner(work(), 1, address) as runner:
         results = dict(runner.run(tasks, lines.append, shares.append))
         assert [results[index][0] for index in range(4)] == [str(task) for task in tasks]
         assert os.getpid() not in {process for _, process in results.values()}
@@ -151,9 +173,8 @@ def test_workers_with_other_software_are_refused(scheduler: str, monkeypatch: py
         make_runner(print, 1, scheduler).__enter__()
 
 
-def test_a_worker_that_has_other_software_later_is_refused_too(mortal: str, tmp_path: Path):
-    work = importlib.import_module("work_of_tests").work
-    with make_runner(work, 1, mortal) as runner:
+def test_a_worker_that_has_other_software_later_is_refused_too(tmp_path: Path):
+    with cluster_of(1, tmp_path) as address, make_runner(work(), 1, address) as runner:
         # On the path of the workers, before the NumPy that is there, as if it had been replaced.
         (tmp_path / "numpy-0.9.dist-info").mkdir()
         (tmp_path / "numpy-0.9.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 0.9\n")
