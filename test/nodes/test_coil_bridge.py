@@ -145,7 +145,8 @@ def test_silence_stops_the_coils_and_the_next_command_starts_them(graph):
     drive_until(graph, lambda: driven(node), "a current")
     graph.wait(lambda: not applied(node)[-1].any(), "zero current")
     graph.wait(lambda: any("no command for 0.1 s" in d.status[0].message for d in diagnostics), "the reason")
-    graph.wait(lambda: bool(currents) and currents[-1].stop == "no command for 0.1 s", "the reason with the currents")
+    # On a busy machine another reason may come after it.
+    graph.wait(lambda: "no command for 0.1 s" in [each.stop for each in currents], "the reason with the currents")
     drive_until(graph, lambda: np.any(currents[-1].current), "a current again")
 
 
