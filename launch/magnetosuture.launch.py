@@ -3,10 +3,12 @@
 The setup is one that ships with the package, by `setup:=NAME`, or a file of your own, by `setup_file:=PATH`. With
 `namespace:=NAME` all nodes are in a namespace. The coil bridge goes as far as the setup says; on hardware a person
 arms it. With `simulated:=true` a rig in software and a path follower come with them, and the bridge drives that rig and
-arms itself. With `planner:=true` procedures can be executed, and no path follower starts. With `console:=true` the
-operator's page is served on this machine. Where tf2_ros is installed, the dish's frame is published as that of
-`parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others. With `enclaves:=true`
-each process is in the SROS2 enclave of its name, below that of its namespace: see docs/how_to/security.md.
+arms itself, unless `autostart` is given. With `planner:=true` procedures can be executed, and no path follower starts.
+With `console:=true` the operator's page is served on this machine. Where tf2_ros is installed, the dish's frame is
+published as that of `parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others.
+With `enclaves:=true` each process is in the SROS2 enclave of its name, below that of its namespace: see
+docs/how_to/security.md. With `autostart:=inactive` or `autostart:=unconfigured` the lifecycle nodes go no farther by
+themselves, for a lifecycle manager or `ros2 lifecycle set`; else each goes as far as the setup says.
 
 What only looks comes back when its process dies: the camera's nodes and the operator's page. What moves the needle does
 not: a person arms the bridge, planner and path follower would begin anew amid a motion, and the scene server would
@@ -26,6 +28,7 @@ from launch_ros.actions import Node
 PACKAGE = "magnetosuture_thread"
 DEFAULT_SETUP = "petri_35mm_polyamide"
 RIG_NODES = ("rig_simulator", "path_follower")
+LIFECYCLE_NODES = ("scene_server", "perception", "coil_bridge", "needle_planner", "path_follower")
 RESPAWNED = ("perception", "console")
 RESPAWN_DELAY = 2.0  # s
 
@@ -50,6 +53,7 @@ def generate_launch_description() -> LaunchDescription:
         file = Path(given).expanduser() if given else folder / f"{LaunchConfiguration('setup').perform(context)}.yaml"
         if not file.is_file():
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
+        autostart = LaunchConfiguration("autostart").perform(context)
         planner, enclaves = (LaunchConfiguration(name).perform(context) == "true" for name in ("planner", "enclaves"))
         frame = LaunchConfiguration("parent_frame").perform(context)
         inner = LaunchConfiguration("namespace").perform(context)
@@ -60,13 +64,20 @@ def generate_launch_description() -> LaunchDescription:
         def ros_arguments(name: str) -> list[str]:
             return ["--enclave", "/" + "/".join([*outer, name])] if enclaves else []
 
-        return [*started(str(file.resolve()), planner, ros_arguments), *transforms(frame, ros_arguments)]
+        robot = started(str(file.resolve()), autostart, planner, ros_arguments)
+        return [*robot, *transforms(frame, ros_arguments)]
 
     return LaunchDescription(
         [
             argument("setup", DEFAULT_SETUP, "name of a setup that ships with the package", choices=names),
             argument("setup_file", "", "path of a setup of your own, in place of setup"),
             argument("namespace", "", "namespace of all nodes"),
+            argument(
+                "autostart",
+                "",
+                "state that the lifecycle nodes enter by themselves; empty: as the setup says",
+                choices=["", "unconfigured", "inactive", "active"],
+            ),
             argument("parent_frame", "map", "frame that the dish's is in; empty if others publish it"),
             switch("use_sim_time", "take the time from /clock"),
             switch("simulated", "with a rig in software"),
@@ -78,12 +89,21 @@ def generate_launch_description() -> LaunchDescription:
     )
 
 
-def started(file: str, planner: bool, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
-    """Return the nodes with a parameter file, the needle planner among them or not, and ROS arguments by their name."""
+def started(file: str, autostart: str, planner: bool, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
+    """Return the nodes with a parameter file.
+
+    Args:
+        file: the setup.
+        autostart: state that the lifecycle nodes enter by themselves; empty: as the setup says.
+        planner: whether the needle planner is among them, in place of the path follower.
+        ros_arguments: of a node, by its name.
+    """
     with_console = IfCondition(LaunchConfiguration("console"))
     with_rig, without = (condition(LaunchConfiguration("simulated")) for condition in (IfCondition, UnlessCondition))
 
     def node(name: str, *more: dict[str, str], named: bool = True, **options: object) -> Node:
+        if autostart and name in LIFECYCLE_NODES:
+            more = (*more, {"autostart": autostart})
         return Node(
             package=PACKAGE,
             executable=name,

@@ -77,6 +77,12 @@ def quantity(
     return field(default=default, metadata={"quantity": about})
 
 
+def autostart_parameter() -> Any:
+    """Return the dataclass field of a lifecycle node's parameter `autostart`."""
+    states = ("unconfigured", "inactive", "active")
+    return quantity("active", "state that the node enters by itself at start", choices=states)
+
+
 class Configuration:
     """Base of the configuration dataclasses: checks every field when an object is made.
 

@@ -17,6 +17,7 @@ SCENE_SERVER = "scene_server"  # besides, where the scene changes while the othe
 PROCESSES = ("perception", "coil_bridge")
 RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is simulated
 PLANNER = "needle_planner"  # besides, where procedures are executed
+STANDBY_NODES = ("vision_tracker", "thread_model", SCENE_SERVER, PLANNER, "path_follower")  # lifecycle, without boards
 ALL_NODES = (*NODES, SCENE_SERVER, PLANNER, *RIG_NODES)
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"

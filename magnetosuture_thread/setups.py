@@ -19,6 +19,7 @@ from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.scene.editing import SceneServerSettings
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
@@ -112,7 +113,7 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
         ConfigurationError: there is no such file, or it holds anything invalid.
     """
     path = find_setup_file(name)
-    settings = load_setup(path, SETTINGS_CLASSES)
+    settings = load_setup(path, (*SETTINGS_CLASSES, SceneServerSettings))
     _check_agreement(path, settings)
     setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
     if scene is not None:  # as of a bag, of which no path is followed

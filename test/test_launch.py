@@ -13,10 +13,23 @@ from typing import Any, ClassVar
 
 import pytest
 
-from magnetosuture_thread.interface import DISH_FRAME, NEEDLE_COMMAND, OPERATOR_COMMAND, PROCESSES, RIG_NODES
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.configuration import configuration_fields
+from magnetosuture_thread.interface import (
+    ALL_NODES,
+    DISH_FRAME,
+    NEEDLE_COMMAND,
+    NODES,
+    OPERATOR_COMMAND,
+    PROCESSES,
+    RIG_NODES,
+    STANDBY_NODES,
+)
 
 ROOT = Path(__file__).parent.parent
 INSTALLED: dict[str, str] = {}  # packages of the ROS installation
+LIFECYCLE = {"perception", "coil_bridge", *(set(STANDBY_NODES) & set(ALL_NODES) - set(NODES))}
+AUTOSTART = next(a.quantity.choices for a in configuration_fields(CoilBridgeSettings) if a.name == "autostart")
 SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 
 
@@ -110,6 +123,17 @@ def test_every_node_gets_the_same_file_and_namespace(description):
         assert node.namespace.name == "namespace"
     bridges = {node.condition.kind: node.parameters[2:] for node in started if node.executable == "coil_bridge"}
     assert bridges == {"unless": [], "if": [{"driver": "simulated", "autostart": "armed"}]}
+
+
+@pytest.mark.parametrize("planner", ["true", "false"])
+def test_lifecycle_nodes_alone_go_as_far_as_autostart_says(description, planner: str):
+    (choices,) = (e.choices for e in description if e.kind == "argument" and e.given[0] == "autostart")
+    assert choices == ["", *(state for state in AUTOSTART if state != "armed")]
+    for node in nodes(description, planner=planner, autostart="inactive"):
+        given: dict[str, str] = {}
+        for parameters in node.parameters[1:]:
+            given |= parameters
+        assert given.get("autostart") == ("inactive" if node.executable in LIFECYCLE else None)
 
 
 def test_a_planner_comes_in_place_of_the_path_follower(description):

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.guidance.follower import PathFollower
@@ -21,6 +21,7 @@ class PathFollowerSettings(Configuration):
 
     GROUP: ClassVar[str] = "path_follower"
 
+    autostart: str = autostart_parameter()
     waypoints: tuple[float, ...] = quantity(
         (),
         "waypoints of the tip after its initial position: x and y of each, in the dish frame",

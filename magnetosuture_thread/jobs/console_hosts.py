@@ -21,7 +21,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
-from magnetosuture_thread.jobs.simulate import FORECAST, SLOWER_BRIDGE, START_TIMEOUT
+from magnetosuture_thread.jobs.simulate import ACTIVE, FORECAST, SLOWER_BRIDGE, START_TIMEOUT
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import RECORDED_TOPICS, ConsoleTap
@@ -269,7 +269,8 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *SLOWER_BRIDGE, *SIMULATED_COILS, *FORECAST]
+        given = (*SLOWER_BRIDGE, *ACTIVE, *SIMULATED_COILS, *FORECAST)
+        arguments = ["--params-file", str(self.setup.path.resolve()), *given]
         # Here and not in another thread: the nodes end with the thread that has started them.
         processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
         self._nodes = NodeProcesses(processes, arguments, self._environment, self._logs).__enter__()

@@ -41,7 +41,7 @@ from magnetosuture_thread.jobs.replay_inputs import (
     replay_summary,
     write_results,
 )
-from magnetosuture_thread.jobs.simulate import SLOWER_BRIDGE
+from magnetosuture_thread.jobs.simulate import ACTIVE, SLOWER_BRIDGE
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.replay.clock import Timeline
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 # A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE)
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE, *ACTIVE)
 
 
 @dataclass(frozen=True)

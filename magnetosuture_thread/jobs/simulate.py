@@ -26,6 +26,7 @@ from magnetosuture_thread.interface import (
     SCENE,
     SCENE_MARKERS,
     SCENE_SERVER,
+    STANDBY_NODES,
     TIP_SETPOINT,
 )
 from magnetosuture_thread.jobs.output import whole_folder
@@ -68,6 +69,8 @@ SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
 FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
 # On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
 BRIDGE_AND_RECORDER = ("-p", "path_follower:audience:=2")
+# Whatever a setup says for a launch: nobody would activate the nodes of a job.
+ACTIVE = tuple(part for name in STANDBY_NODES for part in ("-p", f"{name}:autostart:=active"))
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
 
 # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
@@ -166,7 +169,7 @@ def _run(
     progress: Progress,
 ) -> str:
     """Run the graph and record it; return what went wrong, so that the bag stays."""
-    arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE]
+    arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE, *ACTIVE]
     if execution is not None:
         arguments += [*execution.scene_arguments, *FORECAST]
     if rate is not None:

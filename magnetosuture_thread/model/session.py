@@ -153,13 +153,18 @@ class ThreadSession:
 
     def __init__(self, settings: ThreadModelSettings, scene: Scene | None) -> None:
         self.settings, self.scene = settings, scene
+        # Obstacles may come later, and no callback shall wait for the compiler of what they need.
+        Workspace(_OBSTACLES, settings.margin_range)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the thread, as if nothing had come yet; settings and scene stay in force."""
+        settings, scene = self.settings, self.scene
         self._predictor = settings.predictor(scene)
         self._estimator = settings.estimator_session(scene)
         self._last_pose: int | None = None  # stamp of the last pose of the estimate [ns]
         self._late_estimates: list[PredictionResult] = []
         self._measured = False  # whether the camera ever measured the thread that is estimated
-        # Obstacles may come later, and no callback shall wait for the compiler of what they need.
-        Workspace(_OBSTACLES, settings.margin_range)
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.configuration import configuration_fields, quantity
+from magnetosuture_thread.configuration import autostart_parameter, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimator
 from magnetosuture_thread.model.estimator_settings import EstimatorSettings
@@ -34,12 +34,13 @@ OF_MEDIUM = {
     "bending_damping": "air",
     "gravity": "air",
 }
-FIXED = {  # why a node cannot change it
-    "formulation": "what is compiled when it starts",
-    "solver": "what is compiled when it starts",
-    "barriers": "what is imported when it starts",
-    "scene": "what it starts with; the topic scene changes it",
-    "forecast_horizon": "what is compiled when it starts",
+FIXED = {  # why a node cannot change it while it is configured
+    "autostart": "read at the start",
+    "formulation": "compiled when the node is configured",
+    "solver": "compiled when the node is configured",
+    "barriers": "imported when the node is configured",
+    "scene": "read when the node is configured; the topic scene changes it",
+    "forecast_horizon": "compiled when the node is configured",
 }
 
 
@@ -49,6 +50,7 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
 
     GROUP: ClassVar[str] = "thread_model"
 
+    autostart: str = autostart_parameter()
     scene: str = shared_parameter("scene")
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS

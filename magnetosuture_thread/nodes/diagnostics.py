@@ -35,7 +35,7 @@ class Health:
         self._node = node
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._publisher = DIAGNOSTICS.publisher(node)
-        self._level, self._text = DiagnosticStatus.OK, "starting"
+        self._level, self._text, self._standby = DiagnosticStatus.OK, "starting", ""
         self._refused = 0
         self._last_refusal = ""
         self._values: dict[str, object] = {}
@@ -55,6 +55,12 @@ class Health:
     def error(self, text: str, **values: object) -> None:
         """Report level ERROR: the node cannot do its work."""
         self._set(DiagnosticStatus.ERROR, text, values)
+
+    def stand_by(self, text: str) -> None:
+        """Report this at level WARN, whatever else there is to report; an empty text ends that."""
+        if text != self._standby:
+            self._standby = shortened(text, MAX_TEXT_CHARS)
+            self._publish_soon()
 
     def note(self, **values: object) -> None:
         """Keep values for the next report."""
@@ -91,9 +97,9 @@ class Health:
         """Publish the state now."""
         values = {**self._values, "refused": self._refused, "last refusal": self._last_refusal or "none"}
         status = DiagnosticStatus(
-            level=self._level,
+            level=DiagnosticStatus.WARN if self._standby else self._level,
             name=f"{self._node.get_fully_qualified_name().lstrip('/')}: state",
-            message=self._text,
+            message=self._standby or self._text,
             hardware_id="magnetosuture",
             values=[KeyValue(key=key, value=shortened(str(value), MAX_TEXT_CHARS)) for key, value in values.items()],
         )
@@ -108,8 +114,10 @@ class Health:
         changed = (level, text) != (self._level, self._text)
         self._level, self._text = level, text
         self._values.update(values)
-        if not changed:
-            return
+        if changed and not self._standby:
+            self._publish_soon()
+
+    def _publish_soon(self) -> None:
         if self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
             self.publish()
         elif self._late.is_canceled():

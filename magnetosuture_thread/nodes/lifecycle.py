@@ -1,27 +1,33 @@
-"""A managed node: its parameters are checked when it is configured, and stay as they are while it is."""
+"""Managed nodes: their parameters are checked when they are configured, and stay as they are while they are."""
 
 from __future__ import annotations
 
+import gc
 from abc import abstractmethod
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from magnetosuture_thread import ConfigurationError
-from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration
+from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration, configuration_fields
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes.node import PackageNode, reason_of
 from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.parameters import as_declared, declare, declare_unchecked, plain_value
 
 C = TypeVar("C", bound=Configuration)
+E = TypeVar("E", bound="Publisher | Subscription | Service | Timer")
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 ERROR = TransitionCallbackReturn.ERROR
+INACTIVE = "inactive: messages are not used until the node is activated"
 
 
 class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
@@ -30,43 +36,60 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     Args:
         name: of the node.
         settings: its configuration class.
+        fixed: parameters that stay while the node is configured, and why; all if None.
         options: for rclpy's node.
 
     Attributes:
-        settings: in force; None while unconfigured.
-        problem: why the last transition failed.
+        settings: as the node was configured with them; None while unconfigured.
+        problem: why the last transition failed, or why the parameters that were given are invalid.
     """
 
-    def __init__(self, name: str, settings: type[C], **options: Any) -> None:
+    def __init__(self, name: str, settings: type[C], *, fixed: Mapping[str, str] | None = None, **options: Any) -> None:
         self.settings: C | None = None
         super().__init__(name, **node_options(name, options))
-        self._class = settings
+        self._class, self._fixed = settings, fixed
         self.problem: Exception | None = None
+        self._starts = False
         # All can be set before the node is configured, which then says which of them are invalid.
-        with suppress(ConfigurationError):
-            declare(self, settings, read_only=False)
+        try:
+            self._declare()
+        except ConfigurationError as error:
+            self.problem = error
+            declare_unchecked(self, settings)
+        self.add_pre_set_parameters_callback(lambda parameters: as_declared(settings, parameters))
         self.add_on_set_parameters_callback(self._keep)
 
     @abstractmethod
-    def begin(self, settings: C) -> None:
+    def allocate(self, settings: C) -> None:
         """Allocate what the settings require; raise `MagnetosutureError` if that is impossible."""
 
     @abstractmethod
-    def resume(self) -> None:
+    def activate(self) -> None:
         """Become active; raise `MagnetosutureError` where that cannot be."""
 
     @abstractmethod
-    def pause(self) -> None:
+    def deactivate(self) -> None:
         """Become inactive; must not fail."""
 
     @abstractmethod
-    def end(self) -> None:
-        """Give all back that was taken in `begin`, also if that did not get to its end; must not fail."""
+    def release(self) -> None:
+        """Give all back that was taken in `allocate`, also if that did not get to its end; must not fail."""
+
+    @property
+    def configured_settings(self) -> C:
+        """The settings of a node that is configured."""
+        assert self.settings is not None
+        return self.settings
 
     @property
     def stage(self) -> str:
         """The state's name in ROS."""
         return str(self._state_machine.current_state[1])
+
+    @property
+    def is_shutting_down(self) -> bool:
+        """Whether the node is being finalized, and not only made inactive."""
+        return self.stage == "shuttingdown"
 
     @property
     def has_ended(self) -> bool:
@@ -99,7 +122,10 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             MagnetosutureError: a transition failed; the node is destroyed.
         """
         if self.get_parameter_or("autostart").value == "unconfigured":
+            if self.problem is not None:
+                self.get_logger().error(reason_of(self.problem))
             return
+        self._starts = True
         try:
             self.require(self.trigger_configure)
             if self.get_parameter("autostart").value != "inactive" and self.may_start():
@@ -107,14 +133,22 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         except BaseException:  # an interruption too: the driver may be open
             self.destroy_node()
             raise
+        finally:
+            self._starts = False
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""
         try:
-            settings = declare(self, self._class, read_only=False)
-            self.begin(settings)
+            settings = self._declare()
+            self.allocate(settings)
+            # The last one is called first: what is refused must not be prepared, and a barrier not imported.
+            self.remove_on_set_parameters_callback(self._keep)
+            self.add_on_set_parameters_callback(self._keep)
+            if not self._starts:  # as `run` does when the node has started
+                gc.collect()
+                gc.freeze()
         except Exception as error:  # rclpy would swallow it, and what was taken would stay
-            self.end()
+            self.release()
             return self._failed(error)
         self.settings = settings
         return SUCCESS
@@ -122,7 +156,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Become active."""
         try:
-            self.resume()
+            self.activate()
         except Exception as error:
             return self._failed(error)
         return SUCCESS
@@ -130,7 +164,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Become inactive; where even that fails, give all back."""
         try:
-            self.pause()
+            self.deactivate()
         except Exception as error:
             self.on_cleanup(state)
             self._failed(error)
@@ -139,14 +173,14 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give all back; the parameters can be set again."""
-        self.end()
+        self.release()
         self.settings = None
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give all back for good."""
         try:
-            self.pause()
+            self.deactivate()
         except Exception as error:
             self._failed(error)
         return self.on_cleanup(state)
@@ -163,21 +197,121 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def destroy_node(self) -> None:
         """Give all back, and leave the graph at once."""
         try:
-            self.end()
+            self.release()
         finally:
             super().destroy_node()
         # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
         self._state_machine.destroy_when_not_in_use()
 
+    def _declare(self) -> C:
+        fields = [about.name for about in configuration_fields(self._class)]
+        fixed = dict.fromkeys(fields, "") if self._fixed is None else self._fixed
+        return declare(self, self._class, read_only=False, fixed=fixed)
+
     def _failed(self, error: Exception) -> TransitionCallbackReturn:
         self.problem = error
-        self.get_logger().error(reason_of(error))
+        if not self._starts:  # at its start the node ends by this error
+            self.get_logger().error(reason_of(error))
         return FAILURE
 
     def _keep(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse to change settings under a configured node."""
-        held = [p.name for p in parameters if p.name.split(".")[0] not in ROS_PARAMETERS]
-        if self.settings is None or not held:
-            return SetParametersResult(successful=True)
-        error = ConfigurationError(held[0], "a change while configured", "a cleaned-up node")
-        return SetParametersResult(successful=False, reason=str(error))
+        """Refuse to change settings under a configured node; the value that is in force is no change."""
+        for parameter in parameters if self.settings is not None else ():
+            name, value = parameter.name, plain_value(parameter)
+            free = name.split(".")[0] in ROS_PARAMETERS or (self._fixed is not None and name not in self._fixed)
+            if not free and value != plain_value(self.get_parameter_or(name)):
+                shown = value[:10] if isinstance(value, list) else value  # a million entries take long to write
+                expected = "its value in force, until the node is cleaned up"
+                error = ConfigurationError(f"{self._class.GROUP}.{name}", shown, expected)
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+class StandbyNode(ManagedNode[C]):
+    """A managed node that uses messages, answers requests and commands only while it is active.
+
+    While it is not, its state on /diagnostics is that of its lifecycle. What others wait for, as its publishers, enters
+    the graph when it is configured, with everything loaded, and leaves when it is cleaned up: see `held`.
+
+    Attributes:
+        is_active: whether it is.
+    """
+
+    def __init__(self, name: str, settings: type[C], **options: Any) -> None:
+        self.is_active = False
+        self._held: list[Publisher | Subscription | Service | Timer] = []
+        super().__init__(name, settings, **options)
+
+    def held(self, entity: E) -> E:
+        """Return an entity of this node, after noting that it leaves the graph when the node is cleaned up."""
+        self._held.append(entity)
+        return entity
+
+    def release(self) -> None:
+        """Take what is held out of the graph; nodes with more to give back do that before."""
+        for entity in self._held:
+            if isinstance(entity, Publisher):
+                self.destroy_publisher(entity)
+            elif isinstance(entity, Subscription):
+                self.destroy_subscription(entity)
+            elif isinstance(entity, Service):
+                self.destroy_service(entity)
+            else:
+                self.destroy_timer(entity)
+        self._held.clear()
+
+    def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback of a subscription or timer that is called only while the node is active."""
+
+        def call(*arguments: Any) -> None:
+            if self.is_active:
+                callback(*arguments)
+
+        return call
+
+    def require_active(self) -> None:
+        """Refuse a request that only an active node can answer.
+
+        Raises:
+            GraphError: the node is not active.
+        """
+        if not self.is_active:
+            raise GraphError(f"{self.get_name()} is {self.stage}; activate it first")
+
+    def start(self) -> None:
+        """Go as far as the parameter `autostart` says; see `ManagedNode`."""
+        super().start()
+        if not self.is_active:
+            problem = f": {self.problem}" if self.problem else ""
+            self.health.stand_by(INACTIVE if self.stage == "inactive" else f"unconfigured{problem}")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters and allocate what they require."""
+        result = super().on_configure(state)
+        if not self._starts:
+            self.health.stand_by(INACTIVE if result is SUCCESS else f"unconfigured: {self.problem}")
+        return result
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become active."""
+        self.health.stand_by("")
+        result = super().on_activate(state)
+        self.is_active = result is SUCCESS
+        if not self.is_active:
+            self.health.stand_by(INACTIVE)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become inactive; where even that fails, give all back."""
+        result = super().on_deactivate(state)
+        self.is_active = False
+        self.health.stand_by(INACTIVE if result is SUCCESS else "unconfigured")
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give all back; the parameters can be set again."""
+        self.is_active = False
+        result = super().on_cleanup(state)
+        if self.context.ok():
+            self.health.stand_by("finalized" if self.is_shutting_down else "unconfigured")
+        return result

@@ -92,7 +92,7 @@ class GuardedNode(Node):
             if parameter.name == USE_SIM_TIME and self.clock_is_fixed:
                 now = self.get_parameter(USE_SIM_TIME).value
                 if parameter.value is not now:
-                    error = ConfigurationError(USE_SIM_TIME, parameter.value, f"{now}, as the node was started with")
+                    error = ConfigurationError(USE_SIM_TIME, parameter.value, f"{now}, as the node has now")
                     return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -150,7 +150,9 @@ class _GuardedCallback:
             answer = self._call(SetParameters.Request(parameters=[parameter]), SetParameters.Response())
         except Exception as error:
             return SetParametersResult(successful=False, reason=reason_of(error))
-        return answer.results[0]
+        result = answer.results[0]
+        result.reason = shortened(result.reason, 2 * MAX_REASON_CHARS)  # rclpy's own may hold a name from outside
+        return result
 
     def _log(self, reason: str) -> None:
         self._logger.warning(f"{self._name} refused: {reason}", throttle_duration_sec=LOG_PERIOD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -42,7 +43,7 @@ def _type(about: ConfigurationField) -> Parameter.Type:
     return _ARRAYS[about.entry] if about.kind is tuple else _TYPES[about.kind]
 
 
-def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[str, str] | None = None) -> C:
+def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[str, str] = MappingProxyType({})) -> C:
     """Declare every field of a configuration class and return the settings in force.
 
     The node must have been made with the options of `nodes/parameter_files.py`: only so is a parameter that was set
@@ -53,13 +54,14 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[
         node: that gets the parameters.
         cls: the configuration class.
         read_only: whether they stay as they are for good; else they can be declared again.
-        fixed: those that stay as they are all the same, and why, by name.
+        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
+            descriptions.
 
     Raises:
         ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds.
     """
     given = {
-        name: parameter.value
+        name: plain_value(parameter)
         for name, parameter in node.get_parameters_by_prefix("").items()
         if name.split(".")[0] not in ROS_PARAMETERS
     }
@@ -67,17 +69,56 @@ def declare(node: Node, cls: type[C], *, read_only: bool = True, fixed: Mapping[
     for name in sorted(given.keys() & set(SHARED_PARAMETERS) - known):
         node.undeclare_parameter(name)
         del given[name]
-    settings = from_mapping(cls, {name: _plain(value) for name, value in given.items()})
+    settings = from_mapping(cls, given)
     values = to_mapping(settings)
     for about in configuration_fields(cls):
         if about.name in given:
             node.undeclare_parameter(about.name)
-        descriptor = _descriptor(about, read_only, (fixed or {}).get(about.name, ""))
-        if values[about.name] == []:
-            _declare_empty(node, about, descriptor)
-        else:
-            node.declare_parameter(about.name, values[about.name], descriptor, ignore_override=True)
+        descriptor = _descriptor(about, read_only, fixed.get(about.name))
+        _declare(node, about, values[about.name], descriptor)
     return settings
+
+
+def declare_unchecked(node: Node, cls: type[Configuration]) -> None:
+    """Declare all fields of a node that `declare` refused, so that each can be set before `declare` is called again.
+
+    What was given stays, also where it is invalid, and may be set to a value of another type.
+    """
+    for about in configuration_fields(cls):
+        if not node.has_parameter(about.name):
+            _declare(node, about, about.default, _descriptor(about, False, None))
+        elif (value := plain_value(node.get_parameter(about.name))) not in (None, []):
+            node.undeclare_parameter(about.name)
+            node.declare_parameter(about.name, value, ParameterDescriptor(dynamic_typing=True), ignore_override=True)
+
+
+def as_declared(cls: type[C], parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does.
+
+    `ros2 param load` sends an empty list as one of truth values, and 1e-05, a text for YAML 1.1, as a text.
+
+    Args:
+        cls: the configuration class whose fields are declared.
+        parameters: to be set.
+    """
+    fields = {about.name: about for about in configuration_fields(cls)}
+    return [_converted(fields.get(parameter.name), parameter) for parameter in parameters]
+
+
+def _converted(about: ConfigurationField | None, parameter: Parameter) -> Parameter:
+    value = plain_value(parameter)
+    if about is None:
+        return parameter
+    if about.kind is tuple and value == []:
+        return Parameter(parameter.name, _type(about), [])
+    if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.INTEGER):
+        return Parameter(parameter.name, _type(about), float(value))
+    if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.STRING):
+        with suppress(ValueError):  # no number: refused by its type
+            return Parameter(parameter.name, _type(about), float(value))
+    if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.INTEGER_ARRAY):
+        return Parameter(parameter.name, _type(about), [float(entry) for entry in value])
+    return parameter
 
 
 class Changeable(Generic[C]):
@@ -105,6 +146,12 @@ class Changeable(Generic[C]):
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._put_in_force)
 
+    def close(self) -> None:
+        """Follow the parameters no more."""
+        self._node.remove_pre_set_parameters_callback(self._as_declared)
+        self._node.remove_on_set_parameters_callback(self._check)
+        self._node.remove_post_set_parameters_callback(self._put_in_force)
+
     def set(self, values: Mapping[str, Any]) -> None:
         """Set parameters together, as the service does.
 
@@ -119,30 +166,11 @@ class Changeable(Generic[C]):
             raise MagnetosutureError(result.reason)
 
     def _as_declared(self, parameters: Sequence[Parameter]) -> list[Parameter]:
-        """Take whole numbers for real ones and any empty list for an empty one of its kind, as `declare` does.
-
-        `ros2 param load` sends an empty list as one of truth values, and 1e-05, a text for YAML 1.1, as a text.
-        """
-        return [self._converted(parameter) for parameter in parameters]
-
-    def _converted(self, parameter: Parameter) -> Parameter:
-        about, value = self._about.get(parameter.name), _plain(parameter.value)
-        if about is None:
-            return parameter
-        if about.kind is tuple and value == []:
-            return Parameter(parameter.name, _type(about), [])
-        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.INTEGER):
-            return Parameter(parameter.name, _type(about), float(value))
-        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE, Parameter.Type.STRING):
-            with suppress(ValueError):  # no number: refused by its type
-                return Parameter(parameter.name, _type(about), float(value))
-        if (_type(about), parameter.type_) == (Parameter.Type.DOUBLE_ARRAY, Parameter.Type.INTEGER_ARRAY):
-            return Parameter(parameter.name, _type(about), [float(entry) for entry in value])
-        return parameter
+        return as_declared(type(self.settings), parameters)
 
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         self._agreed = None
-        asked = {entry.name: _plain(entry.value) for entry in parameters if entry.name in self._about}
+        asked = {entry.name: plain_value(entry) for entry in parameters if entry.name in self._about}
         if not asked:
             return SetParametersResult(successful=True)
         try:
@@ -178,29 +206,33 @@ def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
     )
 
 
-def _declare_empty(node: Node, about: ConfigurationField, descriptor: ParameterDescriptor) -> None:
-    """Declare a list that is empty: by its value alone rclpy would take it for one of bytes, for good."""
+def _declare(node: Node, about: ConfigurationField, value: Any, descriptor: ParameterDescriptor) -> None:
+    if not isinstance(value, (list, tuple)) or len(value):
+        node.declare_parameter(about.name, value, descriptor, ignore_override=True)
+        return
+    # By its value alone rclpy would take an empty list for one of bytes, for good.
     node.declare_parameter(about.name, _type(about), ParameterDescriptor(), ignore_override=True)
     node.set_parameters([Parameter(about.name, _type(about), [])])
     node.set_descriptor(about.name, descriptor)
 
 
-def _plain(value: Any) -> Any:
+def plain_value(parameter: Parameter) -> Any:
     """Return a parameter's value as YAML has it: an array as a list."""
+    value = parameter.value
     return list(value) if hasattr(value, "typecode") or isinstance(value, tuple) else value
 
 
-def _descriptor(about: ConfigurationField, read_only: bool, fixed: str) -> ParameterDescriptor:
-    quantity = about.quantity
+def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
+    quantity, why = about.quantity, f": {fixed}" if fixed else ""
     expectation = quantity.expectation(about.kind)
     descriptor = ParameterDescriptor(
         name=about.name,
         type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
-        additional_constraints=f"{expectation}; stays as the node was started with it: {fixed}"
-        if fixed
-        else expectation,
-        read_only=read_only or bool(fixed),
+        additional_constraints=expectation
+        if fixed is None
+        else f"{expectation}; stays while the node is configured{why}",
+        read_only=read_only,
     )
     if quantity.minimum is not None and quantity.maximum is not None:
         if about.kind is float:

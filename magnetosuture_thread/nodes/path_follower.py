@@ -5,43 +5,70 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Duration
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
+from magnetosuture_thread.guidance.follower import PathFollower
 from magnetosuture_thread.guidance.path import prepare_paths
 from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
-from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT, run
+from magnetosuture_thread.nodes.scene_follower import SceneFollower
 
 
-class PathFollowerNode(PackageNode):
-    """Publishes a velocity command for every needle pose; without poses the coil bridge times out."""
+class PathFollowerNode(StandbyNode[PathFollowerSettings]):
+    """Publishes a velocity command for every needle pose; without poses the coil bridge times out.
+
+    The path begins when the node has been configured and is first active; activated again, it is continued.
+    """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("path_follower", **node_options("path_follower", options))
-        settings = declare(self, PathFollowerSettings)
-        self._settings, self._follower = settings, settings.follower()
-        prepare_paths()
-        scene = initial_scene(settings.scene)
+        super().__init__("path_follower", PathFollowerSettings, **options)
+        self._follower: PathFollower | None = None
+        self._blocked = ""  # reason why the path cannot be followed
+        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self.start()
+
+    def allocate(self, settings: PathFollowerSettings) -> None:
+        """Check the path against the scene."""
+        scene = self._scene.load(settings.scene)
         if scene is not None:
             settings.check_path(scene)
-        self._blocked = ""  # reason why the path cannot be followed
-        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        prepare_paths()
+        self._follower, self._blocked = settings.follower(), ""
+        self._setpoints = self.held(topics.TIP_SETPOINT.publisher(self))
+        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
+        self.health.note(progress=0.0)
+
+    def activate(self) -> None:
+        """Begin the path, or go on with it."""
+        # While it is there a needle planner refuses to command beside it.
         self._commands = topics.NEEDLE_COMMAND.publisher(self)
-        self._setpoints = topics.TIP_SETPOINT.publisher(self)
-        topics.NEEDLE_POSE.subscribe(self, self.on_pose)
-        self.health.warn("no needle pose yet", progress=0.0)
+        self.health.warn("no needle pose yet")
+
+    def deactivate(self) -> None:
+        """Bring the needle to rest at once, and not when the last command times out."""
+        if self.is_active:
+            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), np.zeros(2)))
+            self._commands.wait_for_all_acked(Duration(seconds=DELIVERY_TIMEOUT))
+            self.destroy_publisher(self._commands)
+
+    def release(self) -> None:
+        """Give the path up."""
+        self._follower = None
+        super().release()
 
     def on_scene(self, scene: Scene) -> None:
         """Check the path against a new scene; a blocked path is not followed further."""
+        if self.settings is None:
+            return
         try:
-            self._settings.check_path(scene)
+            self.settings.check_path(scene)
         except ConfigurationError as error:
             self._blocked = str(error)
         else:
@@ -49,18 +76,19 @@ class PathFollowerNode(PackageNode):
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Publish the velocity command that moves the tip along its path."""
+        assert self._follower is not None  # the node is active
         if self._blocked:
             self.health.error(self._blocked)
             return
         subscribers = self._commands.get_subscription_count()
-        if subscribers < self._settings.audience:
-            some = f"{subscribers} of {self._settings.audience} subscribers to velocity commands"
+        if subscribers < self.configured_settings.audience:
+            some = f"{subscribers} of {self.configured_settings.audience} subscribers to velocity commands"
             self.health.warn(some if subscribers else "no subscriber to velocity commands")
             return
         try:
             pose = reading.needle_pose(message)
             now = self.get_clock().now().nanoseconds * 1e-9
-            reading.check_pose_age(pose.stamp, now, self._settings.pose_timeout)
+            reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
             command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
             self.health.refuse(error)

@@ -16,8 +16,10 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode
 from magnetosuture_thread.planning.session import ProcedureSession
+from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.texts import shortened
 
 MAX_DISTURBANCES = 20  # that are read of a message
@@ -33,17 +35,20 @@ class ProcedureInputs:
         hold_timeout: age beyond which a message on `procedure/hold` does not count [s].
     """
 
-    def __init__(self, node: PackageNode, session: ProcedureSession, hold_timeout: float) -> None:
+    def __init__(
+        self, node: StandbyNode[NeedlePlannerSettings], session: ProcedureSession, hold_timeout: float
+    ) -> None:
         self._node, self._session, self._hold_timeout = node, session, hold_timeout
         self._known = session.known
-        topics.TRACKER_STATE.subscribe(node, self.on_tracker)
+        node.held(topics.TRACKER_STATE.subscribe(node, node.while_active(self.on_tracker)))
         for topic, handle in (
             (topics.PREDICTED_THREAD, self.on_prediction),
             (topics.ESTIMATED_THREAD, self.on_estimate),
             (topics.MARGINS, self.on_margins),
         ):
-            topic.subscribe(node, _Sparing(node, topic, handle, lambda: session.is_active).take, raw=True)
-        topics.PROCEDURE_HOLD.subscribe(node, self.on_hold)
+            sparing = _Sparing(node, topic, handle, lambda: session.is_active)
+            node.held(topic.subscribe(node, node.while_active(sparing.take), raw=True))
+        node.held(topics.PROCEDURE_HOLD.subscribe(node, node.while_active(self.on_hold)))
 
     def on_tracker(self, message: TrackerState) -> None:
         """Register whether the needle is tracked."""

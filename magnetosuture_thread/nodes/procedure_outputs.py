@@ -9,10 +9,12 @@ from typing import Any
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
 
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.session import ProcedureSession, ProcedureStatus
+from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
@@ -34,12 +36,16 @@ class ProcedureOutputs:
         session: whose procedure it is.
     """
 
-    def __init__(self, node: PackageNode, session: ProcedureSession) -> None:
+    def __init__(self, node: StandbyNode[NeedlePlannerSettings], session: ProcedureSession) -> None:
         self._node, self._session = node, session
-        self._states = topics.PROCEDURE_STATE.publisher(node)
-        self._plans = topics.PROCEDURE_PLAN.publisher(node)
+        self._states = node.held(topics.PROCEDURE_STATE.publisher(node))
+        self._plans = node.held(topics.PROCEDURE_PLAN.publisher(node))
         self._published: tuple[Any, ...] = ()
         self._published_at = -math.inf
+
+    def repeat(self) -> None:
+        """Publish the state at the next call, also where it has not changed."""
+        self._published = ()
 
     def publish(self) -> StateMessage | None:
         """Publish what has changed; return the state if it was published."""

@@ -45,8 +45,8 @@ class SceneFollower:
         changed: Callable[[Scene], None] = lambda scene: None,
     ) -> None:
         self.scene = scene
-        self._heard = False
-        self._health, self._changed = health, changed
+        self._heard: Scene | None = None  # the last one of the topic, also where it was refused
+        self._node, self._health, self._changed = node, health, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
 
     @property
@@ -60,22 +60,25 @@ class SceneFollower:
         Raises:
             ConfigurationError: there is no such file, or it holds anything invalid.
         """
-        if not self._heard:
+        if self._heard is None:
             self.scene = initial_scene(name)
+        else:
+            self.scene = self._heard
+            if name:
+                self._node.get_logger().info(f"scene {self.version} of the topic, and not that of the parameter")
         return self.scene
 
     def on_scene(self, data: bytes) -> None:
         """Handle a published scene."""
         try:
-            scene = received_scene(data)
+            self._heard = scene = received_scene(data)
             if scene.version == self.version:
-                self._heard = True
                 return
             self._changed(scene)
         except MagnetosutureError as error:
             self._health.refuse(error)
             return
-        self.scene, self._heard = scene, True
+        self.scene = scene
 
 
 def received_scene(data: bytes) -> Scene:

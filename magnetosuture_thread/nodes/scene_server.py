@@ -8,39 +8,58 @@ from typing import Any
 
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
-from magnetosuture_thread import MagnetosutureError, Scene, read_scene
+from magnetosuture_thread import MagnetosutureError, Scene
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.scene_follower import initial_scene
 from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
 
-class SceneServerNode(PackageNode):
-    """Publishes the scene whenever it changes; an invalid change is refused with its reason and changes nothing."""
+class SceneServerNode(StandbyNode[SceneServerSettings]):
+    """Publishes the scene whenever it changes; an invalid change is refused with its reason and changes nothing.
+
+    Configured, it reads the scene of its parameter; activated again, it publishes the scene that is in force.
+    """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(SCENE_SERVER, automatically_declare_parameters_from_overrides=True, **options)
-        settings = declare(self, SceneServerSettings)
-        self._editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
-        self._scenes = topics.SCENE.publisher(self)
-        self._markers = topics.SCENE_MARKERS.publisher(self)
+        super().__init__(SCENE_SERVER, SceneServerSettings, **options)
+        self._editor = SceneEditor(None)
+        self.start()
+
+    def allocate(self, settings: SceneServerSettings) -> None:
+        """Read the scene."""
+        self._editor = SceneEditor(initial_scene(settings.scene))
+        self._scenes = self.held(topics.SCENE.publisher(self))
+        self._markers = self.held(topics.SCENE_MARKERS.publisher(self))
         self._offer(LoadScene, LOAD_SCENE, lambda asked: self._editor.load(asked.file))
         self._offer(EditShape, ADD_SHAPE, lambda asked: self._editor.add(asked.name, asked.shape))
         self._offer(EditShape, REPLACE_SHAPE, lambda asked: self._editor.replace(asked.name, asked.shape))
         self._offer(RemoveShape, REMOVE_SHAPE, lambda asked: self._editor.remove(asked.name))
+
+    def activate(self) -> None:
+        """Publish the scene."""
         if self._editor.scene is None:
             self.health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {LOAD_SCENE}")
         else:
             self._publish(self._editor.scene)
 
+    def deactivate(self) -> None:
+        """Publish no more; others go on by what they have."""
+
+    def release(self) -> None:
+        """Forget the scene, and the shapes that were added."""
+        self._editor = SceneEditor(None)
+        super().release()
+
     def _offer(self, service: Any, name: str, change: Callable[[Any], None]) -> None:
-        self.create_service(service, name, lambda asked, answer: self._change(answer, lambda: change(asked)))
+        self.held(self.create_service(service, name, lambda asked, answer: self._change(answer, lambda: change(asked))))
 
     def _change(self, answer: Any, change: Callable[[], None]) -> Any:
         """Change the scene, and say what became of it."""
+        self.require_active()
         before = self._editor.scene
         try:
             change()

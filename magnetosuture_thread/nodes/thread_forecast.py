@@ -28,8 +28,8 @@ from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_m
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.node import PackageNode
 
 MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
 MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
@@ -47,6 +47,7 @@ class ForecastTask(NamedTuple):
     commanded: np.ndarray
     horizon: float
     slowed: bool
+    generation: int
 
 
 class ThreadForecasts:
@@ -61,26 +62,32 @@ class ThreadForecasts:
         session: whose settings and scene are used.
     """
 
-    def __init__(self, node: PackageNode, session: ThreadSession) -> None:
+    def __init__(self, node: StandbyNode[ThreadModelSettings], session: ThreadSession) -> None:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
         self._started = -NEVER  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
-        self._published = topics.FORECAST.publisher(node)
-        self._markers = topics.THREAD_MARKERS.publisher(node)
-        topics.FILTER_STATE.subscribe(node, self.on_filter_state)
-        node.create_service(ForecastPath, FORECAST_PATH, self.on_path)
         self._forecaster()
+        self._generation = 0  # of the forecasts that are still wanted
+        self._published = node.held(topics.FORECAST.publisher(node))
+        self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
+        node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
+        node.held(node.create_service(ForecastPath, FORECAST_PATH, self.on_path))
         self._waiting: SimpleQueue[ForecastTask | None] = SimpleQueue()
         self._error: Exception | None = None
         self._worker = Thread(target=self._work, name="forecasts", daemon=True)
         self._worker.start()
 
     def close(self) -> None:
-        """Publish no more; to be called before the node is destroyed."""
+        """Publish no more; to be called before the publishers are destroyed."""
         self._waiting.put(None)
         self._worker.join()
+
+    def reset(self) -> None:
+        """Publish nothing until there is another estimate, nor what is being made."""
+        self._last, self._command = None, None
+        self._generation += 1
 
     def on_filter_state(self, message: object) -> None:
         """Remember the command that the bridge follows."""
@@ -113,7 +120,9 @@ class ThreadForecasts:
             _, commanded, filtered, source = self._command
         start = ForecastStart.of_estimate(result.estimate, pose, filtered)
         slowed = source == "operator" or settings.friction_feedback == "all"
-        self._waiting.put(ForecastTask(forecaster, result.stamp, start, commanded, settings.forecast_horizon, slowed))
+        horizon = settings.forecast_horizon
+        task = ForecastTask(forecaster, result.stamp, start, commanded, horizon, slowed, self._generation)
+        self._waiting.put(task)
 
     def _work(self) -> None:
         while self._error is None and (task := self._waiting.get()) is not None:
@@ -129,6 +138,8 @@ class ThreadForecasts:
         except MagnetosutureError as error:
             self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
             return
+        if task.generation != self._generation:
+            return
         when = MESSAGES.time(task.stamp)
         self._published.publish(forecast_message(MESSAGES, when, forecast))
         if self._markers.get_subscription_count():
@@ -138,8 +149,10 @@ class ThreadForecasts:
         """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
 
         Raises:
-            InvalidInputError: path, speed or horizon are out of bounds, or nothing is estimated yet.
+            MagnetosutureError: path, speed or horizon are out of bounds, nothing is estimated yet, or the node is not
+                active.
         """
+        self._node.require_active()
         settings = self._session.settings
         follower = make_path_follower(request, settings)
         forecaster = self._forecaster()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
-from magnetosuture_thread import InvalidInputError, ThreadEstimate
+from magnetosuture_thread import InvalidInputError, Scene, ThreadEstimate
 from magnetosuture_thread.model.prediction import STARTED
 from magnetosuture_thread.model.program import SOLVED
 from magnetosuture_thread.model.session import WAITING, PredictionResult
+from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes.diagnostics import Health
 
 UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning
@@ -80,3 +81,10 @@ class ThreadHealth:
         if estimate.problems:
             figures["last_refused_piece"] = estimate.problems[0]
         return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}
+
+
+def model_text(settings: ThreadModelSettings, scene: Scene | None) -> str:
+    """Return in words which thread is modelled, where and how."""
+    where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
+    thread = f"{settings.segments} segments of {settings.material}"
+    return f"{thread}, {where}, {settings.formulation} by {settings.solver}"

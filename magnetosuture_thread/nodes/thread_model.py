@@ -13,25 +13,27 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from magnetosuture_thread import InvalidInputError, NeedlePose, Scene
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.cdr import header_stamp, time_of
-from magnetosuture_thread.messages.markers import packed_markers
-from magnetosuture_thread.messages.packing import packed_estimate, packed_margins, packed_prediction
+from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
-from magnetosuture_thread.nodes.thread_health import ThreadHealth
+from magnetosuture_thread.nodes.thread_health import ThreadHealth, model_text
+from magnetosuture_thread.nodes.thread_outputs import ThreadOutputs
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.thread_observation import ThreadObservation
 
+LOADING = "loading the model's kernels; the first start on a machine compiles them"
 
-class ThreadModelNode(PackageNode):
+
+class ThreadModelNode(StandbyNode[ThreadModelSettings]):
     """Predicts and estimates the thread at every needle pose.
+
+    Activated again, it starts from the next measured thread. Parameters that are not `FIXED` can be changed in any
+    state.
 
     Args:
         listens: whether poses and observations of the thread come by topics; else a tracker in the same process
@@ -40,45 +42,70 @@ class ThreadModelNode(PackageNode):
     """
 
     def __init__(self, *, listens: bool = True, **options: Any) -> None:
-        super().__init__("thread_model", **node_options("thread_model", options))
-        settings = declare(self, ThreadModelSettings, read_only=False, fixed=FIXED)
-        self.get_logger().info("loading the model's kernels; the first start on a machine compiles them")
-        scene = initial_scene(settings.scene)
-        self._session = ThreadSession(settings, scene)
-        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        super().__init__("thread_model", ThreadModelSettings, fixed=FIXED, **options)
+        self._scene = SceneFollower(self, self.health, None, self.on_scene)
         self._states = ThreadHealth(self.health)
-        self._settings = ThreadSettings(self, self._session, self.health)
-        self._predicted = topics.PREDICTED_THREAD.publisher(self)
-        self._estimated = topics.ESTIMATED_THREAD.publisher(self)
-        self._margins = topics.MARGINS.publisher(self)
-        self._markers = topics.THREAD_MARKERS.publisher(self)
-        self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
+        self._changes: ThreadSettings | None = None
+        self._forecasts: ThreadForecasts | None = None
+        self._material: bytes | None = None  # that came while the node was unconfigured; each is applied once
+        topics.MATERIAL.subscribe(self, self.on_material, raw=True, unheard=self.health.refuse)
         self._observed = False
-        self._last_margins = 0  # stamp of those that were published [ns]
-        if listens:
-            self.listen()
-        self.health.warn("no needle pose yet")
-        where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
-        self.get_logger().info(
-            f"ready: {settings.segments} segments of {settings.material}, {where}, "
-            f"{settings.formulation} by {settings.solver}"
-        )
+        self._listens = listens
+        self.start()
 
-    def destroy_node(self) -> None:
-        """Leave the graph, once no forecast is being made."""
+    def allocate(self, settings: ThreadModelSettings) -> None:
+        """Make the model, and load its kernels."""
+        self.get_logger().info(LOADING)
+        scene = self._scene.load(settings.scene)
+        with self.health.busy(LOADING):
+            self._session = ThreadSession(settings, scene)
+            self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
+        self._changes = ThreadSettings(self, self._session, self.health)
+        if self._material is not None:
+            self._changes.on_material(self._material)
+            self._material = None
+        self._outputs = ThreadOutputs(self, self._session)
+        if self._listens:
+            self._subscribe()
+        self.get_logger().info(f"ready: {model_text(settings, scene)}")
+
+    def activate(self) -> None:
+        """Wait for a needle pose."""
+        self.health.warn("no needle pose yet")
+
+    def deactivate(self) -> None:
+        """Forget the thread, which moves meanwhile."""
+        if self._forecasts is not None:
+            self._forecasts.reset()
+        if not self.is_shutting_down:
+            self._session.reset()
+
+    def release(self) -> None:
+        """Give the model up, once no forecast is being made."""
         if self._forecasts is not None:
             self._forecasts.close()
-        super().destroy_node()
+        if self._changes is not None:
+            self._changes.close()
+        self._changes = self._forecasts = None
+        super().release()
 
     def listen(self) -> None:
-        """Subscribe to needle poses and to what is seen of the thread."""
-        topics.THREAD_OBSERVATION.subscribe(self, self.on_observation_message, raw=True)
-        topics.MEASURED_THREAD.subscribe(self, self.on_measured_thread_message, raw=True)
-        topics.NEEDLE_POSE.subscribe(self, self.on_pose)
+        """Take needle poses, and what is seen of the thread, by topics from now on."""
+        self._listens = True
+        if self.settings is not None:
+            self._subscribe()
+
+    def on_material(self, data: bytes) -> None:
+        """Handle a ThreadMaterial message; one that comes before the node is configured waits for that."""
+        if self._changes is None:
+            self._material = data
+        else:
+            self._changes.on_material(data)
 
     def on_scene(self, scene: Scene) -> None:
         """Change the scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
-        self._session.change(self._session.settings, scene)
+        if self.settings is not None:
+            self._session.change(self._session.settings, scene)
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Step the thread to a needle pose, or report why that is impossible."""
@@ -86,7 +113,14 @@ class ThreadModelNode(PackageNode):
 
     def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray) -> None:
         """Handle a pose handed over by a tracker in the same process, as its message would be."""
-        self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading, covariance))
+        if self.is_active:
+            self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading, covariance))
+
+    def _subscribe(self) -> None:
+        observation, measured = self.on_observation_message, self.on_measured_thread_message
+        self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
+        self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
+        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
 
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()
@@ -97,7 +131,7 @@ class ThreadModelNode(PackageNode):
             return
         result = self._session.predict(reading.nanoseconds(stamp), read)
         step_time = time.perf_counter() - began
-        self._publish_prediction(result, step_time)  # at once, as it is waited for
+        self._outputs.publish_prediction(result, step_time)  # at once, as it is waited for
         result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
@@ -129,47 +163,26 @@ class ThreadModelNode(PackageNode):
 
     def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
         """Handle an observation of the thread handed over by a tracker in the same process."""
-        self._report_all(self._session.on_observation(reading.nanoseconds(stamp), observation))
+        if self.is_active:
+            self._report_all(self._session.on_observation(reading.nanoseconds(stamp), observation))
 
     def _report_all(self, results: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()
         for result in results:
             step_time = time.perf_counter() - began
-            self._publish_prediction(result, step_time)
+            self._outputs.publish_prediction(result, step_time)
             self._report(result, step_time)
             began = time.perf_counter()
         for late in self._session.late_estimates():
             self._report(late, 0.0)
 
-    def _publish_prediction(self, result: PredictionResult, step_time: float) -> None:
-        if result.prediction is not None:
-            when, material = time_of(result.stamp), self._session.settings.material
-            self._predicted.publish(packed_prediction(when, result.prediction, material, step_time=step_time))
-
     def _report(self, result: PredictionResult, step_time: float) -> None:
-        """Publish estimate and margins of a pose or of a late observation, or why there are none.
-
-        No margin is published that is not proven.
-        """
+        """Publish estimate and margins of a pose or of a late observation, or why there are none."""
         if result.refused is not None:
             self.health.refuse(result.refused)
             return
-        if result.estimate is not None:
-            self._estimated.publish(packed_estimate(time_of(result.stamp), result.estimate))
-        if result.stamp >= self._last_margins or not result.late:  # those of an earlier frame are of no use any more
-            self._publish_margins(result)
+        self._outputs.publish_estimate(result)
         self._states.show(result, step_time)
-
-    def _publish_margins(self, result: PredictionResult) -> None:
-        if result.late and result.estimate is None:
-            return
-        when, margins, of_estimate = time_of(result.stamp), result.margins, result.estimate is not None
-        reason = "" if margins else result.reason
-        self._margins.publish(packed_margins(when, margins, reason, result.scene_version, of_estimate=of_estimate))
-        self._last_margins = result.stamp
-        if self._markers.get_subscription_count() and (result.prediction or result.estimate):
-            diameter = self._session.thread.diameter
-            self._markers.publish(packed_markers(when, result.prediction, margins, diameter, result.estimate))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -29,7 +29,10 @@ class ThreadSettings:
         self._node, self._session, self._health = node, session, health
         self._names = [about.name for about in configuration_fields(ThreadModelSettings)]
         self._parameters = Changeable(node, session.settings, self._prepare)
-        topics.MATERIAL.subscribe(node, self.on_material, raw=True, unheard=health.refuse)
+
+    def close(self) -> None:
+        """Change the settings no more."""
+        self._parameters.close()
 
     def on_material(self, data: bytes) -> None:
         """Apply a ThreadMaterial message, or report why it is refused."""

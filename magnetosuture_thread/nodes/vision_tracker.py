@@ -17,12 +17,11 @@ from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_observation, packed_path, packed_pose
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
 from magnetosuture_thread.nodes.run import run
-from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.tracker_health import NO_SCENE, TrackerHealth
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
@@ -31,7 +30,6 @@ from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
-NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 LOADING = "loading the tracker's kernels; the first start on a machine compiles them, for a minute or more"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
@@ -46,47 +44,63 @@ class Follower(Protocol):
         """Receive what is published as observation of the thread."""
 
 
-class VisionTrackerNode(PackageNode):
-    """Tracks the needle in every camera frame; when it is lost, no pose is published."""
+class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
+    """Tracks the needle in every camera frame; when it is lost, no pose is published.
+
+    Activated again, it finds needle and thread anew.
+    """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("vision_tracker", **node_options("vision_tracker", options))
-        settings = declare(self, VisionTrackerSettings)
-        self.get_logger().info(LOADING)
-        with self.health.busy(LOADING):
-            warm_up()
-        scene = initial_scene(settings.scene)
-        self._settings = settings
-        self._session = TrackerSession(settings, scene) if scene is not None else None
-        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
-        self._camera = CAMERA[settings.image_transport].name
-        self._words = "nothing seen"
+        super().__init__("vision_tracker", VisionTrackerSettings, **options)
+        self._session: TrackerSession | None = None
+        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self._words = TrackerHealth(self.health)
         self._lens: Lens | None = None
-        self._lens_problem = ""  # stays in the state until valid parameters come, as frames keep coming
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
-        self._poses = topics.NEEDLE_POSE.publisher(self)
-        self._states = topics.TRACKER_STATE.publisher(self)
         self._followers: list[Follower] = []
-        self._observations = topics.THREAD_OBSERVATION.publisher(self)
-        self._threads = topics.MEASURED_THREAD.publisher(self)
-        if settings.image_transport == "compressed":
-            topics.COMPRESSED_IMAGE.subscribe(self, self.on_compressed)
-        else:
-            topics.IMAGE.subscribe(self, self.on_image)
         topics.CAMERA_INFO.subscribe(self, self.on_camera_info)
-        self.create_timer(0.5 * SILENCE, self.on_watch, clock=self._steady)
-        self.health.warn("no camera frame yet" if scene is not None else NO_SCENE)
+        self.start()
+
+    def allocate(self, settings: VisionTrackerSettings) -> None:
+        """Load the kernels, and subscribe to the camera."""
+        self.get_logger().info(LOADING)
+        with self.health.busy(LOADING):
+            warm_up()
+        self._session = self._new_session(settings, self._scene.load(settings.scene))
+        self._camera = CAMERA[settings.image_transport].name
+        self._poses = self.held(topics.NEEDLE_POSE.publisher(self))
+        self._states = self.held(topics.TRACKER_STATE.publisher(self))
+        self._observations = self.held(topics.THREAD_OBSERVATION.publisher(self))
+        self._threads = self.held(topics.MEASURED_THREAD.publisher(self))
+        if settings.image_transport == "compressed":
+            self.held(topics.COMPRESSED_IMAGE.subscribe(self, self.while_active(self.on_compressed)))
+        else:
+            self.held(topics.IMAGE.subscribe(self, self.while_active(self.on_image)))
+        self.held(self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=self._steady))
         self.get_logger().info(f"ready: frames from {self.resolve_topic_name(self._camera)}")
+
+    def activate(self) -> None:
+        """Look for needle and thread in the next frame."""
+        self._words.begin(self._session)
+
+    def deactivate(self) -> None:
+        """Forget needle and thread, which move meanwhile."""
+        if not self.is_shutting_down:
+            self._session = self._new_session(self.configured_settings, self._scene.scene)
+
+    def release(self) -> None:
+        """Leave the camera."""
+        self._session = None
+        super().release()
 
     def on_scene(self, scene: Scene) -> None:
         """Look for the needle in another scene."""
-        if self._session is None:
-            self._session = TrackerSession(self._settings, scene)
-            self._session.set_lens(self._lens)
-        else:
+        if self._session is not None:
             self._session.set_scene(scene)
+        elif self.settings is not None:
+            self._session = self._new_session(self.settings, scene)
 
     def hand_to(self, follower: Follower) -> None:
         """Hand every pose and observation of the thread to a follower in the same process, once it is published."""
@@ -98,17 +112,15 @@ class VisionTrackerNode(PackageNode):
 
     def on_image(self, message: Image) -> None:
         """Track the needle in a raw frame."""
-        self._take(
-            message,
-            lambda: unpack_image(message.data, message.height, message.width, message.step, message.encoding),
-        )
+        size = message.height, message.width, message.step
+        self._take(message, lambda: unpack_image(message.data, *size, message.encoding))
 
     def on_camera_info(self, message: CameraInfo) -> None:
         """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
         try:
-            self._lens, self._lens_problem = lens_of(message), ""
+            self._lens, self._words.lens_problem = lens_of(message), ""
         except InvalidInputError as error:
-            self._lens, self._lens_problem = None, str(error)
+            self._lens, self._words.lens_problem = None, str(error)
             self.health.refuse(error)
         if self._session is not None:
             self._session.set_lens(self._lens)
@@ -120,7 +132,14 @@ class VisionTrackerNode(PackageNode):
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(MESSAGES.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
-            self.health.warn("; ".join(filter(None, (reason, f"before that {self._words}", self._lens_problem))))
+            self._words.show_silence(reason)
+
+    def _new_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> TrackerSession | None:
+        if scene is None:
+            return None
+        session = TrackerSession(settings, scene)
+        session.set_lens(self._lens)
+        return session
 
     def _arrival(self) -> float:
         return float(self._steady.now().nanoseconds * 1e-9)
@@ -160,21 +179,7 @@ class VisionTrackerNode(PackageNode):
             if len(seen.centreline):
                 self._threads.publish(packed_path(when, seen.centreline))
         self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
-        values: dict[str, Any] = {"frames": self._session.frames, "tracked": self._session.tracked}
-        if track.needle_length is not None:
-            values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
-        if seen.problem is not None:
-            self.health.refuse(seen.problem, **values)
-        elif seen.tracked:
-            values["confidence"] = round(track.confidence, 3)
-            self._words = f"tracking; {track.warning}" if track.warning else "tracking"
-            if self._lens_problem:
-                self.health.warn(f"{self._words}; {self._lens_problem}", **values)
-            else:
-                (self.health.warn if track.warning else self.health.ok)(self._words, **values)
-        else:
-            self._words = f"{track.state.value}: {track.reason}"
-            self.health.warn(self._words, **values)
+        self._words.show(seen, self._session)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.planning.executor import MAX_WAIT
 from magnetosuture_thread.planning.planner import NeedlePlanner
@@ -20,6 +20,7 @@ class NeedlePlannerSettings(Configuration):
 
     GROUP: ClassVar[str] = "needle_planner"
 
+    autostart: str = autostart_parameter()
     scene: str = shared_parameter("scene")
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")

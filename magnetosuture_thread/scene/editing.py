@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from magnetosuture_thread.configuration import Configuration
+from magnetosuture_thread.configuration import Configuration, autostart_parameter
 from magnetosuture_thread.scene.files import parse_yaml, read_scene
 from magnetosuture_thread.scene.mapping import shape_from_mapping
 from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, Scene, SceneShape, scene_error
@@ -18,6 +18,7 @@ class SceneServerSettings(Configuration):
 
     GROUP: ClassVar[str] = "scene_server"
 
+    autostart: str = autostart_parameter()
     scene: str = shared_parameter("scene")
 
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.shared_parameters import shared_parameter
@@ -24,6 +24,7 @@ class VisionTrackerSettings(Configuration):
 
     GROUP: ClassVar[str] = "vision_tracker"
 
+    autostart: str = autostart_parameter()
     image_transport: str = quantity("compressed", "which camera topic to take", choices=("raw", "compressed"))
     scene: str = shared_parameter("scene")
     needle_length: float = shared_parameter("needle_length")

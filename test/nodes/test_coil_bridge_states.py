@@ -215,7 +215,7 @@ def test_bad_parameters_refuse_to_configure_until_they_are_mended(graph):
     assert change(graph, Transition.TRANSITION_CONFIGURE)
     refused = set_parameter(graph, "max_current", 50.0)
     assert not refused.successful
-    assert "a cleaned-up node" in refused.reason
+    assert "expected its value in force, until the node is cleaned up" in refused.reason
     assert change(graph, Transition.TRANSITION_CLEANUP)
     assert set_parameter(graph, "max_current", 5.0).successful
     assert change(graph, Transition.TRANSITION_CONFIGURE)

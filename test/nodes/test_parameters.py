@@ -26,7 +26,8 @@ def test_every_setting_is_a_described_parameter(graph):
     node = graph.add(ThreadModelNode, segments=30, thread_length=0.02)
     for about in configuration_fields(ThreadModelSettings):
         descriptor = node.describe_parameter(about.name)
-        assert descriptor.read_only == (about.name in FIXED)
+        assert (FIXED.get(about.name, "?") in descriptor.additional_constraints) == (about.name in FIXED)
+        assert not descriptor.read_only
         assert about.quantity.description in descriptor.description
         if about.quantity.unit:
             assert about.quantity.unit in descriptor.description
@@ -40,10 +41,16 @@ def test_every_setting_is_a_described_parameter(graph):
     assert node.describe_parameter("fixed_nodes").type == node.get_parameter("fixed_nodes").type_.value == 7
 
 
-def test_what_stays_for_good_is_read_only_and_says_why(graph):
+def test_what_stays_while_the_node_is_configured_says_why(graph):
     node = graph.add(ThreadModelNode)
-    assert "compiled when it starts" in node.describe_parameter("formulation").additional_constraints
-    assert not node.set_parameters([Parameter("formulation", value="paper")])[0].successful
+    why = node.describe_parameter("formulation").additional_constraints
+    assert why.endswith("; stays while the node is configured: compiled when the node is configured")
+    refused = node.set_parameters([Parameter("formulation", value="paper")])[0]
+    assert not refused.successful
+    assert refused.reason == (
+        "thread_model.formulation: got 'paper', expected its value in force, until the node is cleaned up"
+    )
+    assert node.set_parameters([Parameter("formulation", value="rod")])[0].successful  # which is no change
     tracker = graph.add(VisionTrackerNode)
     refused = tracker.set_parameters([Parameter("needle_length", value=0.01)])[0]
     assert not refused.successful
@@ -73,7 +80,7 @@ class Kitchen:
 
     def __init__(self, node: Node) -> None:
         self.node, self.in_force, self.refusal = node, Oven(), ""
-        declare(node, Oven, read_only=False, fixed={"trays": "they are screwed in"})
+        declare(node, Oven, read_only=False)
         self.changeable = Changeable(node, self.in_force, self._prepare)
 
     def _prepare(self, settings: Oven) -> Callable[[], None]:
@@ -126,8 +133,6 @@ def test_whole_numbers_and_empty_lists_are_taken_as_in_a_file(kitchen):
         ({"temperature": math.inf}, "out of range"),
         ({"temperature": "hot"}, "Wrong parameter type"),
         ({"temperature": None}, "cannot be undeclared"),
-        ({"trays": 3}, "read-only"),
-        ({"temperature": 350.0, "trays": 3}, "read-only"),
         ({"dishes": [1.0, math.nan]}, "oven.dishes: got .*nan.*, expected a list from 0 to 9 kg"),
         ({"dishes": [10**30]}, ""),
         ({"dishes": [1.0] * 5000}, "oven.dishes: got '5000 entries', expected at most 1000"),

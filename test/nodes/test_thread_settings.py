@@ -204,10 +204,10 @@ def test_a_material_comes_by_topic_and_is_parameters_then(graph):
         ({"material": "steel"}, "thread_model.material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
         ({"segments": 400}, "longer than thick"),
         ({"fixed_nodes": [1] * 200_000}, "200000 entries"),
-        ({"scene": "dish_35mm"}, "read-only"),
+        ({"scene": "dish_35mm"}, "expected its value in force, until the node is cleaned up"),
         ({"gravity": [0.0, -9.8]}, "medium: air only"),
-        ({"formulation": "paper"}, "read-only"),
-        ({"viscosity": 0.5, "solver": "osqp"}, "read-only"),
+        ({"formulation": "paper"}, "expected its value in force"),
+        ({"viscosity": 0.5, "solver": "osqp"}, "thread_model.solver: got 'osqp', expected its value in force"),
         ({"lenght": 0.02}, ""),
     ],
 )
@@ -373,6 +373,6 @@ def test_bytes_that_are_no_message_are_refused_and_end_nothing(graph):
     whole = serialize_message(MESSAGES.scene_message(graph.now(), scene_with(POST)))
     for data in (b"", whole[:-3], whole[:16], b"\x00\x01\x00\x00" + b"\xff" * 40):
         bench.node._scene.on_scene(data)
-        bench.node._settings.on_material(data[:20])
+        bench.node._changes.on_material(data[:20])
     graph.wait(lambda: bench.refusals() >= 8, "the refusals")
     bench.show(2)

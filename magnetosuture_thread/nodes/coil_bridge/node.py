@@ -55,7 +55,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
 
-    def begin(self, settings: CoilBridgeSettings) -> None:
+    def allocate(self, settings: CoilBridgeSettings) -> None:
         """Open the driver; from now on it receives zeros periodically."""
         self.system.check_barriers(settings.barriers)
         self.system.recall(stop_record(self))
@@ -66,22 +66,22 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
         self._pull.follow(bridge)
 
-    def resume(self) -> None:
+    def activate(self) -> None:
         """Activate, so that the bridge can be armed."""
         self.system.latch.activate()
 
-    def pause(self) -> None:
+    def deactivate(self) -> None:
         """Stop at once; activation and arming are needed again."""
         self._rest(self.system.latch.deactivate)
 
-    def end(self) -> None:
+    def release(self) -> None:
         """Set the coils to zero, close the driver, and publish that."""
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
         self._watchdog, self._reactivate = None, False
         self._pull.follow(None)
         self._stamps.clear()
-        ends = self.stage in ("shuttingdown", FINALIZED)
+        ends = self.is_shutting_down or self.has_ended
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
         if ends:
             self._report.report_unless(partial(self.system.remember, ends=True))
