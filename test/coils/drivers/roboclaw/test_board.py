@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
 from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
 from magnetosuture_thread.coils.drivers.roboclaw import protocol
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
@@ -204,7 +205,9 @@ def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_late
     made = board(port)
     made.voltage = 24.0
     expires = time.monotonic() + 0.2
-    commanded = iter([(np.array([3.0, -6.0]), expires), (None, math.inf)])
+    commanded = itertools.chain([(np.array([3.0, -6.0]), expires)], itertools.repeat((None, math.inf)))
+    # On a busy machine the board may get a packet so slowly that it drops it; here it is asked until it answers.
+    monkeypatch.setattr(board_module, "MAX_ATTEMPTS", 100)
 
     def stopped(size: int) -> None:
         if size == stopped_before and time.monotonic() < expires:
@@ -221,7 +224,6 @@ def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_late
     monkeypatch.setattr(port_module, "select", SimpleNamespace(select=late_select))
     monkeypatch.setattr(port_module, "_write", late_write)
     made.write(lambda: next(commanded))
-    assert next(commanded, None) is None
     assert not there.timeline
     assert there.heard > expires
 
