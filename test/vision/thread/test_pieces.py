@@ -21,10 +21,16 @@ from magnetosuture_thread.vision.needle.arc import Arc
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.appearance import MIN_SHARE, Appearance, appearance_of, respaced
-from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding
+from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding, _fit_light, _mark_unlike
 from magnetosuture_thread.vision.thread.observe import observe
 from magnetosuture_thread.vision.thread.order import Piece, find_order
 from magnetosuture_thread.vision.thread.piece_ends import BARE_COLOUR, is_bare_beyond
+from magnetosuture_thread.vision.thread.profiles import (
+    integrate_across,
+    middle_strengths,
+    sample_across,
+    usual_profile,
+)
 from magnetosuture_thread.vision.thread.strands import Strand, first_clear_of, strand_along
 from magnetosuture_thread.vision.tracker import VisionTracker
 
@@ -320,3 +326,75 @@ def test_a_piece_whose_place_is_unknown_has_no_direction():
     assert (first.arc_length, first.direction_known) == ((0.0, 0.0), True)
     assert [np.isnan(piece.arc_length[0]) for piece in others] == [True]
     assert not others[0].direction_known
+
+
+def test_profiles_are_taken_across_a_line_from_its_left_to_its_right():
+    image = (20.0 + 2.0 * np.arange(60) + np.arange(50)[:, None]).astype(np.uint8)
+    points, aside = np.linspace((10.0, 10.0), (40.0, 30.0), 31), np.linspace(-4.0, 4.0, 9)
+    profiles = np.empty((3, 9))
+    sample_across(image, points, np.array([0, 12, 30]), aside, profiles)
+    right = np.array([-20.0, 30.0]) / np.hypot(20.0, 30.0)
+    at = points[[0, 12, 30], None] + aside[:, None] * right
+    np.testing.assert_allclose(profiles, 20.0 + at @ (2.0, 1.0), atol=1e-9)
+
+
+def test_the_usual_profile_is_that_of_most_above_the_floor_beside_each():
+    aside = np.arange(-8.0, 8.5, 0.5)
+    shape = -60.0 * np.exp(-0.5 * aside**2)
+    profiles = shape + np.array([200.0, 150.0, 120.0, 90.0, 180.0])[:, None]
+    profiles[1, 16:] += 80.0  # an edge
+    usual = np.empty(33)
+    usual_profile(profiles, aside, 4.0, usual)
+    np.testing.assert_allclose(usual, shape, atol=0.05)
+
+
+@pytest.mark.parametrize("pale", [False, True])
+def test_the_integral_across_a_thread_is_its_share_of_the_floors_light_times_its_width(pale: bool):
+    image = np.full((60, 80), 100, np.uint8)
+    image[28:32] = 140 if pale else 60
+    points = np.column_stack([np.arange(10.0, 70.0, 2.0), np.full(30, 29.5)])
+    values = np.empty(2)
+    integrate_across(image, points, np.array([3, 20]), 8.0, 0.5, pale, values)
+    np.testing.assert_allclose(values, 0.4 * 4.0, rtol=0.03)
+
+
+@pytest.mark.parametrize("pale", [False, True])
+def test_a_line_is_as_strong_as_on_its_side_that_differs_more_or_less(pale: bool):
+    image = np.full((60, 80), 100, np.int64)
+    image[:29] = 130
+    image[28:31] = 40
+    image = 200 - image if pale else image
+    points = np.column_stack([np.arange(10.0, 70.0, 2.0), np.full(30, 29.0)])
+    for two_sided, expected in ((False, 90.0), (True, 60.0)):
+        values = np.empty(30)
+        middle_strengths(image.astype(np.uint8), points, 5.0, pale, two_sided, values)
+        np.testing.assert_allclose(values, expected)
+    aside = np.empty(30)
+    middle_strengths(image.astype(np.uint8), points - (0.0, 2.0), 5.0, pale, False, aside)
+    np.testing.assert_allclose(aside, 90.0)  # as its middle is looked for up to a pixel aside
+    middle_strengths(image.astype(np.uint8), np.add(points, (0.0, 2.0)), 5.0, pale, True, aside)
+    np.testing.assert_allclose(aside, 60.0)
+
+
+def test_the_floors_light_is_that_of_most_cells_whatever_lies_on_the_others():
+    random = np.random.default_rng(4)
+    places = np.column_stack([np.ones(600), random.uniform(-1.0, 1.0, (600, 2))])
+    given = np.array([[180.0, 150.0], [12.0, -6.0], [-8.0, 5.0]])
+    values = places @ given + random.normal(0.0, 1.0, (600, 2))
+    values[::4] += 60.0
+    values[1::7] = 20.0
+    weights = np.empty((3, 2))
+    _fit_light(places, values, weights)
+    np.testing.assert_allclose(weights, given, atol=0.5)
+
+
+def test_what_is_brighter_or_darker_or_of_another_colour_within_the_dish_is_no_floor():
+    light = np.full((20, 30, 3), 100.0, np.float32)
+    small = light.astype(np.uint8)
+    small[4, 10:13], small[8, 10:13], small[12, 10:13], small[16, 10:13] = 110, 90, (104, 100, 96), 104
+    small[10, 1], small[10, 28] = 150, 150  # at the distances 39 and 42 from the centre
+    found = np.zeros((20, 30), np.uint8)
+    _mark_unlike(small, light, (0.05, 0.06), (42.0, 30.0, 41.0), found)
+    expected = np.zeros_like(found)
+    expected[[4, 8, 12], 10:13] = expected[10, 1] = 1
+    np.testing.assert_array_equal(found, expected)
