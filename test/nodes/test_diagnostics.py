@@ -49,6 +49,7 @@ def test_a_change_that_comes_too_soon_is_said_a_moment_later_and_not_lost(graph,
         health.warn(text)
     graph.wait(lambda: any(d.status[0].message == "third" for d in said), "the last change")
     assert "second" not in [d.status[0].message for d in said]
+    graph.wait(health._late.is_canceled, "the end of the late reports")
 
 
 def test_that_a_node_stands_by_is_reported_at_once_as_a_warning_whatever_else_there_is(graph, monkeypatch):

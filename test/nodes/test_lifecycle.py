@@ -367,6 +367,13 @@ def test_a_scene_that_comes_before_a_node_is_configured_or_active_counts(
     assert SCENES[name](node) == second.version
 
 
+def test_a_tracker_that_was_configured_without_a_scene_takes_one_while_inactive(graph: Graph):
+    node = graph.add(VisionTrackerNode, autostart="inactive")
+    scene = read_scene("dish_50mm")
+    place(graph, node, scene)
+    assert SCENES["vision_tracker"](node) == scene.version
+
+
 @pytest.mark.parametrize("name", NODES)
 def test_it_is_found_in_the_graph_when_everything_is_loaded(graph: Graph, name: str, monkeypatch: pytest.MonkeyPatch):
     """Who waits for its topics, as a replay does, would play into a node that still compiles."""
@@ -568,7 +575,10 @@ def test_a_procedure_is_given_up_when_its_planner_is_deactivated(graph: Graph, b
     graph.wait(result.done, "the result")
     assert result.result().result.reason == "needle_planner is inactive; activate it first"
     assert len(bench.commands) == count
+    published = len(bench.states)
     change(graph, "needle_planner", ACTIVATE)
+    graph.wait(lambda: len(bench.states) > published, "how it ended, once more")
+    assert len(bench.commands) == count  # it has stopped the needle once
     assert bench.send(FAR).accepted
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "another procedure")
 
