@@ -215,7 +215,9 @@ def test_whatever_is_refused_an_inactive_node_reports_that_it_is_inactive(graph:
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_its_scene_can_be_set_before_it_is_configured_and_not_after(graph: Graph, name: str):
+def test_its_scene_can_be_set_before_it_is_configured_and_not_after(
+    graph: Graph, name: str, capfd: pytest.CaptureFixture[str]
+):
     make, parameters = NODES[name]
     reports = graph.listen_later(topics.DIAGNOSTICS)
     node = graph.add(make, autostart="unconfigured", **{**parameters, "scene": "elsewhere"})
@@ -223,6 +225,7 @@ def test_its_scene_can_be_set_before_it_is_configured_and_not_after(graph: Graph
     assert not called(graph, ChangeState, f"{name}/change_state", request).success
     assert isinstance(node.problem, ConfigurationError)
     graph.wait(lambda: "unconfigured: scene: got 'elsewhere'" in state_of(reports), "the reason")
+    assert "scene: got 'elsewhere'" in capfd.readouterr().err
     assert node.set_parameters([Parameter("scene", value="dish_35mm_post")])[0].successful
     change(graph, name, CONFIGURE)
     refused = node.set_parameters([Parameter("scene", value="dish_50mm")])[0]
