@@ -121,8 +121,25 @@ def test_every_node_gets_the_same_file_and_namespace(description):
         assert node.name == (None if node.executable == "perception" else node.executable)
         assert node.parameters[0] == str(ROOT / "config" / "hernia_ring.yaml")
         assert node.namespace.name == "namespace"
+        assert node.parameters[1]["use_sim_time"].name == "use_sim_time"
     bridges = {node.condition.kind: node.parameters[2:] for node in started if node.executable == "coil_bridge"}
     assert bridges == {"unless": [], "if": [{"driver": "simulated", "autostart": "armed"}]}
+
+
+@pytest.mark.parametrize("planner", ["true", "false"])
+def test_the_rig_comes_where_the_robot_is_simulated_and_the_page_where_it_is_asked_for(description, planner: str):
+    simulated, console = ("if", "simulated"), ("if", "console")
+    expected = {
+        **{name: [None] for name in ("scene_server", "perception", "needle_planner")},
+        **{name: [simulated] for name in RIG_NODES},
+        "coil_bridge": [("unless", "simulated"), simulated],
+        "console": [console],
+    }
+    found: dict[str, list[tuple[str, str] | None]] = {}
+    for node in nodes(description, planner=planner):
+        condition = getattr(node, "condition", None)
+        found.setdefault(node.executable, []).append(condition and (condition.kind, condition.given[0].name))
+    assert found == {name: expected[name] for name in found}
 
 
 @pytest.mark.parametrize("planner", ["true", "false"])
@@ -183,9 +200,13 @@ def test_what_moves_the_needle_never_comes_back_by_itself(description):
     assert documented == {name: "yes" if name in respawned else "no" for name in started}
 
 
-def test_a_file_of_ones_own_comes_in_place_of_a_name_and_must_be_there(description, tmp_path: Path):
+def test_a_file_of_ones_own_comes_in_place_of_a_name_and_must_be_there(
+    description, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     mine = tmp_path / "mine.yaml"
     mine.write_text("")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert {node.parameters[0] for node in nodes(description, setup_file="~/mine.yaml")} == {str(mine)}
     assert {node.parameters[0] for node in nodes(description, setup_file=str(mine))} == {str(mine)}
     with pytest.raises(FileNotFoundError, match=r"setup_file: got '.*nowhere\.yaml', expected a parameter file"):
         nodes(description, setup_file=str(tmp_path / "nowhere.yaml"))

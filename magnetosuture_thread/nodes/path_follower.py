@@ -48,7 +48,7 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
     def activate(self) -> None:
         """Begin the path, or go on with it."""
         # While it is there a needle planner refuses to command beside it.
-        self._commands = topics.NEEDLE_COMMAND.publisher(self)
+        self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))
         self.health.warn("no needle pose yet")
 
     def deactivate(self) -> None:

@@ -49,3 +49,25 @@ def test_a_change_that_comes_too_soon_is_said_a_moment_later_and_not_lost(graph,
         health.warn(text)
     graph.wait(lambda: any(d.status[0].message == "third" for d in said), "the last change")
     assert "second" not in [d.status[0].message for d in said]
+    graph.wait(health._late.is_canceled, "the end of the late reports")
+
+
+def test_that_a_node_stands_by_is_reported_at_once_as_a_warning_whatever_else_there_is(graph, monkeypatch):
+    monkeypatch.setattr(diagnostics, "PERIOD", 1e6)  # the state of each second would say it too
+    said = graph.listen_later(topics.DIAGNOSTICS)
+    health = Health(graph.probe)
+    graph.wait(lambda: graph.matched(topics.DIAGNOSTICS), "the match")
+
+    def last() -> tuple[bytes, str]:
+        return (said[-1].status[0].level, said[-1].status[0].message) if said else (b"", "")
+
+    health.ok("all well")
+    graph.wait(lambda: last() == (DiagnosticStatus.OK, "all well"), "the state")
+    health.stand_by("inactive")
+    graph.wait(lambda: last() == (DiagnosticStatus.WARN, "inactive"), "the report")
+    health.error("broken")
+    health.stand_by("x" * 100_000)
+    graph.wait(lambda: last()[1].startswith("xxx"), "the report")
+    assert len(last()[1]) <= diagnostics.MAX_TEXT_CHARS
+    health.stand_by("")
+    graph.wait(lambda: last() == (DiagnosticStatus.ERROR, "broken"), "the state of meanwhile")

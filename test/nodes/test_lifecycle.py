@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,14 @@ from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import ProcedureState
 from magnetosuture_msgs.srv import EditShape, ForecastPath, LoadScene, PlanProcedure
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from sensor_msgs.msg import CompressedImage
 from std_srvs.srv import Trigger
 
+from benchmarks.vision.measurements import frame_of
+from magnetosuture_thread import Disc, Forecast, ThreadForecaster
 from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import (
@@ -36,16 +43,20 @@ from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.perception import perception
+from magnetosuture_thread.nodes.procedure_inputs import ProcedureInputs
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
+from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.topics import Topic
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.scene import Scene, SceneShape, read_scene
 from test.nodes.conftest import Graph
 from test.nodes.scenes import scene_told
 from test.nodes.test_needle_planner import FAR, OPEN, Bench
+from test.nodes.test_thread_estimate import counting
+from test.nodes.test_thread_estimate import stamp as frame_stamp
 from test.nodes.test_thread_model import pose, seen
-from test.nodes.test_vision_tracker import compressed, frame
+from test.nodes.test_vision_tracker import camera_info, compressed, frame
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
@@ -69,6 +80,25 @@ PUBLISHED = {
     "needle_planner": "/procedure/state",
     "path_follower": "/needle/servo_cv",
     "scene_server": "/scene",
+}
+ACTIVE = {  # how the first report of each begins while it is active
+    "vision_tracker": "no camera frame yet",
+    "thread_model": "no needle pose yet",
+    "needle_planner": "no procedure",
+    "path_follower": "no needle pose yet",
+    "scene_server": "scene ",
+}
+HANDLERS: dict[str, list[Any]] = {  # classes of which methods take messages and timers
+    "vision_tracker": [VisionTrackerNode],
+    "thread_model": [ThreadModelNode, ThreadForecasts],
+    "needle_planner": [NeedlePlannerNode, ProcedureInputs],
+    "path_follower": [PathFollowerNode],
+}
+IN_EVERY_STATE = ("on_scene", "on_material", "on_camera_info", "on_bridge")  # published only when it changes
+SCENES: dict[str, Callable[[Any], str]] = {  # version of the scene by which each works
+    "vision_tracker": lambda node: str(node._session._tracker._scene.version),
+    "thread_model": lambda node: str(node._session.scene_version),
+    "needle_planner": lambda node: str(node._session.known.scene_version),
 }
 BEGIN = int(time.time()) + 3600  # s; late poses are refused, however slowly a test runs
 
@@ -98,6 +128,18 @@ def stage(graph: Graph, name: str) -> str:
 def state_of(reports: list[Any]) -> str:
     """Return what a node said of itself last on /diagnostics."""
     return str(reports[-1].status[0].message) if reports else ""
+
+
+def values_of(reports: list[Any]) -> dict[str, str]:
+    """Return the values that a node reported last on /diagnostics."""
+    return {each.key: each.value for each in reports[-1].status[0].values} if reports else {}
+
+
+def show_frames(graph: Graph, states: list[Any], image: np.ndarray, *seconds: int) -> None:
+    """Show an image to a tracker at some seconds, each once the one before has been looked at: few may wait."""
+    for second in seconds:
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=second)))
+        graph.wait(lambda: any(each.header.stamp.sec == second for each in states), "its state")  # noqa: B023
 
 
 def show_unused(graph: Graph, node: Any, topic: Topic, message: Any) -> None:
@@ -130,7 +172,7 @@ def test_it_goes_as_far_as_autostart_says_and_through_its_states_twice(graph: Gr
         graph.wait(lambda: state_of(reports) == INACTIVE, "the report")
         change(graph, name, ACTIVATE)
         assert stage(graph, name) == "active"
-        graph.wait(lambda: state_of(reports) not in (INACTIVE, "unconfigured"), "another report")
+        graph.wait(lambda: state_of(reports).startswith(ACTIVE[name]), "another report")
         change(graph, name, DEACTIVATE)
         graph.wait(lambda: state_of(reports) == INACTIVE, "the report")
         change(graph, name, ACTIVATE, DEACTIVATE, CLEANUP)
@@ -168,16 +210,14 @@ def test_whatever_is_refused_an_inactive_node_reports_that_it_is_inactive(graph:
     with graph.between_callbacks():
         node.refuse(ConfigurationError("anything", 1, "another thing"))
         node.health.publish()
-
-    def values() -> dict[str, str]:
-        return {each.key: each.value for each in reports[-1].status[0].values}
-
-    graph.wait(lambda: values()["last refusal"] != "none", "the refusal")
+    graph.wait(lambda: values_of(reports)["last refusal"] != "none", "the refusal")
     assert state_of(reports) == INACTIVE
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_its_scene_can_be_set_before_it_is_configured_and_not_after(graph: Graph, name: str):
+def test_its_scene_can_be_set_before_it_is_configured_and_not_after(
+    graph: Graph, name: str, capfd: pytest.CaptureFixture[str]
+):
     make, parameters = NODES[name]
     reports = graph.listen_later(topics.DIAGNOSTICS)
     node = graph.add(make, autostart="unconfigured", **{**parameters, "scene": "elsewhere"})
@@ -185,6 +225,7 @@ def test_its_scene_can_be_set_before_it_is_configured_and_not_after(graph: Graph
     assert not called(graph, ChangeState, f"{name}/change_state", request).success
     assert isinstance(node.problem, ConfigurationError)
     graph.wait(lambda: "unconfigured: scene: got 'elsewhere'" in state_of(reports), "the reason")
+    assert "scene: got 'elsewhere'" in capfd.readouterr().err
     assert node.set_parameters([Parameter("scene", value="dish_35mm_post")])[0].successful
     change(graph, name, CONFIGURE)
     refused = node.set_parameters([Parameter("scene", value="dish_50mm")])[0]
@@ -203,16 +244,137 @@ def test_a_node_that_is_shut_down_ends(graph: Graph, name: str):
     change(graph, name, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert node.has_ended
     graph.wait(lambda: state_of(reports) == "finalized", "the report")
+    with graph.between_callbacks():
+        node.finish()  # as its process does then
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_with_an_invalid_parameter_all_others_can_be_set_before_it_is_configured(graph: Graph, name: str):
+def test_with_an_invalid_parameter_all_others_can_be_set_before_it_is_configured(
+    graph: Graph, name: str, capfd: pytest.CaptureFixture[str]
+):
     make, parameters = NODES[name]
+    reports = graph.listen_later(topics.DIAGNOSTICS)
     node = graph.add(make, autostart="unconfigured", **{**parameters, "scene": 3.0})
+    reason = f"{name}.scene: got 3.0, expected text"
+    assert reason in capfd.readouterr().err
+    graph.wait(lambda: state_of(reports).startswith(f"unconfigured: {reason}"), "the reason")
     names = {about.name for about in configuration_fields(node._class)}
     assert {each for each in names if not node.has_parameter(each)} == set()
     assert node.set_parameters([Parameter("scene", value="dish_35mm")])[0].successful
     change(graph, name, CONFIGURE)
+
+
+@pytest.mark.parametrize(
+    ("name", "others"), [*((name, {}) for name in HANDLERS), ("vision_tracker", {"image_transport": "raw"})]
+)
+def test_an_inactive_node_handles_no_message_and_no_timer(
+    graph: Graph, name: str, others: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+):
+    make, parameters = NODES[name]
+    handled: list[str] = []
+
+    def noted(handler: str) -> Callable[..., None]:
+        return lambda *_: handled.append(handler)
+
+    for owner in HANDLERS[name]:
+        for handler in [each for each in vars(owner) if each.startswith("on_") and each not in IN_EVERY_STATE]:
+            monkeypatch.setattr(owner, handler, noted(handler))
+    node = graph.add(make, autostart="inactive", **{**parameters, **others})
+    subscriptions = [each for each in node._held if isinstance(each, Subscription)]
+    timers = [each for each in node._held if isinstance(each, Timer)]
+
+    def call() -> list[str]:
+        with graph.between_callbacks():
+            handled.clear()
+            for subscription in subscriptions:
+                subscription.callback(serialize_message(subscription.msg_type()))
+            for timer in timers:
+                timer.callback()
+            return sorted(handled)
+
+    assert call() == []
+    change(graph, name, ACTIVATE)
+    in_every_state = sum(each.topic_name == f"/{topics.BRIDGE_STATE.name}" for each in subscriptions)
+    assert len(call()) == len(subscriptions) + len(timers) - in_every_state > 0
+
+
+def failing(graph: Graph, name: str, transition: int) -> None:
+    """Ask for a transition that fails."""
+    request = ChangeState.Request(transition=Transition(id=transition))
+    assert not called(graph, ChangeState, f"{name}/change_state", request).success
+
+
+def broken() -> None:
+    """Fail as nobody expects it."""
+    raise RuntimeError("nobody foresaw this")
+
+
+def test_an_activation_that_fails_leaves_the_node_inactive(graph: Graph, monkeypatch: pytest.MonkeyPatch):
+    node = graph.add(SceneServerNode, scene="dish_35mm", autostart="inactive")
+    reports = graph.listen(topics.DIAGNOSTICS)
+    monkeypatch.setattr(node, "activate", broken)
+    failing(graph, SCENE_SERVER, ACTIVATE)
+    assert stage(graph, SCENE_SERVER) == "inactive"
+    refused = called(graph, LoadScene, LOAD_SCENE, LoadScene.Request(file="dish_50mm"))
+    assert refused.message == "scene_server is inactive; activate it first"
+    with graph.between_callbacks():
+        node.health.note(asked="now")
+        node.health.publish()
+    graph.wait(lambda: values_of(reports).get("asked") == "now", "another report")
+    assert state_of(reports) == INACTIVE
+    monkeypatch.undo()
+    change(graph, SCENE_SERVER, ACTIVATE)
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_a_deactivation_that_fails_gives_everything_back(graph: Graph, name: str, monkeypatch: pytest.MonkeyPatch):
+    make, parameters = NODES[name]
+    reports = graph.listen_later(topics.DIAGNOSTICS)
+    node = graph.add(make, autostart="unconfigured", **parameters)
+    before = entities(node)
+    change(graph, name, CONFIGURE, ACTIVATE)
+    graph.wait(lambda: state_of(reports).startswith(ACTIVE[name]), "the report")
+    monkeypatch.setattr(node, "deactivate", broken)
+    failing(graph, name, DEACTIVATE)
+    assert stage(graph, name) == "unconfigured"
+    assert entities(node) == before
+    assert "nobody foresaw this" in str(node.problem)
+    graph.wait(lambda: state_of(reports) == "unconfigured", "the report")
+    monkeypatch.undo()
+    assert node.set_parameters([Parameter("scene", value="dish_50mm")])[0].successful
+    change(graph, name, CONFIGURE, ACTIVATE)
+
+
+def place(graph: Graph, node: Any, scene: Scene) -> None:
+    """Publish a scene, and wait until a node has taken it or left it."""
+    graph.publish(topics.SCENE, scene_told(scene))
+    graph.wait(lambda: node._scene._heard == scene, "the scene")
+    with graph.between_callbacks():
+        pass
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_that_comes_before_a_node_is_configured_or_active_counts(
+    graph: Graph, name: str, capfd: pytest.CaptureFixture[str]
+):
+    make, parameters = NODES[name]
+    node = graph.add(make, autostart="unconfigured", **parameters)
+    first, second = read_scene("dish_50mm"), read_scene("dish_35mm_post")
+    place(graph, node, first)
+    change(graph, name, CONFIGURE)
+    assert SCENES[name](node) == first.version
+    assert f"scene {first.version} of the topic, and not that of the parameter" in capfd.readouterr().err
+    place(graph, node, second)
+    assert SCENES[name](node) == second.version
+    change(graph, name, ACTIVATE)
+    assert SCENES[name](node) == second.version
+
+
+def test_a_tracker_that_was_configured_without_a_scene_takes_one_while_inactive(graph: Graph):
+    node = graph.add(VisionTrackerNode, autostart="inactive")
+    scene = read_scene("dish_50mm")
+    place(graph, node, scene)
+    assert SCENES["vision_tracker"](node) == scene.version
 
 
 @pytest.mark.parametrize("name", NODES)
@@ -268,10 +430,39 @@ def test_the_tracker_takes_the_camera_topic_that_it_is_configured_with(graph: Gr
     graph.wait(lambda: node.count_subscribers(image) == 0, "the camera to be left")
     assert node.set_parameters([Parameter("image_transport", value="compressed")])[0].successful
     change(graph, "vision_tracker", CONFIGURE, ACTIVATE)
-    poses = graph.listen(topics.NEEDLE_POSE)
-    for second in range(3):
-        graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), Time(sec=second)))
+    poses, states = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    show_frames(graph, states, frame(camera, thread_arc), 1, 2, 3)
     graph.wait(lambda: bool(poses), "a pose")
+
+
+def test_a_lens_stays_in_force_while_the_tracker_is_inactive_and_configured_again(graph: Graph):
+    case, image = frame_of("distortion", 2, 31)
+    assert case.lens is not None
+    node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    graph.publish(topics.CAMERA_INFO, camera_info(case.lens))
+    graph.wait(lambda: node._lens is not None, "the lens")
+    poses = graph.listen(topics.NEEDLE_POSE)
+    for transitions in ((DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)):
+        change(graph, "vision_tracker", *transitions)
+        graph.wait(lambda: node._poses.get_subscription_count() == 1, "who takes them")
+        before = len(poses)
+        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
+        graph.wait(lambda: len(poses) > before, "a pose")  # noqa: B023, waited for at once
+        position = poses[-1].pose.pose.position
+        assert np.hypot(*(np.array([position.x, position.y]) - case.needle.tail)) < 0.6 * 8e-5
+
+
+def test_what_the_tracker_saw_before_it_was_inactive_is_not_in_its_reports(graph: Graph, camera: Any, thread_arc: Any):
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    states, reports = graph.listen(topics.TRACKER_STATE), graph.listen(topics.DIAGNOSTICS)
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
+    graph.wait(lambda: state_of(reports) == "tracking", "the report")
+    change(graph, "vision_tracker", DEACTIVATE, ACTIVATE)
+    before = len(states)
+    graph.publish(topics.COMPRESSED_IMAGE, CompressedImage(format="jpeg"))
+    graph.wait(lambda: len(states) > before, "the refusal")
+    graph.wait(lambda: state_of(reports).startswith("no camera frame for"), "the silence")
+    assert state_of(reports).endswith("; before that nothing seen")
 
 
 def test_the_thread_starts_anew_where_it_is_seen_after_the_model_was_inactive(graph: Graph):
@@ -331,6 +522,33 @@ def test_forecasts_are_offered_while_the_model_is_configured_with_them(graph: Gr
     graph.wait(lambda: node.count_services(FORECAST_PATH) == 0, "the service to be gone")
 
 
+def test_nothing_is_forecast_from_before_the_model_was_inactive(graph: Graph, monkeypatch: pytest.MonkeyPatch):
+    model = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=0.6, forecast_step=0.03)
+    forecasts, forecast, begun, go_on = graph.listen(topics.FORECAST), ThreadForecaster.forecast, Event(), Event()
+
+    def slow(*arguments: Any, **options: Any) -> Forecast:
+        begun.set()
+        assert go_on.wait(60.0)
+        return forecast(*arguments, **options)
+
+    monkeypatch.setattr(ThreadForecaster, "forecast", slow)
+    state = topics.FILTER_STATE.message(header=MESSAGES.header(frame_stamp(1)))
+    state.commanded.x = state.filtered.x = 0.001
+    graph.publish(topics.FILTER_STATE, state)
+    graph.wait(lambda: model.node._forecasts._command is not None, "the command")
+    model.show(0)
+    assert begun.wait(60.0)
+    change(graph, "thread_model", DEACTIVATE)
+    go_on.set()
+    change(graph, "thread_model", ACTIVATE)
+    request = ForecastPath.Request(path=[Point(x=0.005)], speed=0.005, horizon=1.0)
+    assert "no estimate yet" in called(graph, ForecastPath, FORECAST_PATH, request).message
+    model.show(1)
+    graph.wait(lambda: bool(forecasts), "a forecast")
+    assert forecasts[0].header.stamp == frame_stamp(1)
+    assert forecasts[0].commanded.x == 0.0
+
+
 @pytest.fixture
 def bench(graph: Graph) -> Iterator[Bench]:
     """A planner with an ideal needle; the client leaves the graph at the end of the test."""
@@ -360,7 +578,10 @@ def test_a_procedure_is_given_up_when_its_planner_is_deactivated(graph: Graph, b
     graph.wait(result.done, "the result")
     assert result.result().result.reason == "needle_planner is inactive; activate it first"
     assert len(bench.commands) == count
+    published = len(bench.states)
     change(graph, "needle_planner", ACTIVATE)
+    graph.wait(lambda: len(bench.states) > published, "how it ended, once more")
+    assert len(bench.commands) == count  # it has stopped the needle once
     assert bench.send(FAR).accepted
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "another procedure")
 
@@ -422,13 +643,14 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
     graph.wait(lambda: graph.probe.count_publishers(topics.NEEDLE_COMMAND.name) == 0, "the topic to be free")
     change(graph, "path_follower", ACTIVATE)
     graph.wait(lambda: state_of(reports) == "no needle pose yet", "the report")
-    assert {each.key: each.value for each in reports[-1].status[0].values}["progress"] != "0.0"
+    assert values_of(reports)["progress"] != "0.0"
     graph.wait(lambda: graph.matched(topics.NEEDLE_COMMAND), "the commands")
     graph.wait(lambda: node._commands.get_subscription_count() == 1, "who takes them")
     show(2.0)
     graph.wait(lambda: commands[-1].twist.linear.x > 0.0, "the motion to go on")
     assert reached <= setpoints[-1].pose.position.x < reached + 1e-3
     change(graph, "path_follower", DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)
+    graph.wait(lambda: values_of(reports)["progress"] == "0.0", "the report")
     graph.wait(lambda: graph.matched(topics.TIP_SETPOINT), "the setpoints")
     graph.wait(lambda: node._commands.get_subscription_count() == 1, "who takes them")
     graph.wait(lambda: node._setpoints.get_subscription_count() == 1, "who takes the setpoints")
@@ -436,6 +658,34 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
     show(3.02)
     graph.wait(lambda: setpoints[-1].header.stamp.nanosec == 20_000_000, "the path from its beginning")
     assert setpoints[-1].pose.position.x < reached
+
+
+def test_the_path_follower_checks_scenes_in_every_state(graph: Graph):
+    node = graph.add(PathFollowerNode, autostart="unconfigured", settle=0.0, waypoints=[0.012, 0.0])
+    commands, reports = graph.listen_later(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)
+    blocked = Scene(OPEN.dish, (SceneShape("post", "wall", Disc((0.0123, 0.0), 0.001)),))
+    reason = "waypoints: got [0.012, 0.0], expected a point outside of post"
+
+    def show(second: float) -> None:
+        graph.wait(lambda: node._commands.get_subscription_count() == 1, "who takes the commands")
+        stamp = Time(sec=BEGIN, nanosec=round(1e9 * second))
+        graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
+
+    place(graph, node, blocked)
+    failing(graph, "path_follower", CONFIGURE)
+    assert reason in str(node.problem)
+    place(graph, node, OPEN)
+    change(graph, "path_follower", CONFIGURE)
+    place(graph, node, blocked)
+    change(graph, "path_follower", ACTIVATE)
+    show(0.0)
+    graph.wait(lambda: reason in state_of(reports), "the reason")
+    assert commands == []
+    change(graph, "path_follower", DEACTIVATE, CLEANUP)
+    place(graph, node, OPEN)
+    change(graph, "path_follower", CONFIGURE, ACTIVATE)
+    show(0.02)
+    graph.wait(lambda: state_of(reports) in ("settling", "following"), "the path to be followed")
 
 
 def test_the_scene_server_publishes_and_changes_scenes_while_active(graph: Graph):
@@ -464,24 +714,44 @@ def test_two_nodes_in_one_process_have_states_of_their_own(graph: Graph, camera:
         graph.nodes.append(node)
         graph.executor.add_node(node)
     poses, margins = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.MARGINS)
+    states, image = graph.listen(topics.TRACKER_STATE), frame(camera, thread_arc)
     change(graph, "thread_model", DEACTIVATE)
-
-    def show(*seconds: int) -> None:
-        for second in seconds:
-            graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), Time(sec=second)))
-
-    show(1, 2, 3)
+    show_frames(graph, states, image, 1, 2, 3)
     graph.wait(lambda: bool(poses), "poses")
     change(graph, "thread_model", ACTIVATE)
-    show(4, 5)
+    show_frames(graph, states, image, 4, 5)
     graph.wait(lambda: bool(margins), "margins")
     assert margins[0].header.stamp.sec >= 4
     change(graph, "vision_tracker", DEACTIVATE)
-    show_unused(graph, tracker, topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), Time(sec=6)))
+    show_unused(graph, tracker, topics.COMPRESSED_IMAGE, compressed(image, Time(sec=6)))
     change(graph, "vision_tracker", ACTIVATE)
-    show(7, 8, 9)
+    show_frames(graph, states, image, 7, 8, 9)
     graph.wait(lambda: poses[-1].header.stamp.sec > 6, "poses again")
     assert 6 not in [each.header.stamp.sec for each in poses]
+
+
+@pytest.mark.parametrize("far", ["unconfigured", "finalized"])
+def test_a_tracker_goes_on_beside_a_model_that_holds_nothing(graph: Graph, camera: Any, thread_arc: Any, far: str):
+    given = overrides(scene="dish_35mm", autostart="unconfigured")
+    for node in perception(context=graph.context, parameter_overrides=given):
+        graph.nodes.append(node)
+        graph.executor.add_node(node)
+    change(graph, "vision_tracker", CONFIGURE, ACTIVATE)
+    if far == "finalized":
+        change(graph, "thread_model", CONFIGURE, ACTIVATE, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    poses, states = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    show_frames(graph, states, frame(camera, thread_arc), 1, 2, 3, 4)
+    graph.wait(lambda: len(poses) == 2, "poses")
+
+
+def test_a_model_that_is_to_listen_takes_each_message_once_however_often_it_is_configured(graph: Graph):
+    node = graph.add(lambda **options: ThreadModelNode(listens=False, **options), autostart="unconfigured")
+    with graph.between_callbacks():
+        node.listen()
+    for _ in range(2):
+        change(graph, "thread_model", CONFIGURE)
+        assert [each.topic_name for each in node.subscriptions].count("/needle/measured_cp") == 1
+        change(graph, "thread_model", CLEANUP)
 
 
 class NeverImported:

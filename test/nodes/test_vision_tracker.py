@@ -19,6 +19,7 @@ from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.thread_observation import PieceEnd
+from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.look import UNKNOWN_HEADING
 from test.nodes.scenes import scene_told
 from test.vision.scenes import Pose, render
@@ -35,6 +36,13 @@ def compressed(image: np.ndarray, stamp) -> CompressedImage:
     """Return an image as a JPEG message."""
     message = CompressedImage(format="jpeg", data=encode_jpeg(image, 90).tobytes())
     message.header.stamp = stamp
+    return message
+
+
+def camera_info(lens: Lens) -> CameraInfo:
+    """Return a lens as a message."""
+    message = CameraInfo(width=lens.size[0], height=lens.size[1], distortion_model=lens.model)
+    message.k, message.d = lens.matrix.ravel().tolist(), lens.coefficients.tolist()
     return message
 
 
@@ -249,9 +257,7 @@ def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_no
     assert lens is not None
     node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
-    message = CameraInfo(width=lens.size[0], height=lens.size[1], distortion_model=lens.model)
-    message.k, message.d = lens.matrix.ravel().tolist(), lens.coefficients.tolist()
-
+    message = camera_info(lens)
     graph.publish(topics.CAMERA_INFO, message)
     graph.wait(lambda: node._lens is not None, "the lens")  # messages of two topics come in either order
     graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
