@@ -57,6 +57,7 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
             self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), np.zeros(2)))
             self._commands.wait_for_all_acked(Duration(seconds=DELIVERY_TIMEOUT))
             self.destroy_publisher(self._commands)
+            self._held.remove(self._commands)
 
     def release(self) -> None:
         """Give the path up."""
