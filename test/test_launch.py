@@ -127,7 +127,7 @@ def test_every_node_gets_the_same_file_and_namespace(description):
 
 
 @pytest.mark.parametrize("planner", ["true", "false"])
-def test_the_rig_comes_where_the_robot_is_simulated_and_the_page_where_it_is_asked_for(description, planner: str):
+def test_the_rig_starts_with_a_simulated_robot_only_and_the_page_only_on_request(description, planner: str):
     simulated, console = ("if", "simulated"), ("if", "console")
     expected = {
         **{name: [None] for name in ("scene_server", "perception", "needle_planner")},

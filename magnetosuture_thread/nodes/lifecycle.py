@@ -1,4 +1,4 @@
-"""Managed nodes: their parameters are checked when they are configured, and stay as they are while they are."""
+"""Lifecycle nodes: parameters are checked when a node is configured, and stay as they are until it is cleaned up."""
 
 from __future__ import annotations
 

@@ -135,11 +135,21 @@ def values_of(reports: list[Any]) -> dict[str, str]:
     return {each.key: each.value for each in reports[-1].status[0].values} if reports else {}
 
 
+def are_more_than(count: int, messages: list[Any]) -> Callable[[], bool]:
+    """Return a condition: there are more messages than a count."""
+    return lambda: len(messages) > count
+
+
+def is_shown(second: int, states: list[Any]) -> Callable[[], bool]:
+    """Return a condition: a tracker has published its state at a second."""
+    return lambda: any(each.header.stamp.sec == second for each in states)
+
+
 def show_frames(graph: Graph, states: list[Any], image: np.ndarray, *seconds: int) -> None:
     """Show an image to a tracker at some seconds, each once the one before has been looked at: few may wait."""
     for second in seconds:
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=second)))
-        graph.wait(lambda: any(each.header.stamp.sec == second for each in states), "its state")  # noqa: B023
+        graph.wait(is_shown(second, states), "its state")
 
 
 def show_unused(graph: Graph, node: Any, topic: Topic, message: Any) -> None:
@@ -405,7 +415,9 @@ def overrides(**values: Any) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
-def test_the_tracker_sees_nothing_while_inactive_and_finds_the_needle_anew(graph: Graph, camera: Any, thread_arc: Any):
+def test_an_inactive_tracker_uses_no_frame_and_finds_the_needle_again_once_active(
+    graph: Graph, camera: Any, thread_arc: Any
+):
     node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, states = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
     image = frame(camera, thread_arc)
@@ -447,7 +459,7 @@ def test_a_lens_stays_in_force_while_the_tracker_is_inactive_and_configured_agai
         graph.wait(lambda: node._poses.get_subscription_count() == 1, "who takes them")
         before = len(poses)
         graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
-        graph.wait(lambda: len(poses) > before, "a pose")  # noqa: B023, waited for at once
+        graph.wait(are_more_than(before, poses), "a pose")
         position = poses[-1].pose.pose.position
         assert np.hypot(*(np.array([position.x, position.y]) - case.needle.tail)) < 0.6 * 8e-5
 
@@ -465,7 +477,7 @@ def test_what_the_tracker_saw_before_it_was_inactive_is_not_in_its_reports(graph
     assert state_of(reports).endswith("; before that nothing seen")
 
 
-def test_the_thread_starts_anew_where_it_is_seen_after_the_model_was_inactive(graph: Graph):
+def test_a_model_that_was_inactive_starts_from_the_next_measured_thread(graph: Graph):
     node = graph.add(ThreadModelNode)
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
     graph.publish(topics.MEASURED_THREAD, seen(1.0))
@@ -632,7 +644,7 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
 
     for index in range(30):
         show(index / 60)
-        graph.wait(lambda: len(commands) > index, "the answer")  # noqa: B023, waited for at once
+        graph.wait(are_more_than(index, commands), "the answer")
     reached = setpoints[-1].pose.position.x
     assert commands[-1].twist.linear.x > 0.0
     change(graph, "path_follower", DEACTIVATE)

@@ -240,7 +240,7 @@ def test_what_is_dark_around_a_needle_counts_for_the_place_where_it_is(
     assert np.delete(result, which).max() < 0.2
 
 
-def test_each_row_of_a_needle_has_the_steel_that_is_seen_there():
+def test_each_row_of_a_needle_has_the_steel_of_the_image_there():
     surely, perhaps = share_of_steel(1.0), share_of_steel(1.0)
     perhaps[:, 40:50] = surely[:, 60:70] = 0.0
     rows = np.empty((60, 3))

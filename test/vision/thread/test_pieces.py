@@ -283,12 +283,17 @@ def test_an_end_beside_the_border_of_the_frame_is_not_bare(side: int, left: int)
     assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, away) == (left == 40)
 
 
-@pytest.mark.parametrize("covered", [False, True])
-def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: bool):
-    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
+def straight_thread() -> tuple[MeasuredNeedle, np.ndarray]:
+    """Return a needle, and an image of it with a straight thread of 150 px behind it on a bright floor."""
     image = np.full((480, 640), 225, np.uint8)
     cv2.line(image, (300, 240), (150, 240), 100, 2)
     cv2.line(image, (300, 240), (387, 240), 50, 5)
+    return MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0), image
+
+
+@pytest.mark.parametrize("covered", [False, True])
+def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: bool):
+    needle, image = straight_thread()
     if covered:
         image[240:300, 215:255] = 140
     noise = np.random.default_rng(0).normal(0.0, 2.0, image.shape)
@@ -302,10 +307,7 @@ def test_the_edge_of_an_object_that_a_walk_goes_along_shows_no_thread(covered: b
 
 @pytest.mark.parametrize("bare", [False, True])
 def test_a_thread_is_complete_only_if_bare_floor_lies_beyond_its_end(bare: bool):
-    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
-    image = np.full((480, 640), 225, np.uint8)
-    cv2.line(image, (300, 240), (387, 240), 50, 5)
-    cv2.line(image, (300, 240), (150, 240), 100, 2)
+    needle, image = straight_thread()
     image[:, :149] = 225 if bare else 190  # another floor, that the thread may go on below
     view, walk = DishView((320.0, 240.0), SCALE), line((300.0, 240.0), (151.0, 240.0))
     seen = observe(prepare(image, 2), needle, walk, view, 0.0172, 150.0 * SCALE, scale_known=True)
