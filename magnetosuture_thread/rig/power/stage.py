@@ -10,16 +10,20 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.line import Line
+from magnetosuture_thread.rig.power.packets import ADDRESSES
 
-FIRST_ADDRESS = 0x80
+
+def board_addresses(boards: int) -> list[int]:
+    """Return the addresses of so many boards: different ones, as far as there are that many."""
+    return [ADDRESSES[index % len(ADDRESSES)] for index in range(boards)]
 
 
 class PowerStage:
     """Boards with two coils each, in the order of their ports.
 
     Args:
-        ports: the path at which each board is to be found; boards with the same path share a line, with
-            addresses that count up from 128.
+        ports: the path at which each board is to be found; boards with the same path share a line. Their addresses
+            are `board_addresses`.
         supply: of each board [V].
         resistance: of each coil [ohm].
         inductance: of each coil [H].
@@ -32,8 +36,8 @@ class PowerStage:
     def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
         by_path: dict[str, list[RoboClawBoard]] = defaultdict(list)
         self.boards = []
-        for path in ports:
-            board = RoboClawBoard(FIRST_ADDRESS + len(by_path[path]), supply, resistance, inductance)
+        for path, address in zip(ports, board_addresses(len(ports)), strict=True):
+            board = RoboClawBoard(address, supply, resistance, inductance)
             by_path[path].append(board)
             self.boards.append(board)
         self.lines = [Line(path, boards) for path, boards in by_path.items()]

@@ -124,7 +124,7 @@ def test_what_a_killed_simulation_left_is_replaced_and_anything_else_stays(tmp_p
 def test_a_stage_has_two_coils_on_each_board_in_order(tmp_path):
     paths = [str(tmp_path / name) for name in ("a", "b", "a")]
     stage = PowerStage(paths, 24.0, 1.0, 0.01)
-    assert [board.address for board in stage.boards] == [128, 128, 129]
+    assert [board.address for board in stage.boards] == [128, 129, 130]
     assert [line.boards for line in stage.lines] == [(stage.boards[0], stage.boards[2]), (stage.boards[1],)]
     stage.open()
     for number, board in enumerate(stage.boards):

@@ -16,7 +16,7 @@ from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.rig.power.packets import ACKNOWLEDGED, SET_DUTIES, checksum
 from magnetosuture_thread.rig.power.process import StageProcess
 
-HALF_AND_BACK = bytes((128, SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))  # of the supply: a half, and a quarter reversed
+HALF_AND_BACK = bytes((129, SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))  # of the supply: a half, and a quarter reversed
 RIG = """
 import sys, time
 from magnetosuture_thread.rig.power.process import StageProcess

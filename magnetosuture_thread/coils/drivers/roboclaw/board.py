@@ -6,7 +6,7 @@ import logging
 import math
 import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 ACK = b"\xff"
 MAX_ATTEMPTS = 2
-# Pause after a failure: the board drops a partial packet, and a late answer arrives and is discarded.
+# Pause after a failure, in which the board drops a partial packet.
 RETRY_DELAY = 0.015  # s
 
 # The library logs every missing byte, a hundred times a second for a dead board; the driver reports the problem
@@ -33,6 +33,10 @@ if _library.level == logging.NOTSET:
 
 class Board:
     """RoboClaw board with two coils.
+
+    An acknowledgement is one byte and tells neither what it acknowledges nor which board sent it. After a request
+    without a valid answer none counts, until a question that nothing else asks has been answered: a board answers in
+    the order of requests, so that all earlier answers have come by then, however late they are.
 
     Args:
         port: serial port of its line.
@@ -93,13 +97,31 @@ class Board:
             found.append("a current is at its limit")
         return (*(f"{self._name}: {warning}" for warning in found), *filter(None, self._coil_warnings))
 
+    def identify(self, others: Sequence[int] = ()) -> None:
+        """Verify that the board on this port is the one of this address, before anything is set.
+
+        Args:
+            others: addresses that it must not answer to, as those of boards on other ports.
+
+        Raises:
+            DeviceError: it does not answer to its own address, or answers to another one too.
+        """
+        for other in MAX_ATTEMPTS * tuple(others):
+            self._attempt(self._device.ReadVersion, other)
+            if self._port.answer:
+                expected = "expected a path under /dev/serial/by-path for each port, as over USB addresses are ignored"
+                raise DeviceError(f"{self._name}: answers to address {other} too; {expected}")
+        try:
+            (self.version,) = self._query(self._device.ReadVersion)
+        except DeviceError as error:
+            raise DeviceError(f"{error}: it is off, has another address, or ports are exchanged") from None
+
     def configure(self) -> None:
         """Set currents to zero, set timeout and limits, and verify each.
 
         Raises:
             DeviceError: a value cannot be set or verified.
         """
-        (self.version,) = self._query(self._device.ReadVersion)
         self.write_zero()
         self._verify("duties", self._query(self._device.ReadPWMs), (0, 0))
         # Half a tenth is added, as the library truncates; zero would disable the timeout.
@@ -219,7 +241,7 @@ class Board:
         self._exchange(call, lambda: values, self._acknowledged)
 
     def _acknowledged(self, result: Any) -> bool:
-        return bool(result) and self._port.answer == ACK  # the library accepts any byte
+        return bool(result) and self._port.answer == ACK and self._port.is_drained  # the library accepts any byte
 
     def _query(self, call: Callable[..., Any]) -> tuple[Any, ...]:
         result: tuple[Any, ...] = self._exchange(call, tuple, lambda result: bool(result[0]))[1]
@@ -233,14 +255,28 @@ class Board:
             if attempt:
                 if self._no_retry():
                     break
-                time.sleep(RETRY_DELAY)
+                if not self._drain():
+                    continue
             self._expires = math.inf
             sent = values()
-            try:
-                self._port.begin(self._expires)
-                result = call(self._address, *sent)
-            except (BasicmicroError, serial.SerialException, OSError, termios.error):
-                continue
-            if is_valid(result):
+            result = self._attempt(call, self._address, *sent)
+            if result is not None and is_valid(result):
                 return sent, result
+            self._port.is_drained = False
         raise DeviceError(f"{self._name}: no valid answer to {call.__name__}")
+
+    def _attempt(self, call: Callable[..., Any], *arguments: Any) -> Any:
+        """Return the library's result of a request, None if it failed."""
+        try:
+            self._port.begin(self._expires)
+            return call(*arguments)
+        except (BasicmicroError, serial.SerialException, OSError, termios.error):
+            return None
+
+    def _drain(self) -> bool:
+        """Return whether all earlier answers of the board have come."""
+        time.sleep(RETRY_DELAY)
+        self._expires = math.inf
+        result = self._attempt(self._device.ReadMainBatteryVoltage, self._address)  # no such answer begins with an ACK
+        self._port.is_drained = result is not None and bool(result[0])
+        return self._port.is_drained

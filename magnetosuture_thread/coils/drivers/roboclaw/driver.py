@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -38,6 +41,9 @@ class RoboClawDriver:
     does not confirm both is never ready. Both are polled, with two boards on a line within about a second: a board
     whose supply fails forgets them, which is a loss however soon it is back.
 
+    Each board has to be identified before any is driven, at the start and after every loss: it answers to its own
+    address and, unless the path of its port is stable (see `is_stable`), to none of the boards on other ports.
+
     Args:
         settings: of the bridge.
         coils: number of coils; that of the settings' angles if None.
@@ -65,7 +71,7 @@ class RoboClawDriver:
             return
         mailbox = Mailbox(self._coils, [f"connecting to {path}" for path in self._ports], self._apply_timeout)
         self._lines = [
-            LineThread(number, path, boards, self._settings, mailbox)
+            LineThread(number, path, boards, self._settings, mailbox, _others(self._ports, path))
             for number, (path, boards) in enumerate(self._ports.items())
         ]
         self._mailbox = mailbox
@@ -131,4 +137,23 @@ def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[
         if address in on_port.values():
             raise DriverError(DRIVER_NAME, f"two boards on {path} have address {address}, expected an address for each")
         on_port[number] = address
+    for path, boards in found.items():
+        if shared := set(boards.values()).intersection(_others(found, path)):
+            expected = "different addresses, or a path of each that stays with its plug, as under /dev/serial/by-path"
+            problem = f"{path} and another port have boards of address {min(shared)}, expected {expected}"
+            raise DriverError(DRIVER_NAME, problem)
     return found
+
+
+def is_stable(path: str) -> bool:
+    """Return whether a port's path stays with one plug: a link, as udev makes them, there already or not yet.
+
+    What the kernel numbers (`/dev/tty...`, `/dev/pts/...`) goes to whatever board is found first.
+    """
+    return not Path(path).name.startswith("tty") and (os.path.islink(path) or not os.path.exists(path))
+
+
+def _others(ports: Mapping[str, Mapping[int, int]], path: str) -> tuple[int, ...]:
+    """Return the addresses of boards on other ports, for which one here may be taken; none where the path is stable."""
+    others = {address for other, boards in ports.items() if other != path for address in boards.values()}
+    return () if is_stable(path) else tuple(sorted(others))

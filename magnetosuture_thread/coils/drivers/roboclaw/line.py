@@ -135,13 +135,20 @@ class LineThread:
         boards: number and address of each board on it.
         settings: of the bridge.
         mailbox: source of currents, and destination of reports.
+        others: addresses that none of the boards may answer to.
     """
 
     def __init__(
-        self, number: int, path: str, boards: dict[int, int], settings: CoilBridgeSettings, mailbox: Mailbox
+        self,
+        number: int,
+        path: str,
+        boards: dict[int, int],
+        settings: CoilBridgeSettings,
+        mailbox: Mailbox,
+        others: Sequence[int] = (),
     ) -> None:
-        self._number, self._path, self._addresses, self._settings = number, path, boards, settings
-        self._mailbox = mailbox
+        self._number, self._path, self._addresses, self._others = number, path, boards, others
+        self._settings, self._mailbox = settings, mailbox
         self._wake = mailbox.wake_events[number]
         self._stopping = threading.Event()
         self._boards: dict[int, Board] = {}
@@ -199,6 +206,8 @@ class LineThread:
             )
             for number, address in self._addresses.items()
         }
+        for board in self._boards.values():  # all, before any can acknowledge
+            board.identify(self._others)
         for board in self._boards.values():
             board.configure()
         self._mailbox.set_ready(self._number, self._report())

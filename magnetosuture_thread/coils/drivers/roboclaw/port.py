@@ -35,12 +35,14 @@ class ExchangePort(serial.Serial):
     Attributes:
         answer_timeout: as given.
         answer: the bytes that were read since `begin`.
+        is_drained: whether no answer to an earlier request can come any more; see `Board`.
     """
 
     def __init__(self, path: str, baud_rate: int, answer_timeout: float) -> None:
         self.answer_timeout = answer_timeout
         self._packet = bytearray()
         self.answer = bytearray()
+        self.is_drained = True
         self._until = self._expires = 0.0
         try:
             # The lock comes first, so that a process that holds the port is not disturbed.

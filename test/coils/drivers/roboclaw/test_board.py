@@ -29,6 +29,7 @@ from magnetosuture_thread.rig.power import packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.packets import checksum
 
+SUPPLY = packets.answer(128, packets.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
 
 
@@ -171,12 +172,40 @@ def test_only_the_right_byte_acknowledges(peer, port, reply: bytes):
         board(port).write_zero()
 
 
+@pytest.mark.parametrize(("command", "name"), [(packets.SET_DUTIES, "DutyM1M2"), (packets.SET_TIMEOUT, "SetTimeout")])
+def test_an_acknowledgement_is_not_taken_for_that_of_the_next_request(peer, port, command: int, name: str):
+    """Of a board that from some request on answers each packet only when the next one comes, however late that is."""
+    wait_for(port, 0.5)
+    answer, waiting = simulated(RoboClawBoard()), [b""]
+
+    def late(packet: bytes) -> bytes:
+        waiting.append(answer(packet))
+        is_late = any(heard[1] == command for heard in peer.heard)
+        return waiting.pop(0 if is_late else 1)
+
+    peer.answer(late)
+    with pytest.raises(DeviceError, match=f"no valid answer to {name}"):
+        board(port).configure()
+
+
+def test_after_an_answer_that_did_not_come_no_acknowledgement_counts_without_a_question(peer, port):
+    """As when boards are left, and there is no time for a question."""
+    wait_for(port, 0.5)
+    replies = iter([b""])
+    peer.answer(lambda _: next(replies, b"\xff"))
+    made = board(port, hurries=True)
+    for _ in range(3):
+        with pytest.raises(DeviceError):
+            made.write_zero()
+    assert len(peer.heard) == 3  # each was written
+
+
 def test_one_packet_may_get_lost(peer, port):
     wait_for(port, 0.5)
-    replies = iter([b"", b"\xff"])
+    replies = iter([b"", SUPPLY, b"\xff"])
     peer.answer(lambda _: next(replies))
     board(port).write_zero()
-    assert len(peer.heard) == 2
+    assert len(peer.heard) == 3
 
 
 def test_nothing_is_tried_twice_in_a_hurry(peer, port):
@@ -190,7 +219,7 @@ def test_nothing_is_tried_twice_in_a_hurry(peer, port):
 def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     peer.trickle(0.02)
     with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
-        board(port).configure()
+        board(port).identify()
     assert len(port.answer) < 48  # which the library would wait for
 
 
@@ -264,9 +293,10 @@ def test_a_packet_that_was_held_up_is_made_anew(peer, port, clock):
         port.write(bytes((value,)))
         return bool(port.read(1))
 
-    values = iter([(1,), (2,)])
+    values, made = iter([(1,), (2,)]), board(port)
+    vars(made)["_drain"] = lambda: True
     with pytest.raises(DeviceError):
-        board(port)._exchange(send, lambda: next(values), bool)
+        made._exchange(send, lambda: next(values), bool)
     assert os.read(peer.host, 100) == b"\x02"
 
 
@@ -293,6 +323,7 @@ def test_it_knows_what_the_board_says(peer, patient, port):
     there.duties, there.timeout = (5000, -5000), 0
     peer.answer(simulated(there))
     made = board(port)
+    made.identify()
     made.configure()
     assert made.version.startswith("RoboClaw simulated")
     assert made.voltage == 12.3
@@ -331,13 +362,16 @@ def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
 
 def test_a_second_attempt_takes_what_is_newest(peer, port):
     wait_for(port, 0.5)
-    replies = iter([b"", b"\xff"])
+    replies = iter([b"", SUPPLY, b"\xff"])
     peer.answer(lambda _: next(replies))
     made = board(port)
     made.voltage = 24.0
     newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
     made.write(lambda: next(newest))
-    assert [packet[2:6] for packet in peer.heard] == [struct.pack(">hh", 4095, -8191), bytes(4)]
+    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.SET_DUTIES] == [
+        struct.pack(">hh", 4095, -8191),
+        bytes(4),
+    ]
     assert made.warnings == ()
 
 

@@ -37,7 +37,8 @@ import numpy as np
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
-driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=sys.argv[1:], driver_timeout=0.3))
+boards = {"roboclaw_ports": sys.argv[1:], "roboclaw_addresses": (128, 129)}
+driver = RoboClawDriver(CoilBridgeSettings(**boards, driver_timeout=0.3))
 driver.open()
 while True:
     driver.apply(np.array([3.0, -6.0, 1.5, 0.0]), time.monotonic())
@@ -198,7 +199,7 @@ def test_warnings_of_a_board_are_said_and_it_goes_on(bench):
     driver = bench.open()
     bench.boards[1].warnings = 0x0010
     bench.wait(lambda: bool(driver.state().warnings), "the warning")
-    assert driver.state().warnings[0].endswith("address 128): Temperature Warning")
+    assert driver.state().warnings[0].endswith("address 129): Temperature Warning")
     assert "board 1" in driver.state().warnings[0]
     bench.wait(lambda: driver.state().ready, "the driver to be ready")
 
@@ -474,6 +475,9 @@ def test_a_port_that_is_not_there_is_waited_for(bench):
             "has 1, expected one for each of the 2",
         ),
         ({"roboclaw_ports": ("/dev/a", "/dev/a")}, "two boards on /dev/a have address 128"),
+        ({"roboclaw_ports": ("/dev/ttyACM0", "/dev/ttyACM1")}, "ttyACM0 and another port have boards of address 128"),
+        ({"roboclaw_ports": ("/dev/serial/by-path/a", "/dev/ttyACM1")}, "ttyACM1 and another port"),
+        ({"roboclaw_ports": ("/dev/null", "/dev/zero")}, "expected different addresses, or a path of each"),
         ({"roboclaw_ports": ("/dev/a", "/dev/b"), "driver_timeout": 0.25}, "0.25, expected tenths of a second"),
         ({"roboclaw_ports": ("/dev/a", "/dev/b"), "roboclaw_baud_rate": 9600}, "9600, expected at least 38400"),
     ],
@@ -481,3 +485,76 @@ def test_a_port_that_is_not_there_is_waited_for(bench):
 def test_settings_that_can_never_work_are_refused(changes: dict[str, Any], words: str):
     with pytest.raises(DriverError, match=words):
         RoboClawDriver(CoilBridgeSettings(**changes))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"roboclaw_ports": ("/dev/serial/by-path/a", "/dev/serial/by-path/b")},
+        {"roboclaw_ports": ("/dev/coils_left", "/dev/serial/by-id/b")},
+        {"roboclaw_ports": ("/dev/ttyACM0", "/dev/ttyACM1"), "roboclaw_addresses": (128, 129)},
+    ],
+)
+def test_boards_are_told_apart_by_address_or_by_a_path_that_stays(given: dict[str, Any]):
+    RoboClawDriver(CoilBridgeSettings(**given))
+
+
+def failures(driver: RoboClawDriver) -> list[int]:
+    """Return a list that gets the number of the line with each of its failures from now on."""
+    mailbox, found = driver._mailbox, list[int]()
+    assert mailbox is not None
+    real = mailbox.set_failed
+
+    def fail(line: int, problem: str) -> None:
+        found.append(line)
+        real(line, problem)
+
+    vars(mailbox)["set_failed"] = fail
+    return found
+
+
+def test_boards_that_are_exchanged_when_they_are_plugged_again_are_never_ready(bench):
+    driver = bench.open()
+    first, second = bench.stage.lines
+    with bench.held(driver, *CURRENTS):
+        bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
+        first.unplug()
+        second.unplug()
+        first.path, second.path = second.path, first.path
+        for board in bench.boards:
+            board.power_cycle()
+            board.timeline.clear()
+        heard = [board.heard for board in bench.boards]
+        first.plug()
+        second.plug()
+        tried = failures(driver)
+        bench.wait(lambda: min(tried.count(0), tried.count(1)) >= 3, "three attempts at each")
+        problem = driver.state().problem
+        assert f"board 0 ({second.path}, address 128): no valid answer" in problem
+        assert "ports are exchanged" in problem
+        assert not driver.state().ready
+    assert [board.heard for board in bench.boards] == heard
+    assert not any(board.timeline for board in bench.boards)
+
+
+@pytest.mark.parametrize("stable", [True, False])
+def test_boards_that_answer_to_any_address_need_paths_that_stay(bench, stable: bool):
+    """As all do over USB, where the board's address is not looked at."""
+
+    def usb(board: RoboClawBoard) -> Callable[[bytes, float], bytes]:
+        def receive(data: bytes, now: float) -> bytes:
+            board.address = data[0]
+            return RoboClawBoard.receive(board, data, now)
+
+        return receive
+
+    for board in bench.boards:
+        vars(board)["receive"] = usb(board)
+    bench.stage.open()
+    ports = [str(line.path if stable else line.path.resolve()) for line in bench.stage.lines]
+    driver = bench.open(ready=stable, roboclaw_ports=ports, **PATIENT)
+    if not stable:
+        bench.wait(lambda: "address 128): answers to address 129 too" in driver.state().problem, "the refusal")
+        tried = failures(driver)
+        bench.wait(lambda: min(tried.count(0), tried.count(1)) >= 3, "three attempts at each")
+        assert not driver.state().ready

@@ -50,5 +50,5 @@ def test_currents_that_grow_old_before_their_packet_is_written_are_zero(bench, m
     monkeypatch.setattr(port, "select", SimpleNamespace(select=stopped))
     for _ in range(4):
         driver.apply(CURRENTS, time.monotonic())
-        assert duties_during(bench, 0.3) == {(0, 0)}
+        assert duties_during(bench, 0.5) == {(0, 0)}
     assert driver.state().ready
