@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,29 @@ from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
+REPEATED = "camera repeats frames"
+MAX_CYCLE = 100  # frames; after more of them a repetition is not found
+SAMPLE_ROWS = 64  # of a frame, and as dense columns, that are compared; what moves in a dish covers several
+
+
+class RepetitionDetector:
+    """Finds frames that came before.
+
+    No sensor gives the same noise twice: a frame that is equal, bit for bit, to an earlier one of the last `MAX_CYCLE`
+    is not of this moment. Frames are compared by the hash of a sample of their pixels.
+    """
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, int]] = deque(maxlen=MAX_CYCLE)
+
+    def is_repeated(self, time_s: float, image: np.ndarray) -> bool:
+        """Return whether a frame, taken at a time [s], was there before that time, and keep it."""
+        step = max(1, min(image.shape[:2]) // SAMPLE_ROWS)
+        sample = hash(image[::step, ::step].tobytes())
+        # A bag that was wound back gives its frames again, at the same times.
+        repeated = any(sample == other and before < time_s for before, other in self._seen)
+        self._seen.append((time_s, sample))
+        return repeated
 
 
 @dataclass(frozen=True)
@@ -55,6 +79,7 @@ class TrackerSession:
 
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
         self._tracker = VisionTracker(settings, scene)
+        self._repetition = RepetitionDetector()
         self.frames = self.tracked = 0
 
     @property
@@ -71,11 +96,13 @@ class TrackerSession:
         self._tracker.set_lens(lens)
 
     def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
-        """Look at the next frame, taken at a time [s]; see `VisionTracker.track`."""
+        """Look at the next frame, taken at a time [s]; see `VisionTracker.track`. One that came before has no pose."""
         try:
             track = self._tracker.track(image, time_s)
         except InvalidInputError as error:
             return self.on_broken(error)
+        if self._repetition.is_repeated(time_s, image) and len(track.tail):
+            track = no_pose(self.missing, REPEATED, track.view)
         self.frames += 1
         self.tracked += track.state is State.TRACKED
         return FrameMeasurement(track, published_centreline(track))

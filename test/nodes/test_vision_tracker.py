@@ -6,6 +6,7 @@ import threading
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
@@ -33,8 +34,10 @@ def frame(camera, thread_arc) -> np.ndarray:
 
 
 def compressed(image: np.ndarray, stamp) -> CompressedImage:
-    """Return an image as a JPEG message."""
-    message = CompressedImage(format="jpeg", data=encode_jpeg(image, 90).tobytes())
+    """Return an image as a JPEG message, with a sensor's noise of that moment."""
+    random = np.random.default_rng(stamp.sec * 10**9 + stamp.nanosec)
+    noisy = cv2.add(image, random.integers(0, 3, image.shape, dtype=np.uint8))
+    message = CompressedImage(format="jpeg", data=encode_jpeg(noisy, 90).tobytes())
     message.header.stamp = stamp
     return message
 
@@ -51,13 +54,17 @@ def states(diagnostics) -> list[str]:
     return [array.status[0].message for array in diagnostics]
 
 
-def test_that_kernels_are_being_compiled_is_reported_meanwhile(graph, monkeypatch):
+@pytest.mark.parametrize(("compiles", "word"), [(False, "loading"), (True, "compiling")])
+def test_that_kernels_are_loaded_or_compiled_is_reported_meanwhile(graph, monkeypatch, compiles: bool, word: str):
     reports = graph.listen_later(topics.DIAGNOSTICS)
-    monkeypatch.setattr(
-        vision_tracker,
-        "warm_up",
-        lambda: graph.wait(lambda: states(reports).count(vision_tracker.LOADING) > 1, "the report, and once more"),
-    )
+
+    def warm_up() -> None:
+        if compiles:
+            numba.njit(lambda x: x)(1)
+        reported = [f"{word} the tracker's kernels" + ", once on this machine" * compiles] * 2
+        graph.wait(lambda: states(reports)[-2:] == reported, "the report, and once more")
+
+    monkeypatch.setattr(vision_tracker, "warm_up", warm_up)
     graph.add(VisionTrackerNode, scene="dish_35mm")
     graph.wait(lambda: states(reports)[-1] == "no camera frame yet", "the end of it")
 
@@ -129,6 +136,22 @@ def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camer
     graph.wait(lambda: len(tracking) > 4, "a state")
     assert tracking[4].state == TrackerState.STATE_LOST
     assert len(poses) == 2
+
+
+def test_a_camera_that_repeats_frames_gives_no_pose_until_a_new_one_comes(graph, camera, thread_arc):
+    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
+    reports = graph.listen(topics.DIAGNOSTICS)
+    shown = [compressed(frame(camera, thread_arc), Time()) for _ in range(3)]
+    for index, message in enumerate((shown[0], shown[1], shown[0], shown[1], shown[2])):
+        message.header.stamp = Time(sec=5 + index)
+        graph.publish(topics.COMPRESSED_IMAGE, message)
+        graph.wait(lambda n=index: len(tracking) > n, "a state")
+        if index == 3:
+            graph.wait(lambda: states(reports)[-1] == "lost: camera repeats frames", "the reason on /diagnostics")
+    tracked, repeated = (TrackerState.STATE_TRACKED, ""), (TrackerState.STATE_LOST, "camera repeats frames")
+    assert [(each.state, each.reason) for each in tracking] == [tracked] * 2 + [repeated] * 2 + [tracked]
+    graph.wait(lambda: [each.header.stamp.sec for each in poses] == [5, 6, 9], "poses of new frames alone")
 
 
 def test_of_frames_that_wait_only_the_newest_two_are_tracked(graph, camera, thread_arc, monkeypatch):

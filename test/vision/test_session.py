@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.look import State
-from magnetosuture_thread.vision.session import TrackerSession
+from magnetosuture_thread.vision.session import REPEATED, RepetitionDetector, TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 TAIL = np.array([0.002, 0.001])
@@ -33,3 +35,32 @@ def test_frames_are_counted_and_the_centreline_is_equally_spaced(camera, thread_
     assert broken.track.reason == "image.data: got 3 bytes, expected a picture"
     assert len(broken.centreline) == 0
     assert (session.frames, session.tracked) == (3, 1)
+
+
+def test_a_frame_that_came_before_has_no_pose_and_the_next_new_one_has(camera, thread_arc):
+    one, other, third = (camera.render(TAIL, 0.4, thread_arc(TAIL, 0.4 + np.pi, 40.0)) for _ in range(3))
+    session = TrackerSession(VisionTrackerSettings(confirm_frames=1), Scene())
+    reasons = [
+        session.on_image(float(at), image).track.reason for at, image in enumerate((one, one, other, one, third))
+    ]
+    assert reasons == ["", REPEATED, "", REPEATED, ""]
+    assert (session.frames, session.tracked) == (5, 3)
+    wound_back = [session.on_image(at, image) for at, image in ((0.0, one), (2.0, other))]
+    assert [each.track.reason for each in wound_back] == ["", ""]
+
+
+@pytest.mark.parametrize("cycle", [1, 10, 100])
+def test_a_cycle_of_frames_is_found_in_its_second_round(cycle: int):
+    frames = np.random.default_rng(1).integers(0, 256, (cycle, 96, 128, 3), dtype=np.uint8)
+    detector = RepetitionDetector()
+    found = [detector.is_repeated(float(at), frames[at % cycle]) for at in range(3 * cycle)]
+    assert found == [False] * cycle + [True] * 2 * cycle
+
+
+@pytest.mark.parametrize("quality", [None, 60])
+def test_the_simulated_camera_never_repeats_itself_over_a_needle_at_rest(camera, thread_arc, quality: int | None):
+    thread, detector = thread_arc(TAIL, 0.4 + np.pi, 40.0), RepetitionDetector()
+    for at in range(60):
+        image = camera.render(TAIL, 0.4, thread)
+        image = image if quality is None else decode_image(encode_jpeg(image, quality))
+        assert not detector.is_repeated(float(at), image)

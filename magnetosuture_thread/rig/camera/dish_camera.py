@@ -61,7 +61,8 @@ class DishCamera:
     """Renders frames of a scene.
 
     What stands still is drawn and exposed once, with several fields of noise; a frame takes one of these
-    pictures and draws the region of what moves anew.
+    pictures and draws the region of what moves anew. There the field is shifted, each colour by itself, to where it was
+    never used: as of a sensor, no two frames are equal, also of a needle at rest.
 
     Args:
         scene: what stands before the camera.
@@ -90,6 +91,7 @@ class DishCamera:
         self._still = self._through_lens(self._background)
         self._noise = [self._noise_field() for _ in range(noise_fields)]
         self._exposed = [self._expose(self._still, noise, 1.0) for noise in self._noise]
+        self._shifts, self._shifting = np.zeros((noise_fields, 3, 2), np.int64), np.random.default_rng(seed)
 
     def render(
         self, tail: Points, heading: float, thread: Points, covers: tuple[Cover, ...] = (), gain: float = 1.0
@@ -118,7 +120,7 @@ class DishCamera:
             self._add_strand_and_needle(region, box, line, outline, tail, heading)
             for cover, edge in zip(covers, edges, strict=True):
                 self._add_cover(region, box, cover, edge)
-            image[box] = self._expose(self._through_lens(region), noise[box], gain)
+            image[box] = self._expose(self._through_lens(region), self._noise_in(box, chosen), gain)
         return image
 
     def _add_strand_and_needle(
@@ -170,6 +172,15 @@ class DishCamera:
         noise = self._random.standard_normal((height, width, 3), dtype=np.float32)
         level = np.float32(self._lighting.noise * NOISE_LEVEL / np.sqrt(90.0))
         return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
+
+    def _noise_in(self, box: Box, chosen: int) -> Light:
+        """Return a field's noise in a region, shifted as at no use before; fields go on beyond their borders."""
+        field, noise = self._noise[chosen], []
+        for colour, shift in enumerate(self._shifts[chosen]):
+            rows, columns = (np.arange(part.start, part.stop) + by for part, by in zip(box, shift, strict=True))
+            noise.append(field[:, :, colour].take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap"))
+        self._shifts[chosen] = self._shifting.integers(field.shape[:2], size=(3, 2))
+        return np.dstack(noise)
 
     def _expose(self, light: Light, noise: Light, gain: float) -> Image:
         """Expose the sensor, add its noise, which grows with the root of the light, and round to 8 bits."""
