@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.obstacles.shapes import Ring
 from magnetosuture_thread.interface import DISH_FRAME, SCENE
 from magnetosuture_thread.scene.scene import (
-    MAX_HOLES,
     MAX_NAME_CHARS,
+    MAX_OUTLINES,
     MAX_SHAPES,
     MAX_VERTICES,
     VERSION_CHARS,
@@ -96,7 +96,6 @@ def _require_bounds(message: Any) -> None:
             raise InvalidInputError(f"{SCENE.name}.{field}", count, f"at most {maximum}")
 
     require("shapes", len(message.shapes), MAX_SHAPES)
-    vertices = 0
     for index, shape in enumerate(message.shapes):
         field = f"shapes[{index}]"
         require(f"{field}.name", len(shape.name), MAX_NAME_CHARS)
@@ -104,24 +103,23 @@ def _require_bounds(message: Any) -> None:
         if len(shape.disc) + len(shape.polygon) != 1:
             given = f"{len(shape.disc)} discs and {len(shape.polygon)} polygons"
             raise InvalidInputError(f"{SCENE.name}.{field}", given, "one disc or one polygon")
-        for polygon in shape.polygon:
-            require(f"{field}.polygon.holes", len(polygon.holes), MAX_HOLES)
-            vertices += sum(len(ring.corners) for ring in (polygon.outline, *polygon.holes))
-    require("shapes.polygon.corners", vertices, MAX_VERTICES)
+    polygons = [polygon for shape in message.shapes for polygon in shape.polygon]
+    rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
+    require("shapes.polygon", len(rings), MAX_OUTLINES)
+    require("shapes.polygon.corners", sum(len(ring.corners) for ring in rings), MAX_VERTICES)
 
 
 def _shape_of(shape: Any) -> SceneShape:
     geometry: Disc | Polygon
-    if len(shape.disc):
-        disc = shape.disc[0]
-        geometry = Disc((float(disc.x), float(disc.y)), float(disc.radius))
-    else:
-        polygon = shape.polygon[0]
-        try:
+    try:
+        if len(shape.disc):
+            disc = shape.disc[0]
+            geometry = Disc((float(disc.x), float(disc.y)), float(disc.radius))
+        else:
+            polygon = shape.polygon[0]
             geometry = Polygon(_ring(polygon.outline), tuple(_ring(hole) for hole in polygon.holes))
-            triangulate(geometry)
-        except ConfigurationError as error:
-            raise ConfigurationError(f"{shape.name}.{error.name}", error.value, error.expectation) from None
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{shape.name}.{error.name}", error.value, error.expectation) from None
     return SceneShape(shape.name, shape.kind, geometry, friction=float(getattr(shape, "friction", 0.0)))
 
 

@@ -9,6 +9,7 @@ from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.texts import shortened
 
 
 def initial_scene(name: str) -> Scene | None:
@@ -23,8 +24,8 @@ def initial_scene(name: str) -> Scene | None:
 class SceneFollower:
     """The scene that a node goes by.
 
-    A message that is damaged, or whose scene the node cannot use, is reported to the node's health with the reason;
-    the scene before stays in force.
+    Of a message that is damaged, or whose scene the node cannot use, the reason is reported to the node's health and
+    kept in `problem` until a good one comes; the scene before stays in force.
 
     Args:
         node: that subscribes.
@@ -35,6 +36,7 @@ class SceneFollower:
 
     Attributes:
         scene: in force; None until one is known.
+        problem: why the scene that came last is not in force; empty where it is, or none came.
     """
 
     def __init__(
@@ -44,8 +46,8 @@ class SceneFollower:
         scene: Scene | None,
         changed: Callable[[Scene], None] = lambda scene: None,
     ) -> None:
-        self.scene = scene
-        self._heard: Scene | None = None  # the last one of the topic, also where it was refused
+        self.scene, self.problem = scene, ""
+        self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
         self._node, self._health, self._changed = node, health, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
 
@@ -63,22 +65,24 @@ class SceneFollower:
         if self._heard is None:
             self.scene = initial_scene(name)
         else:
-            self.scene = self._heard
+            self.scene, self.problem = self._heard, ""
             if name:
                 self._node.get_logger().info(f"scene {self.version} of the topic, and not that of the parameter")
         return self.scene
 
     def on_scene(self, data: bytes) -> None:
         """Handle a published scene."""
+        self._heard = None
         try:
             self._heard = scene = received_scene(data)
-            if scene.version == self.version:
-                return
-            self._changed(scene)
+            if scene.version != self.version:
+                self._changed(scene)
         except MagnetosutureError as error:
-            self._health.refuse(error)
-            return
-        self.scene = scene
+            self.problem = f"scene refused: {shortened(str(error))}"
+            self._health.refuse(error, **{"scene problem": self.problem})
+        else:
+            self.scene, self.problem = scene, ""
+            self._health.note(**{"scene problem": "none"})
 
 
 def received_scene(data: bytes) -> Scene:

@@ -18,7 +18,7 @@ MIN_OVERLAP_AREA = 1e-12  # m^2; shapes that share a boundary do not overlap
 WALL_NAME = "wall"
 
 
-def find_collision(scene: Scene, points: Points, *, holes: bool = True) -> str:
+def find_collision(scene: Scene, points: Points, depth: float = 0.0, *, holes: bool = True) -> str:
     """Return the name of what a line through points collides with: `wall`, a shape, or empty for nothing.
 
     It collides with the wall at or beyond it.
@@ -26,14 +26,15 @@ def find_collision(scene: Scene, points: Points, *, holes: bool = True) -> str:
     Args:
         scene: dish and shapes.
         points: of the line; of a point alone, shape (1, 2); shape (m, 2) [m].
+        depth: by which it may lie in the wall or a shape [m].
         holes: whether the holes of a shape are open; else they are taken for part of it.
     """
-    if (np.linalg.norm(points, axis=1) >= scene.dish.radius).any():
+    if (np.linalg.norm(points, axis=1) >= scene.dish.radius + depth).any():
         return WALL_NAME
     line = shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
     for shape in scene.shapes:
         solid = shape.solid if holes else shapely.Polygon(shapely.get_exterior_ring(shape.solid))
-        if solid.intersects(line):
+        if (solid.buffer(-depth) if depth else solid).intersects(line):
             return shape.name
     return ""
 

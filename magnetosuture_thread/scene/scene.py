@@ -10,11 +10,12 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import shapely
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
 
@@ -59,8 +60,10 @@ KINDS = ("tissue", "instrument", "wall")
 """What a shape is: tissue, an instrument or post, or a rigid wall inside of the dish."""
 
 MAX_SHAPES = 200
-MAX_VERTICES = 10_000  # of all polygons of a scene together
-MAX_HOLES = 100  # of a polygon: each is compared with each
+# A coil bridge adopts a scene within 20 ms: that takes 4 us a vertex and 0.2 ms an outline.
+MAX_VERTICES = 1500  # of all polygons of a scene together
+MAX_OUTLINES = 40  # the same, holes included
+MIN_EDGE = 2e-6  # m; a 30th of the thinnest thread, and what arcs and contacts may be off
 MAX_NAME_CHARS = 64
 MAX_COORDINATE = 1.0  # m; anything larger is in another unit
 MIN_RADIUS = 1e-6  # m
@@ -83,6 +86,7 @@ def _check_friction(name: str, value: Any) -> None:
         raise scene_error(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
 
 
+@checked_arguments("dish")
 @dataclass(frozen=True)
 class Dish:
     """The round petri dish; its centre is the origin of the dish frame.
@@ -98,20 +102,10 @@ class Dish:
         ConfigurationError: a value is not finite or not within its bounds.
     """
 
-    diameter: float = 0.035
-    depth: float = 0.003
-    wall_friction: float = 0.0
+    diameter: Annotated[float, bounded("m", 0.005, 0.5)] = 0.035
+    depth: Annotated[float, bounded("m", 1e-5, 0.1)] = 0.003
+    wall_friction: Annotated[float, bounded("", 0.0, MAX_FRICTION)] = 0.0
     self_contact: bool | None = None
-
-    def __post_init__(self) -> None:
-        """Check the bounds."""
-        for name, low, high in (("diameter", 0.005, 0.5), ("depth", 1e-5, 0.1)):
-            value = getattr(self, name)
-            if not (is_number(value) and low <= value <= high):
-                raise scene_error(f"dish.{name}", value, f"a number from {low:g} to {high:g} m")
-        _check_friction("dish.wall_friction", self.wall_friction)
-        if not (self.self_contact is None or isinstance(self.self_contact, bool)):
-            raise scene_error("dish.self_contact", self.self_contact, "true, false, or nothing: by the depth")
 
     def has_self_contact(self, thread_diameter: float) -> bool:
         """Return whether a thread touches itself where it would cross itself.
@@ -131,6 +125,7 @@ class Dish:
         return 0.5 * self.diameter
 
 
+@checked_arguments("shape")
 @dataclass(frozen=True)
 class SceneShape:
     """A named shape that stands in the dish.
@@ -161,21 +156,24 @@ class SceneShape:
             raise scene_error(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
         _check_friction(f"{self.name}.friction", self.friction)
         if isinstance(self.geometry, Disc):
-            object.__setattr__(self, "geometry", _checked_disc(self.name, self.geometry))
+            if len(self.geometry.centre) != 2:
+                raise scene_error(f"{self.name}.disc.centre", self.geometry.centre, "two coordinates x, y [m]")
             return
         farthest = float(np.abs(self.geometry.outline).max())
         if farthest > MAX_COORDINATE:
             expectation = f"coordinates of at most {MAX_COORDINATE:g}, in metres"
             raise scene_error(f"{self.name}.polygon.outline", farthest, expectation)
-        if len(self.geometry.holes) > MAX_HOLES:
-            raise scene_error(f"{self.name}.polygon.holes", f"{len(self.geometry.holes)} holes", f"at most {MAX_HOLES}")
+        shortest = min(float(np.hypot(*(ring - np.roll(ring, 1, axis=0)).T).min()) for ring in self.geometry.rings)
+        if shortest < MIN_EDGE:
+            raise scene_error(f"{self.name}.polygon", shortest, f"edges of at least {MIN_EDGE:g} m")
 
     @cached_property
     def solid(self) -> shapely.Geometry:
         """The shape as a shapely geometry; a disc as a polygon of 256 vertices."""
         if isinstance(self.geometry, Disc):
             return shapely.Point(self.geometry.centre).buffer(self.geometry.radius, quad_segs=64)
-        return shapely.Polygon(self.geometry.outline, self.geometry.holes)
+        outline, *holes = self.geometry.rings
+        return shapely.Polygon(outline, holes)
 
     @property
     def area(self) -> float:
@@ -204,6 +202,7 @@ class SceneShape:
         return [[(x, y) for x, y in ring.coords[:-1]] for ring in (drawn.exterior, *drawn.interiors)]
 
 
+@checked_arguments("scene")
 @dataclass(frozen=True)
 class Scene:
     """The dish and the shapes in it. Shapes are numbered in their order; margins name them by that index.
@@ -223,16 +222,19 @@ class Scene:
         """Check the shapes together."""
         if len(self.shapes) > MAX_SHAPES:
             raise scene_error("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
-        vertices = sum(
-            sum(map(len, shape.geometry.rings)) for shape in self.shapes if isinstance(shape.geometry, Polygon)
-        )
-        if vertices > MAX_VERTICES:
-            raise scene_error("shapes", f"{vertices} vertices", f"at most {MAX_VERTICES} in all")
+        polygons = [shape.geometry for shape in self.shapes if isinstance(shape.geometry, Polygon)]
+        rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
+        for count, what, most in (
+            (len(rings), "outlines and holes", MAX_OUTLINES),
+            (sum(map(len, rings)), "vertices", MAX_VERTICES),
+        ):
+            if count > most:
+                raise scene_error("shapes", f"{count} {what}", f"at most {most} in all")
         names = Counter(shape.name for shape in self.shapes)
         for shape in self.shapes:
             if names[shape.name] > 1:
                 raise scene_error(shape.name, "a name given twice", "a name of its own for each shape")
-            near, far = _distance_and_coverage(shape.geometry, self.dish.radius)
+            near, far = _distance_and_coverage(shape, self.dish.radius)
             if near >= self.dish.radius:
                 raise scene_error(
                     shape.name,
@@ -245,6 +247,7 @@ class Scene:
                 )
 
     @classmethod
+    @checked_arguments("scene")
     def create(cls, *, dish_diameter: float = 0.035, shapes: Mapping[str, Disc | Polygon] | None = None) -> Scene:
         """Return a scene with named shapes, all of them tissue.
 
@@ -332,27 +335,12 @@ def is_name(text: Any) -> bool:
     return isinstance(text, str) and 0 < len(text) <= MAX_NAME_CHARS and text.isprintable() and text == text.strip()
 
 
-def _checked_disc(name: str, disc: Disc) -> Disc:
-    """Return a disc with built-in floats, after checking its bounds."""
-    values = (*disc.centre, disc.radius)
-    if len(values) != 3 or not all(math.isfinite(value) for value in values):
-        raise scene_error(f"{name}.disc", list(values), "finite x, y and radius")
-    x, y, radius = map(float, values)
-    if max(abs(x), abs(y)) > MAX_COORDINATE:
-        raise scene_error(
-            f"{name}.disc.center", [x, y], f"two coordinates x, y of at most {MAX_COORDINATE:g}, in metres"
-        )
-    if not MIN_RADIUS <= radius <= MAX_COORDINATE:
-        raise scene_error(f"{name}.disc.radius", radius, f"a number from {MIN_RADIUS:g} to {MAX_COORDINATE:g} m")
-    return Disc((x, y), radius)
-
-
-def _distance_and_coverage(geometry: Disc | Polygon, dish_radius: float) -> tuple[float, bool]:
+def _distance_and_coverage(shape: SceneShape, dish_radius: float) -> tuple[float, bool]:
     """Return a shape's distance from the dish's centre [m], and whether it leaves any of the dish uncovered."""
+    geometry, solid = shape.geometry, shape.solid
     if isinstance(geometry, Disc):
         away = math.hypot(*geometry.centre)
         return max(0.0, away - geometry.radius), away + dish_radius > geometry.radius
-    solid = shapely.Polygon(geometry.outline, geometry.holes)
     near = float(solid.distance(shapely.Point(0.0, 0.0)))
     if near > 0.0:
         return near, True

@@ -12,7 +12,14 @@ import shapely
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.obstacles.shapes import Ring
-from magnetosuture_thread.scene.scene import MAX_COORDINATE, MAX_HOLES, MAX_VERTICES, MIN_RADIUS, is_number, scene_error
+from magnetosuture_thread.scene.scene import (
+    MAX_COORDINATE,
+    MAX_OUTLINES,
+    MAX_VERTICES,
+    MIN_RADIUS,
+    is_number,
+    scene_error,
+)
 
 
 class ShapeFields:
@@ -54,8 +61,8 @@ class ShapeFields:
         given = self._take(field, default)
         if not isinstance(given, Sequence) or isinstance(given, str):
             raise self.error(field, given, "a list of outlines, each a list of points [m]")
-        if len(given) > MAX_HOLES:
-            raise self.error(field, f"{len(given)} outlines", f"at most {MAX_HOLES}")
+        if len(given) > MAX_OUTLINES:
+            raise self.error(field, f"{len(given)} outlines", f"at most {MAX_OUTLINES}")
         return [_ring(self, f"{field}[{index}]", ring) for index, ring in enumerate(given)]
 
     def ring(self, field: str) -> Ring:

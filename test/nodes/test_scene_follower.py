@@ -48,6 +48,11 @@ def publish(graph: Any, scene: Scene) -> None:
     graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), scene))
 
 
+def values(reports: list[Any]) -> dict[str, str]:
+    """Return the values of the last report."""
+    return {each.key: each.value for each in reports[-1].status[0].values}
+
+
 def refused(graph: Any, reports: list[Any], words: str) -> None:
     """Wait until the node's health has a refusal with these words."""
     graph.wait(lambda: any(words in report.status[0].message for report in reports), f"the refusal: {words}")
@@ -77,8 +82,12 @@ def test_a_damaged_message_is_reported_and_the_scene_before_stays(graph, node):
     graph.publish(topics.SCENE, message)
     refused(graph, reports, "refused: scene.version: got ")
     assert (node.follower.scene, node.changes) == (POST, [])
+    assert node.follower.problem.startswith("scene refused: scene.version: got ")
+    assert node.follower.load("dish_35mm_post") == POST
+    assert node.follower.problem  # a node that is configured again has not heard it any better
     publish(graph, HERNIA)
     graph.wait(lambda: node.follower.scene == HERNIA, "a good one")
+    assert node.follower.problem == ""
 
 
 def test_a_scene_that_the_node_cannot_use_is_reported_and_the_one_before_stays(graph, node):
@@ -87,6 +96,10 @@ def test_a_scene_that_the_node_cannot_use_is_reported_and_the_one_before_stays(g
     publish(graph, HERNIA)
     refused(graph, reports, "refused: coil_bridge.keep_out: got 0.02, expected at most 0.01 m in this dish")
     assert node.follower.scene == POST
+    assert node.follower.problem.startswith("scene refused: coil_bridge.keep_out: got 0.02")
+    graph.wait(lambda: values(reports).get("scene problem") == node.follower.problem, "the problem beside the state")
+    publish(graph, POST)  # which is in force
+    graph.wait(lambda: not node.follower.problem, "the scene before, told again")
     node.refusal = None
     publish(graph, HERNIA)  # again, as it is not in force
     graph.wait(lambda: node.follower.scene == HERNIA, "the scene")
@@ -114,7 +127,7 @@ def test_bytes_that_are_no_scene_are_refused():
     for length in (0, 4, 40, 100, len(whole) // 2, len(whole) - 9):
         with pytest.raises(InvalidInputError, match=r"^scene"):
             received_scene(whole[:length])
-    with pytest.raises(InvalidInputError, match=r"^scene: got 524289 bytes, expected at most 524288"):
+    with pytest.raises(InvalidInputError, match=r"^scene: got 131073 bytes, expected at most 131072"):
         received_scene(bytes(topics.SCENE.max_bytes + 1))
     with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
         received_scene(whole.replace(b"gripper", b"grip\xff\xfe\xfd"))

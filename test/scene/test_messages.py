@@ -21,7 +21,7 @@ from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 from test.scene.scenes import every_shape
 
 LARGE = Polygon(
-    tuple((0.01 * np.cos(a), 0.01 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 9000, endpoint=False))
+    tuple((0.01 * np.cos(a), 0.01 * np.sin(a)) for a in np.linspace(0.0, 2.0 * np.pi, 1500, endpoint=False))
 )
 SCENES = {
     "every shape": every_shape(),
@@ -119,7 +119,7 @@ DAMAGE: list[tuple[Callable[[Any], None], str]] = [
     (of_one("shapes.0.name", "a\nb"), r"scene.shape.name: got 'a\nb', expected 1 to 64 printable characters"),
     (of_one("shapes.0.name", "ring"), "scene.ring: got 'a name given twice', expected a name of its own"),
     (of_one("shapes.0.disc", []), "scene.shapes[0]: got 0 discs and 0 polygons, expected one disc or one polygon"),
-    (of_one("shapes.0.disc.0.radius", float("inf")), "scene.post.disc: got [0.0077, 0.0039, inf], expected finite"),
+    (of_one("shapes.0.disc.0.radius", float("inf")), "scene.post.disc.radius: got inf, expected a number from"),
     (of_one("shapes.0.disc.0.radius", 5e-7), "scene.post.disc.radius: got 5e-07, expected a number from 1e-06"),
     (of_one("shapes.0.disc.0.x", 0.5), "scene.post: got 'a shape outside of the dish"),
     (of_one("shapes.1.polygon.0.outline.corners", []), "scene.ring.polygon.outline: got '0 distinct points', expected"),
@@ -144,14 +144,12 @@ def test_a_damaged_message_is_refused_in_one_line(way: Callable[[Scene], Any], h
 def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it(way: Callable[[Scene], Any]):
     message = way(every_shape())
     ring = message.shapes[1].polygon[0]
-    ring.holes = [ring.holes[0]] * 101
-    with pytest.raises(InvalidInputError, match=r"^scene\.shapes\[1\]\.polygon\.holes: got 101, expected at most 100$"):
+    ring.holes = [ring.holes[0]] * 41
+    with pytest.raises(InvalidInputError, match=r"^scene\.shapes\.polygon: got 4\d, expected at most 40$"):
         messages.parse_scene_message(message)
     ring.holes = []
-    ring.outline.corners = [ring.outline.corners[0]] * 10_001
-    with pytest.raises(
-        InvalidInputError, match=r"^scene\.shapes\.polygon\.corners: got 10\d\d\d, expected at most 10000$"
-    ):
+    ring.outline.corners = [ring.outline.corners[0]] * 1501
+    with pytest.raises(InvalidInputError, match=r"^scene\.shapes\.polygon\.corners: got \d{4}, expected at most 1500$"):
         messages.parse_scene_message(message)
     message.shapes = [message.shapes[0]] * 201
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes: got 201, expected at most 200$"):

@@ -209,7 +209,7 @@ BAD: list[tuple[Any, str]] = [
         {"polygon": {"outline": SQUARE, "holes": [SQUARE] * 101}},
         "post.polygon.holes: got '101 outlines', expected at m",
     ),
-    ({"polygon": {"outline": SQUARE * 2501}}, "post.polygon.outline: got '10004 points', expected at most 10000"),
+    ({"polygon": {"outline": SQUARE * 376}}, "post.polygon.outline: got '1504 points', expected at most 1500"),
     ({"polygon": {"outline": SQUARE}, "corner_radius": 0.006}, "post.corner_radius: got 0.006, expected a radius of"),
 ]
 

@@ -5,27 +5,44 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely.validation import explain_validity
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.arrays import as_numbers
 from magnetosuture_thread.geometry.polyline import Points
 
+MAX_COORDINATE = 10.0
+"""A coordinate beyond this is taken for one in another unit [m]."""
+MIN_EXTENT = 1e-6
+"""A shape smaller than this in every direction is taken for one in another unit [m]."""
 
+
+@checked_arguments("disc")
 @dataclass(frozen=True)
 class Disc:
     """A disc in the plane, or a ball in space.
 
     Attributes:
-        centre: coordinates of the centre, d values [m].
+        centre: coordinates of the centre, two or three values [m].
         radius: radius [m].
+
+    Raises:
+        ConfigurationError: a number cannot be metres, or there are not two or three coordinates.
     """
 
-    centre: tuple[float, ...]
-    radius: float
+    centre: Annotated[tuple[float, ...], bounded("m", -MAX_COORDINATE, MAX_COORDINATE)]
+    radius: Annotated[float, bounded("m", MIN_EXTENT, MAX_COORDINATE)]
+
+    def __post_init__(self) -> None:
+        """Check the dimension."""
+        if len(self.centre) not in (2, 3):
+            raise ConfigurationError("disc.centre", self.centre, "two coordinates, or three in space [m]")
 
     def signed_distance(self, points: Points) -> tuple[NDArray[np.float64], Points]:
         """Return the signed distance of points from the surface, and the outward direction.
@@ -46,13 +63,10 @@ class Disc:
         return distance - self.radius, normal
 
 
-MAX_COORDINATE = 10.0
-"""A coordinate beyond this is taken for one in another unit [m]."""
-MIN_EXTENT = 1e-6
-"""A shape smaller than this in every direction is taken for one in another unit [m]."""
-
 Vertex = tuple[float, float]
 Ring = tuple[Vertex, ...]
+
+_FIT_TOLERANCE = 1e-3  # of the radius of a disc that fits into a solid
 
 # Of an edge between two sharp corners each arc may use just under half, so that a piece of the edge
 # remains: vertices nearly on top of each other would be an edge without a direction.
@@ -83,9 +97,12 @@ class Polygon:
 
     def __post_init__(self) -> None:
         """Check and normalise what was given."""
+        if not isinstance(self.holes, Sequence):
+            raise ConfigurationError("polygon.holes", self.holes, "a list of outlines", self.source)
         outline = _checked_ring("polygon.outline", self.outline, self.source)
         holes = tuple(_checked_ring(f"polygon.holes[{i}]", hole, self.source) for i, hole in enumerate(self.holes))
-        _check_holes(outline, holes, self.source)
+        if holes:
+            _check_holes(outline, holes, self.source)
         object.__setattr__(self, "outline", _oriented(outline, counter_clockwise=True))
         object.__setattr__(self, "holes", tuple(_oriented(hole, counter_clockwise=False) for hole in holes))
 
@@ -100,9 +117,13 @@ class Polygon:
         return sum(_signed_area(ring) for ring in (self.outline, *self.holes))
 
     def can_contain(self, radius: float) -> bool:
-        """Return whether a disc of this radius fits into the solid somewhere [m]."""
+        """Return whether a disc of this radius fits into the solid somewhere, to `_FIT_TOLERANCE` of it [m].
+
+        An offset outline would say it too, but of a comb it takes minutes: each corner meets every other.
+        """
+        tolerance = _FIT_TOLERANCE * radius
         solid = shapely.Polygon(self.outline, self.holes)
-        return not solid.buffer(-radius).is_empty
+        return bool(shapely.maximum_inscribed_circle(solid, tolerance).length >= radius - tolerance)
 
     def smoothed(self, radius: float, angle: float = math.pi / 6, step: float = math.pi / 18) -> Polygon:
         """Return the polygon with its sharp corners rounded by arcs tangent to both edges.
@@ -163,10 +184,10 @@ def check_metres(name: str, points: NDArray[np.float64], source: str) -> None:
 
 def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> Ring:
     """Return a ring without duplicates and closing point, once it is known to bound an area."""
-    for i, point in enumerate(given):
-        if len(point) != 2:
-            raise ConfigurationError(f"{name}[{i}]", tuple(point), "two coordinates x, y [m]", source)
-    points = [(float(x), float(y)) for x, y in given]
+    try:
+        points = [(float(x), float(y)) for x, y in given]
+    except (TypeError, ValueError, OverflowError):
+        raise ConfigurationError(name, given, "points of two coordinates x, y [m]", source) from None
     if len(set(points)) < 3:
         raise ConfigurationError(name, f"{len(set(points))} distinct points", "at least 3 points", source)
     array = np.array(points)
@@ -177,7 +198,7 @@ def _checked_ring(name: str, given: Sequence[Sequence[float]], source: str) -> R
         ring = (ring[-1], *ring[:-1])
     if _is_flat(array):
         raise ConfigurationError(name, "zero area", "points that are not all on one line", source)
-    shape = shapely.Polygon(ring)
+    shape = shapely.Polygon(array)
     if not shape.is_valid:
         raise ConfigurationError(
             name, str(explain_validity(shape)), "an outline that does not cross or touch itself", source
@@ -317,7 +338,8 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Check and normalise what was given."""
-        vertices = np.array(self.vertices, dtype=np.float64)
+        vertices = np.array(as_numbers("mesh.vertices", self.vertices))
+        as_numbers("mesh.faces", self.faces)
         faces = np.array(self.faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
             self._refuse("vertices", f"shape {vertices.shape}", "shape (v, 3) [m]")

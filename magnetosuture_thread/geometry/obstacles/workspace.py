@@ -6,10 +6,12 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.contacts import (
@@ -28,7 +30,7 @@ from magnetosuture_thread.geometry.obstacles.search import (
     closest_in_space,
     closest_on_segment,
 )
-from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
+from magnetosuture_thread.geometry.obstacles.shapes import MIN_EXTENT, Disc, Mesh, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 
 _MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
@@ -314,25 +316,17 @@ class Workspace:
         ConfigurationError: when a shape is not of this dimension, or a number is not in its bounds.
     """
 
+    @checked_arguments("workspace")
     def __init__(
         self,
         shapes: Sequence[Obstacle],
-        reach: float,
-        dimension: int = 2,
-        wall_radius: float = math.inf,
-        friction: Sequence[float] = (),
-        wall_friction: float = 0.0,
+        reach: Annotated[float, bounded("m", 0.0, 100.0)],
+        dimension: Annotated[int, bounded("", 2, 3)] = 2,
+        wall_radius: Annotated[float, bounded("m", MIN_EXTENT, 10.0, unlimited=True)] = math.inf,
+        friction: Annotated[Sequence[float], bounded("", 0.0, MAX_FRICTION)] = (),
+        wall_friction: Annotated[float, bounded("", 0.0, MAX_FRICTION)] = 0.0,
     ) -> None:
-        if dimension not in (2, 3):
-            raise ConfigurationError("workspace.dimension", dimension, "2 or 3")
-        if not (math.isfinite(reach) and reach >= 0.0):
-            raise ConfigurationError("workspace.reach", reach, "a number of at least 0 m")
-        if not wall_radius > 0.0:
-            raise ConfigurationError("workspace.wall_radius", wall_radius, "a number above 0 m, or inf")
-        self.shapes = tuple(shapes)
-        self.reach = float(reach)
-        self.dimension = dimension
-        self.wall_radius = float(wall_radius)
+        self.shapes, self.reach, self.dimension, self.wall_radius = tuple(shapes), reach, dimension, wall_radius
         for i, shape in enumerate(self.shapes):
             _check(f"workspace.shapes[{i}]", shape, dimension)
         self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
@@ -382,18 +376,14 @@ def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: i
     if len(friction) != shapes:
         raise ConfigurationError("workspace.friction", f"{len(friction)} values", f"one for each of {shapes} shapes")
     for name, value in (("wall_friction", wall_friction), *((f"friction[{i}]", mu) for i, mu in enumerate(friction))):
-        if not 0.0 <= value <= MAX_FRICTION:
-            raise ConfigurationError(f"workspace.{name}", value, f"a coefficient from 0 to {MAX_FRICTION:g}")
         if value > 0.0 and dimension != 2:
             raise ConfigurationError(f"workspace.{name}", value, "0 in space: friction is of the plane")
 
 
 def _check(name: str, shape: Obstacle, dimension: int) -> None:
     if isinstance(shape, Disc):
-        if len(shape.centre) != dimension or not np.isfinite(shape.centre).all():
-            raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} finite coordinates [m]")
-        if not (math.isfinite(shape.radius) and shape.radius >= 0.0):
-            raise ConfigurationError(f"{name}.radius", shape.radius, "a number of at least 0 m")
+        if len(shape.centre) != dimension:
+            raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} coordinates [m]")
     elif isinstance(shape, Polygon) and dimension != 2:
         raise ConfigurationError(name, "a polygon", "a disc or a mesh in space")
     elif isinstance(shape, Mesh) and dimension != 3:
