@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 PACKAGE = Path(__file__).parent
 COMPILED_MARK = b"magnetosuture_thread.compiled"
@@ -20,6 +21,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # Said of every function, as numba takes it over from whatever calls one first where it is not said.
 _COUNTED: dict[str, Any] = {"_nrt": True}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}
+_EVENTS = cast(Any, event)  # without types
+_COMPILATIONS = _EVENTS.RecordingListener()
+_EVENTS.register("numba:compile", _COMPILATIONS)
 
 
 def compiled(function: _Function) -> _Function:
@@ -55,6 +59,11 @@ def compiled_without_gil(function: _Function) -> _Function:
     For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
     """
     return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
+
+
+def compilations() -> int:
+    """Return a number that grows with each function that is compiled, and not with those that the cache has."""
+    return len(_COMPILATIONS.buffer)
 
 
 def delete_stale_cache(package: Path = PACKAGE) -> bool:

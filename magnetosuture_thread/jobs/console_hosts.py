@@ -21,7 +21,7 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log
-from magnetosuture_thread.jobs.simulate import ACTIVE, FORECAST, SLOWER_BRIDGE, START_TIMEOUT
+from magnetosuture_thread.jobs.simulate import ACTIVE, FORECAST, SLOWER_BRIDGE, START_TIMEOUT, log_compiling
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import RECORDED_TOPICS, ConsoleTap
@@ -259,7 +259,7 @@ class SimulatedHost(RecordingHost):
         self._setup_name, self._setups = setup, tuple(setups)
         self._environment, self._logs = dict(environment), logs
         self._nodes: NodeProcesses | None = None
-        self._since = 0.0
+        self._since, self._logged = 0.0, set[str]()
         self._changing = False
         self._block(f"starting {self.setup.name}")
 
@@ -308,6 +308,8 @@ class SimulatedHost(RecordingHost):
         self._nodes.check()
         if not self.busy:
             return
+        nodes = self.graph.nodes().items()
+        log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
         missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have

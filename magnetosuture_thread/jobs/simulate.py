@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,10 +34,12 @@ from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.jobs.simulate_procedure import ProcedureRun
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+from magnetosuture_thread.nodes.diagnostics import COMPILING
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.nodes.run import Interruption
 from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.rig.power.stage import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning
@@ -219,7 +221,7 @@ def _run(
             recorder = Recorder(domain, recorded, simulated_clock=rate is not None, receive=receive)
             try:
                 with interruption:
-                    _wait(recorder, check)
+                    _wait(recorder, check, log)
                 if boards:
                     _arm()
                 log("running" if rate is None else f"running at {rate:g} times the speed")
@@ -255,23 +257,39 @@ def _arm() -> None:
 def _wired(folder: str, coils: int) -> list[str]:
     """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
+    boards = {"roboclaw_ports": ports, "roboclaw_addresses": json.dumps(board_addresses(coils // 2))}
     parameters: dict[str, dict[str, object]] = {
-        "coil_bridge": {"driver": "roboclaw", "autostart": "active", "roboclaw_ports": ports, **SLOW_BOARD_TIMEOUTS},
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", **boards, **SLOW_BOARD_TIMEOUTS},
         "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
     }
     given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
     return [part for each in given for part in ("-p", each)]
 
 
-def _wait(recorder: Recorder, check: Callable[[], None]) -> None:
+def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:
+    """Log, once of each node, that it compiles.
+
+    Args:
+        texts: state of each node.
+        logged: nodes of which it was logged.
+        log: called with a line for a person.
+    """
+    for name, text in texts.items():
+        if text.startswith(COMPILING) and name not in logged:
+            logged.add(name)
+            log(f"{name}: {text}")
+
+
+def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
     """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
 
     On a busy machine the first frames take tracker and model a second or more; a run that had begun would lack them.
     """
     optional = {topic.name for topic in OPTIONAL}
-    deadline = time.monotonic() + START_TIMEOUT
+    deadline, logged = time.monotonic() + START_TIMEOUT, set[str]()
     while missing := [name for name in recorder.silent() if name not in optional]:
         check()
+        log_compiling({name: text for name, (text, _) in recorder.status_texts.items()}, logged, log)
         if time.monotonic() > deadline:
             raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
         recorder.spin(POLL_PERIOD)

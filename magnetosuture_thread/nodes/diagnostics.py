@@ -5,15 +5,18 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import ClassVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from magnetosuture_thread.compiled import compilations
 from magnetosuture_thread.nodes.topics import DIAGNOSTICS
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 1.0  # s
+COMPILING = "compiling"  # how the state of a node begins that does
 MAX_TEXT_CHARS = 400  # of a status or a value, whatever is in it
 MAX_VALUES = 100  # that are read of one status
 
@@ -27,9 +30,13 @@ class Health:
 
     Args:
         node: whose health it is.
+
+    Attributes:
+        loading: how many nodes of this process load; no driver may be open then, as a signal ends the process.
     """
 
     quiet = 0.05
+    loading: ClassVar[int] = 0
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -76,20 +83,26 @@ class Health:
             self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
 
     @contextmanager
-    def busy(self, text: str) -> Iterator[None]:
-        """Report once a second, at level WARN, what keeps the node from its callbacks, as long as it does."""
-        self.warn(text)
-        done = threading.Event()
+    def load(self, what: str) -> Iterator[None]:
+        """Report once a second, at level WARN, that the node loads, or compiles what no cache has, while it does."""
+        before, compiling, done = compilations(), f"{COMPILING} {what}, once on this machine", threading.Event()
+        self.warn(f"loading {what}")
+        self._node.get_logger().info(self._text)
 
         def repeat() -> None:
             while not done.wait(PERIOD):
+                if compilations() > before and self._text != compiling:
+                    self.warn(compiling)
+                    self._node.get_logger().info(compiling)
                 self.publish()
 
         thread = threading.Thread(target=repeat, daemon=True)
         thread.start()
+        Health.loading += 1
         try:
             yield
         finally:
+            Health.loading -= 1
             done.set()
             thread.join()
 

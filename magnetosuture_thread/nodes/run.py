@@ -24,10 +24,12 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from magnetosuture_thread import MagnetosutureError
+from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.parameter_files import init
 from magnetosuture_thread.nodes.program import STOPS
 
+LOADING_GRACE = 1.0  # s to end in order for a process that is asked to while it loads
 DELIVERY_TIMEOUT = 0.2  # s for the last messages of all nodes to be acknowledged
 
 
@@ -123,12 +125,19 @@ class _Ending(Future):
     """Done when a signal has asked the process to end: amid its start by a KeyboardInterrupt, later between callbacks.
 
     rclpy's own handlers would take the nodes out of the graph at once, before they can publish their final messages.
+    Python runs no handler while the compiler is at work, nor while an executor waits: a thread hears of signals too. It
+    wakes the executor, and ends a process that goes on loading. No coil has a current then: see `Health.load`.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._asked = self._deferred = False
         self._nodes: tuple[Node, ...] = ()
+        self._executor: SingleThreadedExecutor | None = None
+        woken, written = os.pipe2(os.O_CLOEXEC)
+        os.set_blocking(written, False)
+        signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, args=(woken,), name="signals", daemon=True).start()
         for which in end_signals():
             signal.signal(which, self._on_signal)
         # A KeyboardInterrupt in a function that a C library calls, as to load compiled code, is lost with a traceback
@@ -145,19 +154,18 @@ class _Ending(Future):
         """Leave a callback out: an executor adds one in each turn, and `defer` wakes it."""
 
     def defer(self, executor: SingleThreadedExecutor, nodes: tuple[Node, ...]) -> None:
-        """From now on raise nothing, and wake an executor instead: Python runs no handler while it waits."""
-        self._nodes = nodes
-        woken, written = os.pipe2(os.O_CLOEXEC)
-        os.set_blocking(written, False)
-        signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+        """From now on raise nothing, and wake an executor instead."""
+        self._executor, self._nodes, self._deferred = executor, nodes, True
 
-        def wake() -> None:
-            while os.read(woken, 1):
+    def _watch(self, woken: int) -> None:
+        os.read(woken, 1)
+        while True:
+            if self._executor is not None:
                 with suppress(Exception):  # it is gone already
-                    executor.wake()
-
-        threading.Thread(target=wake, name="signals", daemon=True).start()
-        self._deferred = True
+                    self._executor.wake()
+            time.sleep(LOADING_GRACE)
+            if Health.loading:
+                os._exit(0)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         # Amid a message that rclpy's library makes in Python, a KeyboardInterrupt would come out as another error.

@@ -198,12 +198,20 @@ def test_a_run_begins_with_the_first_prediction_or_after_a_while_without_any(mon
             self.taken["/thread/predicted"] += len(self.spins) == self._frames
 
     recorder = Waiting(frames=7)
-    simulate_module._wait(recorder, lambda: None)
+    simulate_module._wait(recorder, lambda: None, print)
     assert recorder.spins == 7 * [simulate_module.POLL_PERIOD] + [simulate_module.SETTLING_TIME]
     monkeypatch.setattr(simulate_module, "PREDICTION_TIMEOUT", 0.0)
     never = Waiting(frames=-1)
-    simulate_module._wait(never, lambda: None)
+    simulate_module._wait(never, lambda: None, print)
     assert never.spins == [simulate_module.SETTLING_TIME]
+
+
+def test_of_each_node_it_is_logged_once_that_it_compiles():
+    logged: set[str] = set()
+    lines: list[str] = []
+    for texts in ({"a": "loading", "b": "compiling b"}, {"a": "compiling a", "b": "compiling b"}, {"a": "compiling a"}):
+        simulate_module.log_compiling(texts, logged, lines.append)
+    assert lines == ["b: compiling b", "a: compiling a"]
 
 
 def test_a_scenario_without_a_path_is_refused(tmp_path: Path):

@@ -32,7 +32,17 @@ program.import_module = reported
 sys.exit(program.main())
 """
 WITHIN = 4.0  # s after the beginning: amid imports, the making of a node, or its work
-TIMEOUT = 90.0  # s; kernels compile meanwhile, and a signal waits for one
+TIMEOUT = 90.0  # s
+# A compiler that lets no handler of Python run for hours; it says so once it is at work.
+BLOCKED = """
+import hashlib, threading
+from magnetosuture_thread.nodes import vision_tracker
+def compile():
+    threading.Timer(1.0, print, ["blocked"], {"flush": True}).start()
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+vision_tracker.warm_up = compile
+vision_tracker.main()
+"""
 
 
 @pytest.fixture
@@ -64,16 +74,56 @@ def test_two_interruptions_at_any_time_end_a_node_in_order(name: str, environmen
         assert "Traceback" not in output
 
 
+def ended(command: list[str], environment: dict[str, str], word: str, which: signal.Signals) -> tuple[int, str]:
+    """Start a node, send it a signal as soon as it logs a word, and return its exit code and what it logged."""
+    arguments = ["--ros-args", "-p", "scene:=dish_35mm"]
+    process = subprocess.Popen(
+        [sys.executable, *command, *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        before = ""
+        while word not in before:
+            line = process.stdout.readline()
+            assert line, before
+            before += line
+        process.send_signal(which)
+        output, _ = process.communicate(timeout=TIMEOUT)
+    finally:
+        process.kill()
+    return process.returncode, before + output
+
+
+@pytest.mark.parametrize("name", ["vision_tracker", "coil_bridge"])
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_compiles_ends_in_order(name: str, which: signal.Signals, environment, tmp_path: Path):
+    without_cache = {**environment, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    code, output = ended(["-m", f"magnetosuture_thread.nodes.{name}"], without_cache, "compiling", which)
+    assert code == 0, output
+    assert "Traceback" not in output
+    assert "ready" not in output
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_ends_though_the_compiler_lets_no_handler_run(which: signal.Signals, environment):
+    code, output = ended(["-c", BLOCKED], environment, "blocked", which)
+    assert code == 0, output
+
+
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
     without = "import sys; sys.modules['rclpy'] = None; sys.argv[0] = sys.argv[1]; " + (
         "from magnetosuture_thread.nodes.program import main; sys.exit(main())"
     )
-    ended = subprocess.run(
+    run = subprocess.run(
         [sys.executable, "-c", without, name], capture_output=True, text=True, timeout=TIMEOUT, check=False
     )
-    assert ended.returncode == 1
-    assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", ended.stderr)
+    assert run.returncode == 1
+    assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", run.stderr)
 
 
 def test_an_interruption_while_a_library_calls_python_is_not_lost(environment: dict[str, str]):

@@ -48,15 +48,15 @@ class RigSimulatorNode(PackageNode):
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)
         rate = settings.rate if simulated else 1.0
-        self.get_logger().info("loading the rig's kernels; the first start on a machine compiles them")
         scene = initial_scene(settings.scene)
         if scene is None:
             raise ConfigurationError(f"{settings.GROUP}.scene", "", "a scene file: what is simulated has a dish")
         # What one callback may take, so that frames come and the others of this computer get on: else time lags.
         self._catch_up = max(MIN_CATCH_UP, CATCH_UP_FRAMES / settings.frame_rate)
         iterations = max(MIN_ITERATIONS, ITERATION_RATE / settings.frame_rate)
-        self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
-        self.rig.warm_up()
+        with self.health.load("the rig's kernels"):
+            self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
+            self.rig.warm_up()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         epoch = EPOCH if simulated else self.get_clock().now().nanoseconds
         self.time = RigTime(self, epoch, rate, simulated=simulated)
