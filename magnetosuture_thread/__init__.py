@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.barrier import Barrier, Gradient
+    from magnetosuture_thread.barrier import Barrier, Gradient, check_gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
     from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"  # as in pyproject.toml, both files package.xml, CITATION.cff and CHANGELOG.md
 
 _HOME = {
-    "barrier": ("Barrier", "Gradient"),
+    "barrier": ("Barrier", "Gradient", "check_gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
@@ -76,6 +76,7 @@ __all__ = [
     "ThreadPredictor",
     "Workspace",
     "calibrate_bags",
+    "check_gradient",
     "read_scene",
     "replay_offline",
 ]

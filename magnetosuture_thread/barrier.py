@@ -13,7 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.texts import shortened
 
@@ -22,6 +24,9 @@ CONNECTIVITY, COMPRESSION, OBSTACLE = "connectivity", "compression", "obstacle"
 ENHANCED_CONNECTIVITY, STIFFNESS, WALL = "enhanced_connectivity", "stiffness", "wall"
 BUILT_IN = (CONNECTIVITY, COMPRESSION, OBSTACLE, ENHANCED_CONNECTIVITY, STIFFNESS, WALL)
 """Names of the barriers that the formulations bring."""
+GAIN = Quantity("", "1/s", minimum=1e-6, unlimited=True)
+SLACK_WEIGHT = Quantity("", minimum=1e-12, unlimited=True)
+GRADIENT_STEP = 1e-6  # of the nodes' extent; a difference loses as much by rounding as by the curvature
 MAX_BARRIERS = 32
 MAX_NAME_CHARS = 64
 
@@ -76,6 +81,7 @@ class Barrier(ABC):
         name: of the barrier in margins, messages and reports; unique among a thread's barriers.
         gain: alpha, how fast h may decay towards 0 [1/s]; inf only asks for h >= 0 at the end of each step.
         slack_weight: W of the slack that lets a row give way; inf makes it hard.
+        ros_time: time of the next evaluation by the clock of the poses' stamps, set before `set_time` is called [s].
 
     Source: A. D. Ames et al., Control Barrier Functions: Theory and Applications, 2019, section II, in discrete time.
     """
@@ -83,9 +89,24 @@ class Barrier(ABC):
     name: str = ""
     gain: float = math.inf
     slack_weight: float = math.inf
+    ros_time: float = 0.0
 
     def set_time(self, time: float) -> None:  # noqa: B027 - most barriers do not move
-        """Set the time of the next evaluation [s]; a barrier that moves overrides this."""
+        """Set the time of the next evaluation; a barrier that moves overrides this.
+
+        Args:
+            time: since the needle's first pose [s].
+        """
+
+    @property
+    def moves(self) -> bool:
+        """Whether the barrier moves with time."""
+        return type(self).set_time is not Barrier.set_time
+
+    def move_to(self, stamp: float, first: float) -> None:
+        """Set both times: the stamp of the next evaluation, and by that of the first pose the time since [s]."""
+        self.ros_time = stamp
+        self.set_time(stamp - first)
 
     def rows_after(self, before: Points, positions: Points) -> BarrierRows:
         """Return all rows at positions to which the nodes moved from `before`, for barriers whose side that decides."""
@@ -138,6 +159,43 @@ class Barrier(ABC):
         return BarrierRows(self.name, nodes.astype(np.intp), obstacle, value, gradient.astype(np.float64), clearance)
 
 
+def check_gradient(barrier: Barrier, positions: Points, tolerance: float = 1e-4) -> float:
+    """Compare the gradient of a barrier with central differences of its values, by every node.
+
+    Args:
+        barrier: that has its time already, if it moves.
+        positions: of the nodes, where the values are smooth, shape (n, d) [m].
+        tolerance: greatest error that is accepted, as a part of the greatest derivative.
+
+    Returns:
+        The greatest error, as a part of the greatest derivative.
+
+    Raises:
+        InvalidInputError: a derivative is another, with row, node and axis; the number of rows changes close by; or
+            what the barrier returns does not fit together, see `Barrier.rows`.
+    """
+    positions = as_numbers("positions", positions)
+    positions = finite_array(
+        "positions", positions, (None, 3 if positions.shape[-1:] == (3,) else 2), Quantity("", "m")
+    )
+    rows, step = barrier.rows(positions), GRADIENT_STEP * float(np.ptp(positions, axis=0).max())
+    given, found = np.zeros((2, len(rows.value), *positions.shape))
+    np.add.at(given, (np.arange(len(given))[:, None], rows.nodes), rows.gradient)
+    for node, axis in np.ndindex(positions.shape):
+        moved = np.zeros(positions.shape)
+        moved[node, axis] = step
+        ahead, behind = (barrier.rows(place).value for place in (positions + moved, positions - moved))
+        if not ahead.shape == behind.shape == rows.value.shape:
+            raise InvalidInputError(f"barrier {barrier.name}", "another number of rows close by", "the same")
+        found[:, node, axis] = (ahead - behind) / (2.0 * step)
+    error = np.abs(given - found) / max(float(np.abs([given, found]).max(initial=0.0)), np.finfo(float).tiny)
+    if error.max(initial=0.0) > tolerance:
+        row, node, axis = np.unravel_index(int(error.argmax()), error.shape)
+        what = f"derivative {given[row, node, axis]:g} of row {row} by node {node}, axis {axis}"
+        raise InvalidInputError(f"barrier {barrier.name}", what, f"{found[row, node, axis]:g}, as the values change")
+    return float(error.max(initial=0.0))
+
+
 class CompiledBarrier(Barrier):
     """A built-in barrier: compiled code writes all of its rows at once."""
 
@@ -176,10 +234,8 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
             raise ConfigurationError(f"barriers[{index}].name", name, f"1 to {MAX_NAME_CHARS} printable characters")
         if name in taken:
             raise ConfigurationError(f"barriers[{index}].name", name, "a name that no other barrier has")
-        if not barrier.gain > 0.0:
-            raise ConfigurationError(f"{name}.gain", barrier.gain, "a number above 0 [1/s], or inf")
-        if not barrier.slack_weight > 0.0:
-            raise ConfigurationError(f"{name}.slack_weight", barrier.slack_weight, "a number above 0, or inf")
+        GAIN.checked(f"{name}.gain", barrier.gain)
+        SLACK_WEIGHT.checked(f"{name}.slack_weight", barrier.slack_weight)
         taken.add(name)
 
 

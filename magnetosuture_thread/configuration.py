@@ -22,6 +22,8 @@ from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, Budge
 
 C = TypeVar("C", bound="Configuration")
 
+MAX_MILLI = 1e6  # of a number; a greater one is no length in millimetres, and may be too great for a float
+
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
 
@@ -37,6 +39,7 @@ class Quantity:
         maximum: maximum value accepted, also of each entry of a list.
         choices: the texts accepted, empty for any.
         multiple: a list's length must be a multiple of this.
+        unlimited: whether inf is accepted too, as no limit.
     """
 
     description: str
@@ -45,9 +48,10 @@ class Quantity:
     maximum: float | None = None
     choices: tuple[str, ...] = ()
     multiple: int = 1
+    unlimited: bool = False
 
-    def expectation(self, kind: type) -> str:
-        """Return the accepted values as text."""
+    def expectation(self, kind: type, value: Any = None) -> str:
+        """Return the accepted values as text, with a hint where a thousandth of the value given would be accepted."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "text", tuple: "a list"}[kind]
@@ -59,7 +63,65 @@ class Quantity:
             words += f" of at least {self.minimum:g}"
         elif self.maximum is not None:
             words += f" of at most {self.maximum:g}"
-        return f"{words} {self.unit}".rstrip()
+        return f"{words} {self.unit}".rstrip() + (", or inf" if self.unlimited else "") + self.hint(value)
+
+    def hint(self, value: Any) -> str:
+        """Return a question for a length or a speed of which a thousandth would be accepted; empty for another."""
+        wrong = [part for part in (value if isinstance(value, (list, tuple)) else [value]) if not self.within(part)]
+        scaled = all(_is_number(part) and abs(part) <= MAX_MILLI and self.within(1e-3 * part) for part in wrong)
+        asks = self.unit.split("/")[0] == "m" and wrong and scaled
+        return f"; given in {'metres' if self.unit == 'm' else self.unit}?" if asks else ""
+
+    def checked(self, name: str, value: Any, kind: type = float, entry: type = float, source: str = "") -> Any:
+        """Return a value in its type.
+
+        Args:
+            name: of the value, for the error.
+            value: as it was given.
+            kind: float, int, bool, str, or tuple for a list.
+            entry: type of each entry of a list.
+            source: file that it is from, for the error.
+
+        Raises:
+            ConfigurationError: it is of another type, or out of bounds.
+        """
+
+        def refuse() -> ConfigurationError:
+            of = {int: "a list of whole numbers", str: "a list of texts"}.get(entry, "a list")
+            return ConfigurationError(name, value, self.expectation(kind, value).replace("a list", of), source)
+
+        if kind is tuple:
+            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % self.multiple:
+                raise refuse()
+            if not all(self._fits(each, entry) for each in value):
+                raise refuse()
+            return tuple(entry(each) for each in value)
+        if kind is float:
+            if not self.within(value):
+                raise refuse()
+            return float(value)
+        if not isinstance(value, kind) or (kind is int and (isinstance(value, bool) or not self.within(value))):
+            raise refuse()
+        if self.choices and value not in self.choices:
+            raise refuse()
+        return value
+
+    def _fits(self, each: Any, entry: type) -> bool:
+        """Return whether a list may have this entry."""
+        if entry is str:
+            return isinstance(each, str)
+        return self.within(each) and (entry is float or isinstance(each, int))
+
+    def within(self, number: Any) -> bool:
+        """Return whether something is a number, finite and within the bounds."""
+        try:
+            value = float(number) if _is_number(number) else math.nan
+        except OverflowError:  # a whole number beyond any float
+            return False
+        if self.unlimited and value == math.inf:
+            return True
+        low, high = self.minimum, self.maximum
+        return math.isfinite(value) and (low is None or value >= low) and (high is None or value <= high)
 
 
 def quantity(
@@ -119,44 +181,7 @@ class ConfigurationField:
 
     def checked(self, value: Any, source: str = "") -> Any:
         """Return the value in the field's type, or raise `ConfigurationError`."""
-        about = self.quantity
-
-        def refuse() -> ConfigurationError:
-            of = {int: "a list of whole numbers", str: "a list of texts"}.get(self.entry, "a list")
-            return ConfigurationError(
-                f"{self.group}.{self.name}", value, about.expectation(self.kind).replace("a list", of), source
-            )
-
-        if self.kind is tuple:
-            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % about.multiple:
-                raise refuse()
-            if not all(self._fits(entry) for entry in value):
-                raise refuse()
-            return tuple(self.entry(entry) for entry in value)
-        if self.kind is float:
-            if not _is_number(value) or not self._within(value):
-                raise refuse()
-            return float(value)
-        kind: Any = self.kind
-        if not isinstance(value, kind) or (kind is int and (isinstance(value, bool) or not self._within(value))):
-            raise refuse()
-        if about.choices and value not in about.choices:
-            raise refuse()
-        return value
-
-    def _fits(self, entry: Any) -> bool:
-        """Return whether a list may have this entry."""
-        if self.entry is str:
-            return isinstance(entry, str)
-        return _is_number(entry) and self._within(entry) and (self.entry is float or isinstance(entry, int))
-
-    def _within(self, number: float) -> bool:
-        low, high = self.quantity.minimum, self.quantity.maximum
-        try:
-            value = float(number)
-        except OverflowError:  # a whole number beyond any float
-            return False
-        return math.isfinite(value) and (low is None or value >= low) and (high is None or value <= high)
+        return self.quantity.checked(f"{self.group}.{self.name}", value, self.kind, self.entry, source)
 
 
 def _is_number(value: Any) -> bool:

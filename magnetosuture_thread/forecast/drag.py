@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.thread import Thread
 
 
+@checked_arguments("needle drag")
 @dataclass(frozen=True)
 class NeedleDrag:
     """The needle's drag, by which the thread's pull moves it.
@@ -37,17 +39,10 @@ class NeedleDrag:
         ConfigurationError: a number is not positive, or the thread's part is not less than the whole.
     """
 
-    along: float
-    across: float
-    turning: float
+    along: Annotated[float, bounded("N s/m", 1e-15)]
+    across: Annotated[float, bounded("N s/m", 1e-15)]
+    turning: Annotated[float, bounded("N m s", 1e-20)]
     thread: float | None = None
-
-    def __post_init__(self) -> None:
-        """Check the numbers."""
-        for name in ("along", "across", "turning"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"needle drag {name}", value, "a positive number")
 
     def numbers(self, thread: Thread, learned: Thread | None = None) -> NDArray[np.float64]:
         """Return what compiled code takes, see `RolloutModel`.

@@ -9,10 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.forecast.drag import NeedleDrag
 from magnetosuture_thread.forecast.forecast import WALL_NAME, Forecast
@@ -25,13 +27,14 @@ from magnetosuture_thread.forecast.rollout_data import (
     RolloutState,
 )
 from magnetosuture_thread.forecast.start import ForecastStart
+from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, MotionBuffers
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.margins import FrictionLaw
-from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, check_pose
+from magnetosuture_thread.model.prediction import NeedlePose, check_pose
 from magnetosuture_thread.model.predictor import MAX_STEP_LENGTH, ThreadPredictor
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.thread import Thread
@@ -89,6 +92,7 @@ class ThreadForecaster:
         InvalidInputError: a fixed node is none of the thread's.
     """
 
+    @checked_arguments("forecaster")
     def __init__(
         self,
         thread: Thread,
@@ -96,20 +100,18 @@ class ThreadForecaster:
         safety: NeedleSafetyFilter | None = None,
         *,
         law: FrictionLaw | None = None,
-        friction_averaging: float = 0.0,
-        attachment_offset: Sequence[float] = (),
+        friction_averaging: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0,
+        attachment_offset: Annotated[Sequence[float], bounded("m", -0.1, 0.1, multiple=2)] = (),
         drag: NeedleDrag | None = None,
-        step: float = 1.0 / 66.0,
+        step: Annotated[float, bounded("s", 1e-4, 1.0)] = 1.0 / 66.0,
         margin_range: float = 2e-3,
         contact_tolerance: float = 2e-6,
         residual_tolerance: float = 1e-6,
         max_step: float = 0.02,
         max_substeps: int = 200,
         fixed_nodes: Sequence[int] = (),
-        workers: int | None = None,
+        workers: Annotated[int | None, bounded("", 1, 1024)] = None,
     ) -> None:
-        if not (math.isfinite(step) and 1e-4 <= step <= 1.0):
-            raise ConfigurationError("step", step, "a time from 0.0001 to 1 s")
         safety = NeedleSafetyFilter(scene) if safety is None else safety
         if safety.scene.version != scene.version:
             expected = f"the forecast's own, {scene.version}"
@@ -125,6 +127,8 @@ class ThreadForecaster:
             margin_range=margin_range,
             contact_tolerance=contact_tolerance,
             residual_tolerance=residual_tolerance,
+            max_step=max_step,
+            max_substeps=max_substeps,
             fixed_nodes=fixed_nodes,
         )
         formulation = predictor.formulation
@@ -352,7 +356,7 @@ class ThreadForecaster:
         return RolloutBuffers(step, solver, MotionBuffers.of(segments + 1, 2), MarginBuffers.of(4 * contacts))
 
     def _steps(self, horizon: float) -> int:
-        if not (math.isfinite(horizon) and 0.5 * self.step <= horizon <= MAX_HORIZON):
+        if not bounded("s", 0.5 * self.step, MAX_HORIZON).within(horizon):
             raise InvalidInputError("horizon", horizon, f"a time from one step, {self.step:g} s, to {MAX_HORIZON:g} s")
         steps = max(1, round(horizon / self.step))
         if steps > MAX_STEPS:
@@ -361,11 +365,8 @@ class ThreadForecaster:
 
     def _sequence(self, commands: Vector, steps: int) -> Points:
         """Return a velocity for each step."""
-        given = np.asarray(commands, np.float64)
-        if given.shape not in ((2,), (steps, 2)):
-            raise InvalidInputError("commands", f"shape {given.shape}", f"shape (2,) or ({steps}, 2) [m/s]")
-        if not np.isfinite(given).all():
-            raise InvalidInputError("commands", "not finite", "finite velocities [m/s]")
+        given = as_numbers("commands", commands)
+        given = finite_array("commands", given, (2,) if given.ndim == 1 else (steps, 2), bounded("m/s"))
         # A copy, as views of broadcasts are read-only, which is another type for compiled code.
         return np.array(np.broadcast_to(given, (steps, 2)), order="C")
 
@@ -376,12 +377,9 @@ class ThreadForecaster:
     def _check_start(self, start: ForecastStart) -> None:
         pose, nodes = start.pose, (self.thread.segments + 1, 2)
         check_pose(pose)
-        if np.shape(pose.tail) != (2,) or np.shape(pose.heading) != (2,):
-            raise InvalidInputError("needle pose", f"shape {np.shape(pose.tail)}", "one in the plane, shape (2,)")
-        for name, value in (("thread's nodes", start.vertices), ("thread's velocities", start.velocities)):
-            if value is not None and not (np.shape(value) == nodes and np.all(np.abs(value) <= MAX_COORDINATE)):
-                wanted = f"finite, shape {nodes}, at most {MAX_COORDINATE:g}"
-                raise InvalidInputError(name, f"shape {np.shape(value)}", wanted)
+        finite_array("thread's nodes", start.vertices, nodes, bounded("m", -10.0, 10.0))
+        if start.velocities is not None:
+            finite_array("thread's velocities", start.velocities, nodes, bounded("m/s", -10.0, 10.0))
         own, given = self.thread, start.thread or self.thread
         fixed = ("length", "segments", "diameter", "attachment")
         if any(getattr(given, name) != getattr(own, name) for name in fixed):
@@ -390,11 +388,9 @@ class ThreadForecaster:
         if gap > unit:
             wanted = f"at most {unit:.2e} m"
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from where it is fixed", wanted)
-        if not (math.isfinite(start.interval) and start.interval >= 0.0):
-            raise InvalidInputError("interval of the start", start.interval, "a time of at least 0 s")
         for name, pair in (("tip velocity", start.tip_velocity), ("needle force", start.needle_force)):
-            if pair is not None and not (np.shape(pair) == (2,) and np.isfinite(pair).all()):
-                raise InvalidInputError(f"{name} of the start", np.asarray(pair).tolist(), "two finite numbers")
+            if pair is not None:
+                finite_array(f"{name} of the start", pair, (2,), bounded())
         clearance = self.safety.clearance(pose.tail, pose.heading)
         if clearance <= 0.0:
             raise InvalidInputError("needle pose", f"{-clearance:.2e} m inside of a shape or the wall", "one outside")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator import ThreadEstimate
@@ -18,6 +20,7 @@ from magnetosuture_thread.model.thread import Thread
 Vector = NDArray[np.float64]
 
 
+@checked_arguments("forecast start", InvalidInputError)
 @dataclass(frozen=True, eq=False)
 class ForecastStart:
     """Needle and thread at the start of a forecast.
@@ -38,7 +41,7 @@ class ForecastStart:
     pose: NeedlePose
     vertices: Points
     velocities: Points | None = None
-    interval: float = 0.0
+    interval: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0
     tip_velocity: Vector | None = None
     warm_start: WarmStart | None = None
     needle_force: Vector | None = None

@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.forces import ThreadForces
 from magnetosuture_thread.model.margins import Margins
 
-MAX_COORDINATE = 10.0  # m; nothing that a dish could hold is farther away
+MAX_COORDINATE = 1.0  # m; nothing that a dish could hold is farther away
+TIME, DEVIATION = Quantity("", "s"), Quantity("", minimum=0.0)
 STARTED = "started"  # status of a prediction that no step led to
 
 
@@ -53,9 +56,7 @@ class NeedlePose:
     def __post_init__(self) -> None:
         """Take sequences of numbers as arrays."""
         for name in ("tail", "heading"):
-            value = getattr(self, name)
-            if not isinstance(value, np.ndarray):
-                object.__setattr__(self, name, np.array(value, dtype=np.float64))
+            object.__setattr__(self, name, as_numbers(f"needle pose {name}", getattr(self, name)))
 
 
 @dataclass(frozen=True)
@@ -107,15 +108,24 @@ class Prediction:
         return self.compute_forces()
 
 
-def check_pose(pose: NeedlePose) -> None:
-    """Raise `InvalidInputError` unless the pose is finite, not absurdly far, and its heading a unit vector."""
+def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int = 2) -> None:
+    """Raise `InvalidInputError` unless a pose can be one: finite, its tail within reach, its heading a unit vector.
+
+    Args:
+        pose: of the needle.
+        reach: greatest distance of its tail from the dish's centre [m].
+        dimension: of the space that it is in.
+    """
     # In plain floats: for two or three of them numpy takes ten times as long, in every step.
-    if not math.isfinite(pose.stamp):
+    if not TIME.within(pose.stamp):
         raise InvalidInputError("needle pose stamp", pose.stamp, "a finite time [s]")
-    tail, heading = np.asarray(pose.tail).tolist(), np.asarray(pose.heading).tolist()
-    if not all(abs(value) <= MAX_COORDINATE for value in tail):
-        raise InvalidInputError(
-            "needle pose position", tail, f"finite coordinates, at most {MAX_COORDINATE:g} m from 0"
-        )
+    if not pose.tail.shape == pose.heading.shape == (dimension,):
+        shapes = f"tail and heading of shapes {pose.tail.shape} and {pose.heading.shape}"
+        raise InvalidInputError("needle pose", shapes, f"shapes ({dimension},)")
+    tail, heading = pose.tail.tolist(), pose.heading.tolist()
+    if not math.hypot(*tail) <= reach:
+        expected = f"finite coordinates, at most {reach:g} m from the dish's centre"
+        raise InvalidInputError("needle pose position", tail, expected + Quantity("", "m", -reach, reach).hint(tail))
+    finite_array("needle pose deviation", pose.deviation, (2,), DEVIATION)
     if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
         raise InvalidInputError("needle pose heading", heading, "a unit vector")

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.barrier import Barrier
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.forces import ThreadForces
@@ -30,8 +33,11 @@ from magnetosuture_thread.model.program import SOLVED, Residuals
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.solvers import make_solver
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread, check_scene, direction_between
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene import Scene, find_collision
 
+DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a camera sees above it
+LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
+START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
 MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
@@ -64,6 +70,8 @@ class ThreadPredictor:
         thread: the thread.
         formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty without a scene.
         pose, state: the last ones; None before the start.
+        added: the barriers that were added, with the time from which those that move count.
+        reach: greatest distance of the needle's tail from the dish's centre [m].
 
     Raises:
         ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
@@ -71,6 +79,7 @@ class ThreadPredictor:
         InvalidInputError: a fixed node is none of the thread's.
     """
 
+    @checked_arguments("thread predictor")
     def __init__(
         self,
         thread: Thread,
@@ -80,16 +89,16 @@ class ThreadPredictor:
         formulation: str | Formulation = "rod",
         solver: str = "banded",
         paper: PaperOptions | None = None,
-        margin_range: float = 5e-3,
-        contact_tolerance: float = 2e-6,
-        residual_tolerance: float = 1e-6,
-        max_step: float = 0.02,
-        max_substeps: int = 200,
+        margin_range: Annotated[float, bounded("m", 0.0, 2.0)] = 5e-3,
+        contact_tolerance: Annotated[float, bounded("m", 0.0, 1e-3)] = 2e-6,
+        residual_tolerance: Annotated[float, bounded("", 1e-15, 1e-2)] = 1e-6,
+        max_step: Annotated[float, bounded("s", 1e-5, 2.0)] = 0.02,
+        max_substeps: Annotated[int, bounded("", 1, 100_000)] = 200,
         fixed_nodes: Sequence[int] = (),
     ) -> None:
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace, self.scene_version = Workspace((), margin_range), ""
+        workspace, self.scene_version, self._scene = Workspace((), margin_range), "", scene
         if isinstance(scene, Workspace):
             workspace = scene
         elif scene is not None:
@@ -110,9 +119,13 @@ class ThreadPredictor:
             chosen = make_solver(solver, residual_tolerance)
             formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
         self.thread, self.formulation, self.contact_tolerance = thread, formulation, contact_tolerance
+        self.added = formulation.added
         self._longest_step, self._most_substeps = max_step, max_substeps
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
+        self.reach = min(workspace.wall_radius + DISH_MARGIN, MAX_COORDINATE)
+        far, self._shape = self.reach + thread.length, (None, formulation.dimension)
+        self._limits = bounded("m", -far, far)
         self.pose: NeedlePose | None = None
         self.state: ThreadState | None = None
 
@@ -144,14 +157,8 @@ class ThreadPredictor:
         Raises:
             ConfigurationError: a name is unknown, a number is not positive, or see the class.
         """
-        if material not in MATERIALS:
-            raise ConfigurationError("material", material, f"one of {', '.join(MATERIALS)}")
-        fixings = [kind.value for kind in Attachment]
-        if attachment not in fixings:
-            raise ConfigurationError("attachment", attachment, f"one of {', '.join(fixings)}")
-        for name, value, least in (("length", length, 0.0), ("viscosity", viscosity, 0.0), ("segments", segments, 2)):
-            if not (math.isfinite(value) and value > least):
-                raise ConfigurationError(name, value, f"a finite number above {least:g}")
+        Quantity("", choices=tuple(MATERIALS)).checked("material", material, str)
+        Quantity("", choices=tuple(kind.value for kind in Attachment)).checked("attachment", attachment, str)
         thread = Thread.of(
             MATERIALS[material],
             length=length,
@@ -178,40 +185,48 @@ class ThreadPredictor:
                 self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
         self.formulation.warm_up()
         self.reset()
+        self.added.first_time = math.inf
 
     def reset(self) -> None:
         """Forget the thread's shape; the next call must be `start`."""
         self.pose = self.state = None
 
-    def start(self, pose: NeedlePose, centreline: Points | None = None) -> Prediction:
+    def start(self, pose: NeedlePose, centreline: Points | None = None, *, strict: bool = True) -> Prediction:
         """Set the thread's shape from a centreline, measured or assumed, from tail to end.
 
         Args:
             pose: the needle at the same instant.
-            centreline: polyline, shape (m, d), m >= 2 [m]; if it is shorter than the thread, the
-                thread goes on straight, and where the wall is in its way, along the wall. None is a thread that
-                lies straight behind the needle.
+            centreline: polyline, shape (m, d), m >= 2 [m]. None is a thread that lies straight behind the needle, and
+                where the wall is in its way, along the wall.
+            strict: whether a centreline of another length than the thread's, by more than `LENGTH_TOLERANCE`, is
+                refused, and a thread that lies in the wall or a shape of the scene by more than `START_DEPTH`. If not,
+                a shorter centreline goes on straight, as where the camera measured a part, what is too long is left
+                out, and the thread is pushed out of what it lies in.
 
         Raises:
-            InvalidInputError: the pose or the centreline is not finite, or the centreline is shorter
-                than a segment or begins farther than one from the tail.
+            InvalidInputError: the pose or the centreline is not finite, or too far from the dish; the centreline is
+                shorter than a segment or begins farther than one from the tail; or see `strict`.
         """
-        check_pose(pose)
+        check_pose(pose, self.reach, self.formulation.dimension)
+        length, whole = self.thread.length, centreline is not None and strict
         if centreline is None:
             centreline = np.array([pose.tail, pose.tail - 2.0 * self.thread.segment_length * pose.heading])
-        if len(centreline) < 2 or not np.all(np.abs(centreline) <= MAX_COORDINATE):
-            raise InvalidInputError(
-                "centreline",
-                f"{len(centreline)} points",
-                f"at least 2 finite points, at most {MAX_COORDINATE:g} m from 0",
-            )
+        centreline = finite_array("centreline", centreline, self._shape, self._limits)
+        if len(centreline) < 2:
+            raise InvalidInputError("centreline", f"{len(centreline)} points", "at least 2")
         gap, unit = float(np.linalg.norm(centreline[0] - pose.tail)), self.thread.segment_length
         if gap > unit:
             raise InvalidInputError("centreline", f"{gap:.2e} m from the needle's tail", f"at most {unit:.2e} m")
         path = np.vstack([pose.tail, centreline[1:]])
         if arc_lengths(path)[-1] < unit:
             raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:.2e} m long", f"at least {unit:.2e} m")
-        return self.start_at(pose, chain_inside(path, self.thread.segments, unit, self._room_radius))
+        if whole and not abs(arc_lengths(path)[-1] - length) <= LENGTH_TOLERANCE * length:
+            expected = f"{length:g} m, the thread's length, within {LENGTH_TOLERANCE:.0%}; strict=False takes a part"
+            raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:g} m long", expected)
+        chain = chain_inside(path, self.thread.segments, unit, self._room_radius)
+        if strict and isinstance(self._scene, Scene) and (name := find_collision(self._scene, chain, START_DEPTH)):
+            raise InvalidInputError("centreline", f"a thread that lies in {name}", "one clear of wall and shapes")
+        return self.start_at(pose, chain)
 
     def start_at(self, pose: NeedlePose, vertices: Points) -> Prediction:
         """Set the thread's nodes.
@@ -224,22 +239,22 @@ class ThreadPredictor:
             InvalidInputError: the pose or a node is not finite, there are not n + 1 nodes, the first is
                 farther than a segment from the tail, or segments cross where the scene does not allow it.
         """
-        check_pose(pose)
-        wanted = (self.thread.segments + 1, len(pose.tail))
-        if vertices.shape != wanted or not np.all(np.isfinite(vertices)):
-            raise InvalidInputError("thread's nodes", f"shape {vertices.shape}", f"finite, shape {wanted} [m]")
+        check_pose(pose, self.reach, self.formulation.dimension)
+        shape = self.thread.segments + 1, self.formulation.dimension
+        vertices = finite_array("thread's nodes", vertices, shape, self._limits)
         gap = float(np.linalg.norm(vertices[0] - pose.tail))
         if gap > self.thread.segment_length:
             nearest = f"at most {self.thread.segment_length:.2e} m"
             raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
         self.formulation.check_start(vertices)
+        self.added.first_time = min(self.added.first_time, pose.stamp)
         self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self.pose = pose
         return self._prediction(pose, 0.0, 0, None, None, Residuals(0.0, 0.0, 0.0), True)
 
     def follow_on(self, other: ThreadPredictor) -> None:
         """Continue from the state of another predictor, if it has started."""
-        self.pose = other.pose
+        self.added.first_time, self.pose = other.added.first_time, other.pose
         self.state = other.state.resampled(other.thread, self.thread) if other.state is not None else None
 
     def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
@@ -261,7 +276,7 @@ class ThreadPredictor:
         """
         if self.pose is None or self.state is None:
             raise InvalidInputError("needle pose", "a pose before the start", "a centreline first")
-        check_pose(pose)
+        check_pose(pose, self.reach, self.formulation.dimension)
         last, state = self.pose, self.state
         interval = pose.stamp - last.stamp
         if interval <= 0.0:
@@ -269,12 +284,7 @@ class ThreadPredictor:
         ends = {0: pose.tail, **{node: state.positions[node] for node in self.fixed_nodes}}
         for node, position in (prescribed or {}).items():
             _check_node("node of prescribed motion", node, self.thread)
-            if np.shape(position) != pose.tail.shape or not np.all(np.abs(position) <= MAX_COORDINATE):
-                where = np.asarray(position).tolist()
-                raise InvalidInputError(
-                    f"position of node {node}", where, f"finite, at most {MAX_COORDINATE:g} m from 0"
-                )
-            ends[node] = position
+            ends[node] = finite_array(f"position of node {node}", position, self._shape[1:], self._limits)
         nodes = tuple(ends)
         begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
         way = max(map(math.dist, begin.tolist(), end.tolist()))
@@ -349,8 +359,8 @@ class ThreadPredictor:
         assert state is not None
         positions = state.positions
         warm_start = formulation.warm_start() if prescribed and pose.motion is not None else None
-        formulation.added.set_time(pose.stamp)
-        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
+        self.added.set_time(pose.stamp)
+        added = self.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
         def compute_margins() -> Margins:
             rows = formulation.margins(positions, pose.heading)
@@ -383,5 +393,5 @@ class ThreadPredictor:
 
 def _check_node(field: str, node: int, thread: Thread) -> None:
     """Raise `InvalidInputError` unless this is a node of the thread and not the needle's own."""
-    if not 1 <= node <= thread.segments:
+    if not (isinstance(node, (int, np.integer)) and 1 <= node <= thread.segments):
         raise InvalidInputError(field, node, f"a node from 1 to {thread.segments}; node 0 follows the needle")

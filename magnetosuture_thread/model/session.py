@@ -168,6 +168,7 @@ class ThreadSession:
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
         self._last: int | None = None
+        self._first = math.inf  # stamp of the first pose [s]
         self._needle_motion = NeedleMotionFilter()
         self._needle_motion.warm_up()
         self._initial_observation = InitialObservation()
@@ -350,9 +351,10 @@ class ThreadSession:
             if self._seen is not None and self._seen[0] > stamp:
                 self._seen = None  # of the time before it was set back
         try:
-            check_pose(pose)
+            check_pose(pose, self._predictor.reach)
         except InvalidInputError as error:
             return PredictionResult(stamp, pose, problem=error, scene_version=self.scene_version)
+        self._first = self._predictor.added.first_time = min(self._first, pose.stamp)
         return self._follow(stamp, self._needle_motion.update(pose))
 
     def _follow(self, stamp: int, pose: NeedlePose) -> PredictionResult:
@@ -362,7 +364,7 @@ class ThreadSession:
             if self._predictor.started:
                 prediction = self._predictor.step(attached)
             elif (centreline := self._initial_shape(stamp, pose, attached)) is not None:
-                prediction = self._predictor.start(attached, centreline)
+                prediction = self._predictor.start(attached, centreline, strict=False)
             else:
                 self._early.append((stamp, pose))
                 return PredictionResult(stamp, pose, scene_version=self.scene_version)

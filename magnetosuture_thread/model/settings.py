@@ -274,15 +274,21 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
     def predictor(self, scene: Scene | None) -> ThreadPredictor:
         """Return a predictor of this thread in a scene, its kernels compiled.
 
+        They are loaded by steps in the bare dish: through shapes these would take seconds.
+
         Args:
             scene: dish and obstacles; None for neither.
 
         Raises:
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
+        self._predictor(scene and Scene(scene.dish)).warm_up()
+        return self._predictor(scene)
+
+    def _predictor(self, scene: Scene | None) -> ThreadPredictor:
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
-        predictor = ThreadPredictor(
+        return ThreadPredictor(
             self.thread(),
             scene,
             load_barriers(self.barriers, f"{self.GROUP}.barriers"),
@@ -295,8 +301,6 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
             max_step=self.max_step,
             fixed_nodes=self.fixed_nodes,
         )
-        predictor.warm_up()
-        return predictor
 
     @property
     def is_estimated(self) -> bool:
@@ -314,9 +318,9 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
         """
         if not self.is_estimated:
             return None
-        estimator = ThreadEstimator(self.predictor(scene), self.estimator_options())
-        estimator.warm_up()
-        return EstimatorSession(estimator)
+        options = self.estimator_options()
+        ThreadEstimator(self._predictor(scene and Scene(scene.dish)), options).warm_up()
+        return EstimatorSession(ThreadEstimator(self._predictor(scene), options))
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""

@@ -6,17 +6,26 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Scene
 
+LENGTH = bounded("m", 1e-4, 2.0)
+SEGMENTS = bounded("", 3, 2000)
+DIAMETER = bounded("m", 1e-6, 0.01)
+VISCOSITY = bounded("Pa s", 1e-6, 1e4)
+DRAG = bounded("Pa s", 0.0, 1e6)
+SHARE = bounded("", 1e-3, 1.0)
 MAX_REST_ANGLE = 0.5  # rad; of a thread at rest at a node, beyond which its segments do not resolve it
 
 
+@checked_arguments("medium")
 @dataclass(frozen=True)
 class Medium:
     """What a thread moves in, and what it does to the thread per length.
@@ -36,21 +45,22 @@ class Medium:
         flow: w, velocity of the medium, the same everywhere; one value for each dimension, or none [m/s].
     """
 
-    drag_across: float
-    drag_along: float
-    mass_per_length: float = 0.0
-    gravity: tuple[float, ...] = ()
-    bending_damping: float = 0.0
-    flow: tuple[float, ...] = ()
+    drag_across: Annotated[float, DRAG]
+    drag_along: Annotated[float, DRAG]
+    mass_per_length: Annotated[float, bounded("kg/m", 0.0, 10.0)] = 0.0
+    gravity: Annotated[tuple[float, ...], bounded("m/s^2", -100.0, 100.0)] = ()
+    bending_damping: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0
+    flow: Annotated[tuple[float, ...], bounded("m/s", -1.0, 1.0)] = ()
 
     @classmethod
+    @checked_arguments("medium")
     def liquid(
         cls,
-        viscosity: float,
-        length: float,
-        diameter: float,
-        wetted_fraction: float = 0.5,
-        drag_anisotropy: float = 0.5,
+        viscosity: Annotated[float, VISCOSITY],
+        length: Annotated[float, LENGTH],
+        diameter: Annotated[float, DIAMETER],
+        wetted_fraction: Annotated[float, SHARE] = 0.5,
+        drag_anisotropy: Annotated[float, SHARE] = 0.5,
     ) -> Medium:
         """Return the drag of a slender thread that floats in a viscous liquid, without inertia.
 
@@ -84,6 +94,7 @@ class Medium:
         return cls(drag, drag, mass_per_length, gravity, bending_damping)
 
 
+@checked_arguments("material")
 @dataclass(frozen=True)
 class Material:
     """A suture material.
@@ -98,10 +109,10 @@ class Material:
     """
 
     name: str
-    diameter: float
-    elastic_modulus: float
+    diameter: Annotated[float, DIAMETER]
+    elastic_modulus: Annotated[float, bounded("Pa", 0.0, 1e12)]
     source: str
-    stiffness_weight: float = 1.0
+    stiffness_weight: Annotated[float, bounded("", 0.0, 1e12)] = 1.0
 
 
 _REFERENCE_SET = "as in the reference trajectories; USP size and a handbook modulus, not measured on a sample"
@@ -122,6 +133,7 @@ class Attachment(Enum):
     CLAMPED = "clamped"  # leaves along the needle's axis, as the paper's polyamide
 
 
+@checked_arguments("thread")
 @dataclass(frozen=True)
 class Thread:
     """One thread of n equal segments in a medium.
@@ -141,13 +153,19 @@ class Thread:
     """
 
     material: str
-    length: float
-    segments: int
-    diameter: float
-    bending_stiffness: float
+    length: Annotated[float, LENGTH]
+    segments: Annotated[int, SEGMENTS]
+    diameter: Annotated[float, DIAMETER]
+    bending_stiffness: Annotated[float, bounded("N m^2", 0.0, 1e3)]
     medium: Medium
     attachment: Attachment
     rest_curvature: float | tuple[float, ...] = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the curvatures' number."""
+        if isinstance(self.rest_curvature, tuple) and len(self.rest_curvature) != self.segments - 1:
+            expected = f"one number, or {self.segments - 1} of the inner nodes [1/m]"
+            raise ConfigurationError("thread.rest_curvature", self.rest_curvature, expected)
 
     @cached_property
     def segment_length(self) -> float:
@@ -160,14 +178,15 @@ class Thread:
         return self.segment_length * np.broadcast_to(np.asarray(self.rest_curvature, dtype=float), self.segments - 1)
 
     @classmethod
+    @checked_arguments("thread")
     def of(
         cls,
         material: Material,
         *,
-        length: float,
-        segments: int,
+        length: Annotated[float, LENGTH],
+        segments: Annotated[int, SEGMENTS],
         attachment: Attachment,
-        viscosity: float = 1.0,
+        viscosity: Annotated[float, VISCOSITY] = 1.0,
         wetted_fraction: float = 0.5,
         drag_anisotropy: float = 0.5,
         rest_curvature: float | tuple[float, ...] = 0.0,

@@ -27,22 +27,24 @@ SURE = 1.0 - 1e-9  # of the certified time, against rounding
 class AddedRows(NamedTuple):
     """Rows of the barriers that a user has added, on the velocity of the tip.
 
-        rows_j . v >= -rate_j max(margin_j, 0)
+        rows_j . v >= -rate_j max(margin_j, 0) - drift_j
 
     Attributes:
         rows: shape (k, 2).
         margin: h over the size of its gradient, shape (k,) [m].
         rate: share of the margin by which it may decrease, shape (k,) [1/s].
+        drift: change of the margin of a needle that stands still, as a barrier moves, shape (k,) [m/s].
         barrier: index among the names of constraints, shape (k,).
     """
 
     rows: Points
     margin: NDArray[np.float64]
     rate: NDArray[np.float64]
+    drift: NDArray[np.float64]
     barrier: NDArray[np.int64]
 
 
-NO_ROWS = AddedRows(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0, np.int64))
+NO_ROWS = AddedRows(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
 
 
 @compiled
@@ -255,19 +257,21 @@ def nearest_clear(
         aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
         rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
-    rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0)
+    rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0) - added.drift
     depth[count:fixed], who[count:fixed, 0], who[count:fixed, 1] = -added.margin, 0, added.barrier
     if time >= hold and _all_hold(vx, vy, rows, least, depth, fixed):
         return vx, vy
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
     ux, uy, total = vx, vy, fixed
-    for attempt in range(PASSES):
-        holds, x, y = _projected(vx, vy, rows, bounded, depth, total, True)
-        if not holds:
-            holds, x, y = _projected(vx, vy, rows, bounded, depth, total, False)
-        if not holds and attempt > 0:
-            holds, x, y = _projected(vx, vy, rows, least, depth, fixed, False)
+    for _ in range(PASSES):
+        holds, x, y = False, 0.0, 0.0
+        for fallback in range(4):  # the last one between barriers that close in: no nearer to any by itself
+            bound = bounded if fallback < 2 else least if fallback == 2 else np.minimum(least, 0.0)
+            used = total if fallback < 2 else fixed
+            holds, x, y = _projected(vx, vy, rows, bound, depth, used, fallback == 0)
+            if holds:
+                break
         if not holds:
             break
         time, ended, where = safe_time(x, y, needle, scene)

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier, check_barriers
+from magnetosuture_thread.arguments import bounded, checked_arguments
+from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.needle_arc import needle_points
-from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, AddedRows, measure, nearest_clear
+from magnetosuture_thread.geometry.arrays import finite_array
+from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
+from magnetosuture_thread.safety.added_barriers import AddedNeedleBarriers
+from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, measure, nearest_clear
 from magnetosuture_thread.safety.certificate import NOTHING, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.safety.limits import checked_speed, limit_norm, rate_limit
+from magnetosuture_thread.safety.limits import FINITE, checked_velocity, limit_norm, rate_limit
 from magnetosuture_thread.safety.motion import BodyData, FilterData
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
@@ -30,9 +34,7 @@ STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
 SIDESTEP_MARGIN = 2e-4  # m; beyond keep_out, within which the needle is taken off sideways
 SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
 SIDESTEP_BALANCE = 1e-6  # m; of depth on both sides, from which on the needle is in a gap
-CHECKS = 8  # instants of a hold at which an added barrier is checked
-BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
-ROUNDING = 1e-12  # by which an added barrier may decrease
+POSITION = bounded("m", -1.0, 1.0)  # no dish is larger
 WALL_NAME = "wall"
 SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
 
@@ -82,7 +84,12 @@ class NeedleSafetyFilter:
 
     Barriers that a user adds are enforced by rows of the same program, on the points of the needle from tail to tip.
     They are then checked at `CHECKS` instants of the hold, and the velocity is scaled down until they hold there.
-    Between these instants they are not certified.
+    Between these instants they are not certified. Of a barrier that moves, the row is
+
+        grad h . J_p v + dh/dt >= -rate max(h, 0)
+
+    and at each instant the needle may be no worse off than if it stood still, where that breaks the barrier too: it may
+    flee, no faster than it is commanded.
 
     Args:
         scene: dish and shapes.
@@ -97,27 +104,27 @@ class NeedleSafetyFilter:
         needle_curvature: of its arc, positive to the left of its heading [1/m].
 
     Raises:
-        ConfigurationError: the needle has no room in the dish.
+        ConfigurationError: a number is out of bounds, or the needle has no room in the dish.
     """
 
+    @checked_arguments("safety filter")
     def __init__(
         self,
         scene: Scene,
         barriers: Sequence[Barrier] = (),
         *,
-        keep_out: float = 5e-4,
-        approach_rate: float = 10.0,
-        hold_time: float = 0.205,
-        max_speed: float = math.inf,
-        max_acceleration: float = math.inf,
-        needle_length: float = 0.0,
-        needle_curvature: float = 0.0,
+        keep_out: Annotated[float, bounded("m", 1e-6, 0.1)] = 5e-4,
+        approach_rate: Annotated[float, bounded("1/s", 0.01, 1e3)] = 10.0,
+        hold_time: Annotated[float, bounded("s", 1e-3, 10.0)] = 0.205,
+        max_speed: Annotated[float, bounded("m/s", 1e-6, 0.5, unlimited=True)] = math.inf,
+        max_acceleration: Annotated[float, bounded("m/s^2", 1e-6, 1e3, unlimited=True)] = math.inf,
+        needle_length: Annotated[float, bounded("m", 0.0, 0.1)] = 0.0,
+        needle_curvature: Annotated[float, bounded("1/m", -1e4, 1e4)] = 0.0,
     ) -> None:
         self.scene, self.keep_out, self.hold_time = scene, keep_out, hold_time
         self.kinematics = NeedleKinematics(needle_length, needle_curvature)
         chord = self.kinematics.chord
-        if not keep_out > 0.0:
-            raise ConfigurationError("keep_out", keep_out, "a positive distance [m]")
+        check_needle("safety filter", needle_length, needle_curvature)
         least = chord + 2.0 * keep_out
         if scene.dish.diameter <= least:
             expected = f"more than {least:g} m, room for the needle and keep_out on both sides"
@@ -137,8 +144,8 @@ class NeedleSafetyFilter:
         self._keep = math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out))
         self._keep_wall = keep_out + 0.125 * bend * spacing**2
         self._packed = pack_scene(scene)
-        check_barriers(tuple(barriers))
-        self._barriers, self._time = tuple(barriers), 0.0
+        added = self.kinematics, self._points, hold_time, self._rate, len(scene.names)
+        self._added = AddedNeedleBarriers(barriers, *added)
         self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall
         self._touched = np.zeros(len(self._names), np.bool_)
         self._pose: tuple[tuple[float, ...], PosedNeedle] | None = None  # the last one, by tail and heading
@@ -146,6 +153,7 @@ class NeedleSafetyFilter:
         middle, east = np.array([-0.5 * chord, 0.0]), np.array([1.0, 0.0])
         self.nearest_clear(np.array([1e-3, 0.0]), middle, east)
         self.safe_share(np.array([1e-3, 0.0]), middle, east)
+        self._added.time = None
 
     def compiled_data(self) -> FilterData:
         """Return the filter for compiled loops.
@@ -153,7 +161,7 @@ class NeedleSafetyFilter:
         Raises:
             ConfigurationError: it has barriers of a user, which compiled code does not know.
         """
-        if self._barriers:
+        if self._added:
             raise ConfigurationError(
                 "barriers of the safety filter", self._names[-2], "none: compiled code has its own"
             )
@@ -163,17 +171,19 @@ class NeedleSafetyFilter:
         limits = min(float(self._max_speed), MAX_SPEED), float(self._max_acceleration), STUCK
         return FilterData(body, float(self.hold_time), *keep, rate, BAND, *limits, self._packed, NO_ROWS)
 
+    @checked_arguments("command", InvalidInputError)
     def filter(
         self,
         commanded: Vector,
         tail: Vector,
         heading: Vector,
         *,
-        slowdown: float = 1.0,
-        max_speed: float = math.inf,
+        slowdown: Annotated[float, bounded("", 0.0, 1.0)] = 1.0,
+        max_speed: Annotated[float, bounded("m/s", 0.0, unlimited=True)] = math.inf,
         previous: Vector | None = None,
-        elapsed: float = math.inf,
-        time: float = 0.0,
+        elapsed: Annotated[float, bounded("s", 0.0, unlimited=True)] = math.inf,
+        time: float | None = None,
+        first_time: float = 0.0,
     ) -> FilteredCommand:
         """Return what is left of a commanded velocity: slowed, limited, and kept clear for the whole hold.
 
@@ -185,15 +195,16 @@ class NeedleSafetyFilter:
             max_speed: a limit that holds now, besides the filter's own [m/s].
             previous: velocity that the change is limited from, shape (2,) [m/s]; not limited if None.
             elapsed: since then [s].
-            time: now, for barriers that move [s].
+            time: now, by the clock of the poses' stamps, for barriers that move; see `Barrier.set_time` [s].
+            first_time: of the needle's first pose by that clock [s].
 
         Raises:
-            InvalidInputError: something is not finite, or the slowdown is not within 0 and 1.
+            InvalidInputError: something is not finite or out of bounds, or a barrier moves and there is no time.
         """
-        if not 0.0 <= slowdown <= 1.0:
-            raise InvalidInputError("slowdown", slowdown, "a factor from 0 to 1")
-        self._time = time
-        speed = checked_speed(commanded)
+        self._added.time, self._added.first_time = time, first_time
+        self._added.set_time()
+        commanded = checked_velocity(commanded)
+        speed = math.hypot(*commanded)
         if speed == 0.0:
             return FilteredCommand(commanded, np.zeros(2), slowdown)
         active = [FRICTION] if slowdown < 1.0 else []
@@ -202,7 +213,7 @@ class NeedleSafetyFilter:
         if slowdown * speed > largest * (1.0 + 1e-12):
             active.append(SPEED)
         if previous is not None and math.isfinite(self._max_acceleration):
-            change = self._max_acceleration * elapsed
+            previous, change = finite_array("previous", previous, (2,), FINITE), self._max_acceleration * elapsed
             if math.hypot(*(velocity - previous)) > change * (1.0 + 1e-12):
                 velocity = rate_limit(previous, velocity, change)
                 active.append(ACCELERATION)
@@ -224,18 +235,17 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        speed = checked_speed(velocity)
-        needle = self._at(tail, heading)
-        if speed == 0.0:
+        velocity, needle = checked_velocity(velocity), self._at(tail, heading)
+        if not velocity.any():
             return velocity, []
         self._touched[:] = False
-        added = self._added_rows(needle) if self._barriers else NO_ROWS
+        added = self._added.rows(needle) if self._added else NO_ROWS
         x, y = nearest_clear(
             float(velocity[0]), float(velocity[1]), needle, self._rate, BAND, self._packed, added, self._touched
         )
         clear = velocity if x == velocity[0] and y == velocity[1] else np.array([x, y])
-        if self._barriers:
-            share, name = self._checked_share(clear, tail, heading)
+        if self._added:
+            share, name = self._added.checked_share(clear, tail, heading)
             if share < 1.0:
                 clear = share * clear
                 self._touched[self._names.index(name)] = True
@@ -262,66 +272,13 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        checked_speed(velocity)
+        velocity = checked_velocity(velocity)
         x, y = float(velocity[0]), float(velocity[1])
         time, what, _ = safe_time(x, y, self._at(tail, heading), self._packed, drift)
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
-        if not self._barriers:
+        if not self._added:
             return found
-        return min(found, self._checked_share(velocity, tail, heading, drift), key=lambda share: share[0])
-
-    def _added_rows(self, needle: PosedNeedle) -> AddedRows:
-        """Return the rows of the added barriers on the tip's velocity, each over the size of its gradient."""
-        along = np.array([needle.chord_x, needle.chord_y])
-        left = np.array([-along[1], along[0]])
-        found: list[AddedRows] = []
-        for index, barrier in enumerate(self._barriers, start=len(self.scene.names)):
-            barrier.set_time(self._time)
-            rows = barrier.rows(needle.points)
-            slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
-            size = np.where(slope > 0.0, slope, 1.0)
-            gradient = rows.gradient / size[:, None, None]
-            drive = np.einsum("rkd,d->r", gradient, along)
-            turn = np.einsum("rkd,rkd->r", gradient, needle.turning[rows.nodes])
-            rate, which = np.full(len(size), min(barrier.gain, self._rate)), np.full(len(size), index, np.int64)
-            on_tip = drive[:, None] * along + turn[:, None] * left
-            found.append(AddedRows(on_tip, rows.value / size, rate, which))
-        return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
-
-    def _checked_share(self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0) -> tuple[float, str]:
-        """Return the share of a velocity with which every added barrier holds at every check, and what it is for."""
-        broken = self._broken(velocity, tail, heading, drift)
-        if not broken:
-            return 1.0, ""
-        low, high = 0.0, 1.0
-        for _ in range(BISECTIONS):
-            middle = 0.5 * (low + high)
-            is_broken = bool(self._broken(middle * velocity, tail, heading, middle * drift))
-            low, high = (low, middle) if is_broken else (middle, high)
-        return low, broken
-
-    def _broken(self, velocity: Vector, tail: Vector, heading: Vector, drift: float) -> str:
-        """Return the first added barrier that gets below 0, or lower than it is, within the hold; empty for none."""
-        heading = heading / math.hypot(float(heading[0]), float(heading[1]))
-        along, across = self.kinematics.body_velocity(heading, velocity)
-        begin = self._at(tail, heading).points
-        times = [check / CHECKS * self.hold_time for check in range(1, CHECKS + 1)]
-        points = [self._points_at(*self.kinematics.moved(tail, heading, along, across, time, drift)) for time in times]
-        for barrier in self._barriers:
-            barrier.set_time(self._time)
-            least = np.minimum(barrier.value(begin), 0.0) - ROUNDING
-            for time, where in zip(times, points, strict=True):
-                barrier.set_time(self._time + time)
-                value = barrier.value(where)
-                # Where the number of rows changes with time, every one of them has to be safe.
-                if not (value >= (least if value.shape == least.shape else -ROUNDING)).all():
-                    return barrier.name
-        return ""
-
-    def _points_at(self, tail: Vector, heading: Vector) -> Vector:
-        """Return the points that stand for the needle, from tail to tip, shape (m, 2) [m]."""
-        c, s = float(heading[0]), float(heading[1])
-        return np.asarray(self._points @ np.array([[c, s], [-s, c]]) + tail)
+        return min(found, self._added.checked_share(velocity, tail, heading, drift), key=lambda share: share[0])
 
     def clearance(self, tail: Vector, heading: Vector) -> float:
         """Return the signed least distance of the points of the needle's axis from the wall and all shapes [m].
@@ -362,13 +319,14 @@ class NeedleSafetyFilter:
 
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
+        tail, heading = finite_array("tail", tail, (2,), POSITION), finite_array("heading", heading, (2,), FINITE)
         key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
         last = self._pose  # read once, as forecasts have the same filter in a thread of their own
         if last is not None and last[0] == key:
             return last[1]
         size = math.hypot(key[2], key[3])
-        if not (math.isfinite(size) and size > 0.0 and math.isfinite(key[0]) and math.isfinite(key[1])):
-            raise InvalidInputError("pose", list(key), "finite numbers and a direction")
+        if not size > 0.0:
+            raise InvalidInputError("heading", heading.tolist(), "a direction")
         c, s = key[2] / size, key[3] / size
         turn = np.array([[c, s], [-s, c]])  # of rows
         e = self.kinematics.chord_direction(np.array([c, s]))

@@ -7,9 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.geometry.arrays import finite_array
 
 Vector = NDArray[np.float64]
+
+FINITE = Quantity("", "m/s")
 
 
 def limit_norm(vector: Vector, max_norm: float) -> Vector:
@@ -32,13 +35,10 @@ def rate_limit(previous: Vector, target: Vector, max_change: float) -> Vector:
     return previous + limit_norm(target - previous, max_change)
 
 
-def checked_speed(velocity: Vector) -> float:
-    """Return the size of a velocity [m/s].
+def checked_velocity(velocity: Vector) -> Vector:
+    """Return a velocity as an array of shape (2,) [m/s].
 
     Raises:
-        InvalidInputError: it is not finite.
+        InvalidInputError: it is of another shape, or not finite.
     """
-    x, y = float(velocity[0]), float(velocity[1])
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise InvalidInputError("velocity", [x, y], "finite numbers [m/s]")
-    return math.hypot(x, y)
+    return finite_array("velocity", velocity, (2,), FINITE)

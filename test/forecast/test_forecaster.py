@@ -315,7 +315,7 @@ def test_first_contact_names_shape_and_time():
         ({"pose": NeedlePose(0.0, np.array([np.nan, 0.0]), EAST)}, "position"),
         ({"pose": NeedlePose(math.nan, np.zeros(2), EAST)}, "stamp"),
         ({"pose": NeedlePose(0.0, np.zeros(2), np.array([2.0, 0.0]))}, "heading"),
-        ({"pose": NeedlePose(0.0, np.zeros(3), np.array([1.0, 0.0, 0.0]))}, "plane"),
+        ({"pose": NeedlePose(0.0, np.zeros(3), np.array([1.0, 0.0, 0.0]))}, "needle pose: got tail and heading"),
         ({"pose": NeedlePose(0.0, np.array([0.006, 0.0]), EAST)}, "first node"),
         ({"pose": NeedlePose(0.0, np.array([0.005, 0.0055]), EAST), "vertices": None}, "inside of a shape"),
         ({"pose": NeedlePose(0.0, np.array([0.015, 0.0]), EAST), "vertices": None}, "inside of a shape or the wall"),

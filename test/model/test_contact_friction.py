@@ -148,7 +148,7 @@ def test_a_thread_held_by_friction_does_not_creep(friction: float, held: bool):
     around = radius * np.column_stack([np.cos(turned), np.sin(turned)])
     path = np.vstack([[(4e-3, 3e-3), (5e-3, 2.5e-3), (5e-3, 1.6e-3)], around, [(0.03, -radius)]])
     rest = NeedlePose(0.0, path[0], np.array([-1.0, 0.0]))
-    predictor.start(rest, path)
+    predictor.start(rest, path, strict=False)
     along = [predictor.step(NeedlePose(0.1 * k, rest.tail, rest.heading)).positions[-1, 0] for k in range(1, 151)]
     assert (abs(along[-1] - along[75]) < 1e-7) == held
 
@@ -171,7 +171,7 @@ def test_the_scene_gives_each_shape_and_the_wall_its_friction():
 
 @pytest.mark.parametrize("value", [-0.1, 2.1, math.nan, math.inf])
 def test_a_coefficient_out_of_bounds_is_refused(value: float):
-    with pytest.raises(ConfigurationError, match=r"friction\[0\]"):
+    with pytest.raises(ConfigurationError, match="friction: got"):
         Workspace((Disc((0.0, 0.0), 1e-3),), 1e-3, friction=(value,))
     with pytest.raises(ConfigurationError, match="wall_friction"):
         Workspace((), 1e-3, wall_friction=value)

@@ -42,7 +42,7 @@ def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, 
 
 def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
     seen = thread_arc(np.zeros(2), 3.0, 60.0, length=0.015)
-    prediction = new().start(pose(1.0), seen)
+    prediction = new().start(pose(1.0), seen, strict=False)
     assert np.abs(prediction.strain).max() < 1e-3  # a chord is shorter than its arc
     assert prediction.positions.shape == (26, 2)
     assert np.linalg.norm(seen - prediction.positions[10], axis=1).min() < 1e-4
@@ -75,8 +75,9 @@ def test_the_same_motion_in_other_samples_gives_the_same_thread():
         (pose(float("nan")), "a finite time"),
         (pose(1.0, float("nan")), "finite coordinates"),
         (pose(1.0, 0.0, float("inf")), "finite coordinates"),
-        (pose(1.0, 1e20), "at most 10 m from 0"),
-        (pose(1.0, 0.0, -1e160), "at most 10 m from 0"),
+        (pose(1.0, 1e20), "at most 1 m from the dish's centre"),
+        (pose(1.0, 0.0, -1e160), "at most 1 m from the dish's centre"),
+        (pose(1.0, 5.0), "at most 1 m from the dish's centre; given in metres?"),
         (NeedlePose(1.0, np.zeros(2), np.array([2.0, 0.0])), "a unit vector"),
         (NeedlePose(1.0, np.zeros(2), np.array([np.nan, 0.0])), "a unit vector"),
         (pose(0.0), "later than"),
@@ -97,7 +98,7 @@ def test_a_start_needs_a_centreline():
         predictor.step(pose(0.0))
     for centreline, words in (
         (np.zeros((1, 2)), "1 points"),
-        (np.array([[0.0, 0.0], [np.nan, 0.0]]), "finite points"),
+        (np.array([[0.0, 0.0], [np.nan, 0.0]]), "finite numbers"),
         (np.array([[0.0, 0.0], [1e-5, 0.0]]), "1.00e-05 m long"),
         (np.zeros((3, 2)), "0.00e[+]00 m long"),
         (np.array([[0.005, 0.0], [0.02, 0.0]]), "5.00e-03 m from the needle's tail"),
@@ -109,7 +110,7 @@ def test_a_start_needs_a_centreline():
 
 def test_a_centreline_with_repeated_points_is_taken():
     seen = np.array([[0.0, 0.0], [0.0, 0.0], [-0.01, 0.0], [-0.015, 0.0], [-0.015, 0.0]])
-    prediction = new().start(pose(0.0), seen)
+    prediction = new().start(pose(0.0), seen, strict=False)
     np.testing.assert_allclose(prediction.positions[:, 0], -THREAD.segment_length * np.arange(26), atol=1e-12)
 
 
@@ -188,7 +189,7 @@ def test_both_ends_can_be_led():
         ({26: np.zeros(2)}, "a node from 1 to 25"),
         ({25: np.array([np.nan, 0.0])}, "position of node 25"),
         ({25: np.zeros(3)}, "position of node 25"),
-        ({25: np.array([11.0, 0.0])}, "at most 10 m"),
+        ({25: np.array([11.0, 0.0])}, "numbers from -1.019 to 1.019 m"),
     ],
 )
 def test_driven_nodes_that_cannot_be_are_refused(prescribed: dict[int, np.ndarray], words: str):

@@ -17,6 +17,7 @@ from magnetosuture_thread.model.formulations import PaperOptions, make_formulati
 from magnetosuture_thread.model.margins import SOLID
 from magnetosuture_thread.model.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
 from test.model.worlds import polygon, scene_with
@@ -183,6 +184,18 @@ def test_the_attachments_velocity_is_the_rate_of_its_place():
 def test_a_predictor_can_be_made_wherever_obstacles_are(formulation: str, disc: Disc):
     """Where it is warmed up there may be one, which says nothing of where the thread will be."""
     assert not made(formulation=formulation).predictor(scene_with(disc)).started
+
+
+def test_a_comb_around_the_needle_is_adopted_by_prediction_and_estimate():
+    """A straight thread at the origin would not get through its 700 teeth, which says nothing of other threads."""
+    turn, radius = np.linspace(0.0, 2.0 * np.pi, 1400, endpoint=False), np.where(np.arange(1400) % 2, 0.002, 0.012)
+    scene = scene_with(
+        polygon(*np.column_stack([radius * np.cos(turn), radius * np.sin(turn)]).ravel().tolist()), diameter=0.035
+    )
+    session = ThreadSession(made(), scene_with())
+    session.change(session.settings, scene)
+    assert session.scene == scene
+    assert session.estimates
 
 
 def test_what_cannot_be_solved_is_said_at_each_step_and_not_at_the_start():

@@ -22,6 +22,7 @@ from magnetosuture_thread import (
     Prediction,
     Scene,
     ThreadPredictor,
+    check_gradient,
 )
 from magnetosuture_thread.barrier import load_barriers
 from test.examples import FOLDER, load_example
@@ -106,16 +107,28 @@ def test_barrier_gradient_matches_finite_differences(barrier: Barrier):
     random = np.random.default_rng(5)
     positions = np.cumsum(random.uniform(-1e-3, 1e-3, (26, 2)), axis=0)
     barrier.set_time(0.5)
-    nodes, values = barrier.gradient(positions)
-    full = np.zeros((len(nodes), *positions.shape))
-    for column in range(nodes.shape[1]):
-        full[np.arange(len(nodes)), nodes[:, column]] += values[:, column]
-    for node in range(len(positions)):
-        for axis in range(2):
-            step = np.zeros_like(positions)
-            step[node, axis] = 1e-7
-            slope = (barrier.value(positions + step) - barrier.value(positions - step)) / 2e-7
-            np.testing.assert_allclose(full[:, node, axis], slope, atol=1e-6 * max(1e-3, float(np.abs(full).max())))
+    assert check_gradient(barrier, positions) < 1e-6
+
+
+def skewed(barrier: Barrier, change: Callable[[Gradient], Gradient]) -> Barrier:
+    """Return a barrier with another gradient."""
+    return type("Skewed", (type(barrier),), {"gradient": lambda self, x: change(type(barrier).gradient(self, x))})()
+
+
+@pytest.mark.parametrize(
+    ("barrier", "change", "words"),
+    [
+        (TipKeepIn(), lambda found: Gradient(found.nodes, -found.values), "derivative -1 of row .* by node 25, axis 1"),
+        (CurvatureBound(), lambda found: Gradient(found.nodes, 2.0 * found.values), "of row"),
+        (CurvatureBound(), lambda found: Gradient(found.nodes[:, :2], found.values[:, :2]), "derivative 0 of row"),
+        (MovingDisc(), lambda found: Gradient(found.nodes[::-1], found.values), "as the values change"),
+        (MovingDisc(), lambda found: Gradient(found.nodes, found.values[:, 0]), "derivatives of shape"),
+    ],
+)
+def test_a_gradient_that_is_wrong_is_named(barrier: Barrier, change: Callable[[Gradient], Gradient], words: str):
+    positions = np.cumsum(np.random.default_rng(5).uniform(-1e-3, 1e-3, (26, 2)), axis=0)
+    with pytest.raises(InvalidInputError, match=f"barrier {barrier.name}: .*{words}"):
+        check_gradient(skewed(barrier, change), positions)
 
 
 def test_several_barriers_hold_together_beside_the_wall_and_a_post():
@@ -229,7 +242,7 @@ def test_barriers_must_be_told_apart():
         ([type("None", (TipKeepIn,), {"name": ""})()], "printable characters"),
         ([type("Slow", (TipKeepIn,), {"gain": 0.0})()], "tip_keep_in.gain"),
         ([type("Soft", (TipKeepIn,), {"slack_weight": math.nan})()], "tip_keep_in.slack_weight"),
-        ([object()], "a subclass of Barrier"),
+        ([object()], "an instance of Barrier"),
     ):
         with pytest.raises(ConfigurationError, match=words):
             ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=barriers)  # type: ignore[arg-type]

@@ -7,27 +7,33 @@ import math
 import numpy as np
 import pytest
 
-from magnetosuture_thread import Barrier, ConfigurationError, Disc, Gradient, NeedleSafetyFilter, Scene
+from magnetosuture_thread import (
+    Barrier,
+    ConfigurationError,
+    Disc,
+    Gradient,
+    InvalidInputError,
+    NeedleSafetyFilter,
+    Scene,
+)
+from test.examples import load_example
 
+MovingDisc = load_example("barriers/moving_disc").MovingDisc
 HOLD, LENGTH = 0.2, 0.0025
 EAST = np.array([1.0, 0.0])
 
 
 class HalfPlane(Barrier):
-    """Every point of the needle keeps y below a bound that may move: h_i = bound + t rate - y_i."""
+    """Every point of the needle keeps y below a bound: h_i = bound - y_i."""
 
     name = "half_plane"
 
-    def __init__(self, bound: float = 0.003, rate: float = 0.0) -> None:
-        self.bound, self.rate, self.time = bound, rate, 0.0
-
-    def set_time(self, time: float) -> None:
-        """Move the bound."""
-        self.time = time
+    def __init__(self, bound: float = 0.003) -> None:
+        self.bound = bound
 
     def value(self, positions: np.ndarray) -> np.ndarray:
         """Return a row for each point."""
-        return np.asarray(self.bound + self.rate * self.time - positions[:, 1])
+        return np.asarray(self.bound - positions[:, 1])
 
     def gradient(self, positions: np.ndarray) -> Gradient:
         """Return its gradient."""
@@ -35,7 +41,19 @@ class HalfPlane(Barrier):
         return Gradient(np.arange(count)[:, None], np.tile([[[0.0, -1.0]]], (count, 1, 1)))
 
 
-class Appearing(HalfPlane):
+class MovingHalfPlane(HalfPlane):
+    """The same bound, which moves: h_i = bound + t rate - y_i."""
+
+    def __init__(self, bound: float = 0.003, rate: float = 0.0) -> None:
+        super().__init__(bound)
+        self.rate, self.time, self.start = rate, 0.0, bound
+
+    def set_time(self, time: float) -> None:
+        """Move the bound."""
+        self.time, self.bound = time, self.start + time * self.rate
+
+
+class Appearing(MovingHalfPlane):
     """The same bound, which there is only from a time on."""
 
     def value(self, positions: np.ndarray) -> np.ndarray:
@@ -84,8 +102,8 @@ def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[f
         active.update(found.active)
         along, across = safety.kinematics.body_velocity(heading, found.filtered)
         for part in np.linspace(0.0, 1.0, 33):
-            points = safety._points_at(*safety.kinematics.moved(tail, heading, along, across, part * HOLD))
-            for barrier in safety._barriers:
+            points = safety._added.points_at(*safety.kinematics.moved(tail, heading, along, across, part * HOLD))
+            for barrier in safety._added.barriers:
                 barrier.set_time(now + part * HOLD)
                 least = min(least, float(barrier.value(points).min()))
         tail, heading = safety.kinematics.moved(tail, heading, along, across, HOLD)
@@ -127,12 +145,18 @@ def test_where_it_does_not_matter_a_velocity_is_left_bit_for_bit():
 
 
 def test_a_bound_that_comes_nearer_lets_a_needle_flee_and_not_wait_for_it():
-    safety = needle(HalfPlane(0.002, rate=-0.01))
+    safety = needle(MovingHalfPlane(0.002, rate=-0.01))
     tail, heading = np.array([0.0, 0.0]), np.array([1.0, 0.0])
     free = safety.filter(np.array([0.01, 0.0]), tail, heading, time=0.0)
     assert free.active == ()  # at the end of the hold the bound is at the needle
-    caught = safety.filter(np.array([0.01, 0.0]), tail, heading, time=0.15)
-    assert caught.reason == "stopped by half_plane"
+    pushed = needle(MovingHalfPlane(0.002, rate=-0.01), length=0.0).filter(
+        np.array([0.01, 0.0]), tail, heading, time=0.15
+    )
+    assert pushed.active == ("half_plane",)
+    assert pushed.filtered[1] < -0.005  # as fast as it is commanded, and off the bound
+    assert math.hypot(*pushed.filtered) == pytest.approx(0.01)
+    towards = safety.filter(np.array([0.0, 0.01]), tail, np.array([0.0, 1.0]), time=0.15)
+    assert towards.reason == "stopped by half_plane"
     fleeing = safety.filter(np.array([0.0, -0.012]), tail, np.array([0.0, -1.0]), time=0.15)
     assert fleeing.filtered.tolist() == [0.0, -0.012]
 
@@ -192,17 +216,72 @@ def test_beyond_an_added_barrier_a_point_leaves_a_little_as_it_slides():
 
 def test_a_barrier_that_appears_within_the_hold_is_kept_too():
     safety, tail = needle(Appearing(0.0), length=0.0), np.array([0.0, -0.001])
-    assert safety.filter(np.array([0.01, 0.0]), tail, EAST).active == ()
-    found = safety.filter(np.array([0.0, 0.01]), tail, EAST)  # 2 mm in the hold
+    assert safety.filter(np.array([0.01, 0.0]), tail, EAST, time=0.0).active == ()
+    found = safety.filter(np.array([0.0, 0.01]), tail, EAST, time=0.0)  # 2 mm in the hold
     assert found.active == ("half_plane",)
     assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
 
 
 def test_with_added_barriers_the_share_is_still_that_of_the_wall_and_no_older_reason_is_named():
-    safety, east = needle(HalfPlane(0.002, rate=-0.01)), np.array([0.01, 0.0])
+    safety, east = needle(MovingHalfPlane(0.002, rate=-0.01)), np.array([0.01, 0.0])
     at_wall = np.array([0.0175 - LENGTH - 0.0015, -0.002])
+    safety.filter(east, np.zeros(2), EAST, time=0.0)
     share, name = safety.safe_share(east, at_wall, EAST)
     assert name == "wall"
     assert 0.3 < share < 0.6
-    assert safety.filter(east, at_wall, EAST).active == ("wall",)
-    assert safety.filter(east, np.zeros(2), EAST, time=0.15).active == ("half_plane",)
+    assert safety.filter(east, at_wall, EAST, time=0.0).active == ("wall",)
+    assert safety.filter(np.array([0.0, 0.01]), np.zeros(2), EAST, time=0.15).active == ("half_plane",)
+
+
+PERIOD, CLEARANCE = 0.05, 1e-4  # s and m
+
+
+def chased(command: np.ndarray, *discs: Barrier, steps: int = 40) -> tuple[list[np.ndarray], list[float]]:
+    """Command a point at the origin that discs move to; return what was filtered, and the least h after each step."""
+    safety, tail = needle(*discs, length=0.0), np.zeros(2)
+    filtered, least = [], []
+    for step in range(steps):
+        found = safety.filter(command, tail, EAST, time=100.0 + step * PERIOD, first_time=100.0)
+        tail = tail + PERIOD * found.filtered
+        filtered.append(found.filtered)
+        for disc in discs:
+            disc.set_time((step + 1) * PERIOD)
+        least.append(min(float(disc.value(tail[None])[0]) for disc in discs))
+    return filtered, least
+
+
+def disc_from(side: float, name: str = "moving_disc") -> Barrier:
+    """Return a disc that comes along x at 2 mm/s from -1, the left, or 1, the right."""
+    disc = MovingDisc((side * (0.0015 + CLEARANCE), 0.0), (-0.002 * side, 0.0), 0.0015)
+    disc.name = name
+    return disc
+
+
+def test_a_needle_that_is_slower_than_the_disc_behind_it_flees_as_fast_as_it_is_commanded():
+    command = np.array([0.001, 0.0])
+    filtered, least = chased(command, disc_from(-1.0), steps=20)
+    assert all(np.allclose(velocity, command, rtol=1e-9) for velocity in filtered)
+    assert least[-1] == pytest.approx(CLEARANCE - (0.002 - 0.001) * 20 * PERIOD)  # it is run over, and does not wait
+
+
+def test_a_needle_that_is_faster_than_the_disc_behind_it_is_never_touched():
+    command = np.array([0.0005, 0.003])  # off its way, too slowly by itself
+    filtered, least = chased(command, disc_from(-1.0))
+    assert min(least) > -1e-6
+    assert filtered[0][0] > 0.001
+    assert max(math.hypot(*velocity) for velocity in filtered) <= math.hypot(*command) * (1.0 + 1e-9)
+
+
+def test_between_two_discs_that_close_in_a_needle_leaves_sideways_and_does_not_run_into_one():
+    filtered, _ = chased(np.array([0.0, 0.003]), disc_from(-1.0), disc_from(1.0, "other_disc"), steps=10)
+    assert all(velocity[1] > 0.0029 for velocity in filtered)
+    (towards, *_), _ = chased(np.array([0.003, 0.0]), disc_from(-1.0), disc_from(1.0, "other_disc"), steps=1)
+    assert not towards.any()
+
+
+def test_a_filter_with_a_barrier_that_moves_needs_the_time():
+    safety, tail = needle(disc_from(-1.0), length=0.0), np.array([0.0, 0.005])
+    for call in (safety.filter, safety.safe_share, safety.nearest_clear):
+        with pytest.raises(InvalidInputError, match=r"time: got None.*moving_disc moves"):
+            call(np.array([0.001, 0.0]), tail, EAST)
+    assert not needle(HalfPlane()).filter(np.array([0.001, 0.0]), tail - 0.01, EAST).active

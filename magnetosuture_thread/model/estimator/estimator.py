@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import checked_arguments
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
@@ -59,6 +60,7 @@ class ThreadEstimator:
         ConfigurationError: the predictor's formulation is not `rod`, or it is not in the plane.
     """
 
+    @checked_arguments("estimator")
     def __init__(self, predictor: ThreadPredictor, options: EstimatorOptions | None = None) -> None:
         formulation = predictor.formulation
         if not isinstance(formulation, RodFormulation):
@@ -106,6 +108,7 @@ class ThreadEstimator:
         self.start(pose, path)
         self.step(replace(pose, stamp=0.01), ThreadObservation((piece,), True))
         self.reset()
+        self.predictor.added.first_time = math.inf
 
     def reset(self) -> None:
         """Forget the thread; the next call must be `start`."""
@@ -127,7 +130,7 @@ class ThreadEstimator:
         Raises:
             InvalidInputError: see `ThreadPredictor.start`.
         """
-        self._prediction = self.predictor.start(pose, centreline)
+        self._prediction = self.predictor.start(pose, centreline, strict=False)
         self._converged = self._prediction.converged
         self._forget()
         arcs = np.arange(self.thread.segments + 1.0)
@@ -328,6 +331,7 @@ class ThreadEstimator:
             along = np.gradient(positions, axis=0)
             normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
             covariance = scale * self._variance[:, None, None] * normal[:, :, None] * normal[:, None, :]
+        formulation.added.set_time(pose.stamp)
         added, tolerance = formulation.added.rows(positions), self.predictor.contact_tolerance
 
         def compute_rows() -> list[BarrierRows]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import Annotated
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
 
 SLOW_PARAMETERS = ("stiffness_over_drag", "drag_anisotropy", "rest_curvature", "flow")
 AUTOMATIC = "auto"
+SHARE, LENGTH, TIME = bounded("", 1e-6, 100.0), bounded("m", 1e-9, 0.1), bounded("s", 1e-3, 1e5)
 
 
+@checked_arguments("estimator")
 @dataclass(frozen=True)
 class EstimatorOptions:
     """How much the camera and the model are trusted.
@@ -33,28 +36,22 @@ class EstimatorOptions:
         ConfigurationError: a value is not a positive number, or a parameter is unknown.
     """
 
-    error_correlation: float = 0.1
-    point_correlation: float = 2.5e-4
-    min_deviation: float = 5e-6
-    noise_time: float = 1.0
-    initial_error: float = 0.2
-    disturbance_time: float = 0.4
-    history: float = 1.0
+    error_correlation: Annotated[float, SHARE] = 0.1
+    point_correlation: Annotated[float, LENGTH] = 2.5e-4
+    min_deviation: Annotated[float, LENGTH] = 5e-6
+    noise_time: Annotated[float, TIME] = 1.0
+    initial_error: Annotated[float, SHARE] = 0.2
+    disturbance_time: Annotated[float, TIME] = 0.4
+    history: Annotated[float, TIME] = 1.0
     slow_parameters: tuple[str, ...] = (AUTOMATIC,)
-    slow_time: float = 10.0
+    slow_time: Annotated[float, TIME] = 10.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Check the names."""
         for name in self.slow_parameters if self.slow_parameters != (AUTOMATIC,) else ():
             if name not in SLOW_PARAMETERS:
                 expected = f"some of {', '.join(SLOW_PARAMETERS)}, or {AUTOMATIC} alone"
                 raise ConfigurationError("estimator.slow_parameters", name, expected)
-        for each in fields(self):
-            if each.name == "slow_parameters":
-                continue
-            value = getattr(self, each.name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ConfigurationError(f"estimator.{each.name}", value, "a positive number")
 
     @property
     def automatic(self) -> bool:

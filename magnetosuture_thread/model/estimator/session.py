@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from magnetosuture_thread.arguments import checked_arguments
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
@@ -58,6 +59,7 @@ class EstimatorSession:
         estimator: warmed up.
     """
 
+    @checked_arguments("estimator session")
     def __init__(self, estimator: ThreadEstimator) -> None:
         self._estimator = estimator
         self._moments: deque[_Moment] = deque(maxlen=MAX_POSES)
@@ -77,6 +79,7 @@ class EstimatorSession:
         self.reset()
         self._early = dict(other._early)
         before, now = other._estimator, self._estimator
+        now.predictor.added.first_time = before.predictor.added.first_time
         kept = before.snapshot()
         if kept is None:
             return

@@ -74,12 +74,16 @@ class AddedBarriers:
     Args:
         barriers: in the order in which margins list them.
         segment_length: D [m].
+
+    Attributes:
+        first_time: stamp of the needle's first pose [s].
     """
 
     def __init__(self, barriers: Sequence[Barrier], segment_length: float) -> None:
         self._barriers, self._unit = tuple(barriers), segment_length
         self._before: list[Vector | None] = [None] * len(self._barriers)
         self._start = np.empty((0, 0))
+        self.first_time = math.inf
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
@@ -95,9 +99,9 @@ class AddedBarriers:
         return [barrier.rows(positions) for barrier in self._barriers]
 
     def set_time(self, time: float) -> None:
-        """Set the time of the next evaluation [s]."""
+        """Set the time of the next evaluation, a stamp [s]."""
         for barrier in self._barriers:
-            barrier.set_time(time)
+            barrier.move_to(time, self.first_time)
 
     def begin(self, positions: Points, time: float, interval: float) -> None:
         """Begin a step: keep h(x) of the barriers whose gain does not let it fall to 0 within it.

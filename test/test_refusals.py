@@ -1,0 +1,260 @@
+"""What the public constructors and calls refuse: by a name, the value and what is expected, whatever is given."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import magnetosuture_thread
+from magnetosuture_thread import (
+    MATERIALS,
+    Attachment,
+    Barrier,
+    ConfigurationError,
+    Disc,
+    Dish,
+    EstimatorOptions,
+    EstimatorSession,
+    ForecastStart,
+    Gradient,
+    InvalidInputError,
+    MagnetosutureError,
+    Material,
+    Medium,
+    Mesh,
+    NeedlePose,
+    NeedleSafetyFilter,
+    Polygon,
+    Scene,
+    SceneShape,
+    Thread,
+    ThreadEstimator,
+    ThreadForecaster,
+    ThreadPredictor,
+    Workspace,
+    check_gradient,
+)
+
+SCENE = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.01, 0.0), 0.0015)})
+EMPTY = Scene.create(dish_diameter=0.045)
+EAST, STRAIGHT = np.array([1.0, 0.0]), np.array([[0.0, 0.0], [-0.019, 0.0]])
+THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
+POSE = NeedlePose(0.0, np.zeros(2), EAST)
+NODES = np.column_stack([np.linspace(0.0, -0.019, 26), np.zeros(26)])
+
+
+class Below(Barrier):
+    """h_i = 1 cm - y_i."""
+
+    name = "below"
+
+    def __init__(self, gain: Any = math.inf, slack_weight: Any = math.inf) -> None:
+        self.gain, self.slack_weight = gain, slack_weight
+
+    def value(self, positions: np.ndarray) -> np.ndarray:
+        """Return a row for each node."""
+        return np.asarray(0.01 - positions[:, 1])
+
+    def gradient(self, positions: np.ndarray) -> Gradient:
+        """Return its gradient."""
+        return Gradient(np.arange(len(positions))[:, None], np.tile([[[0.0, -1.0]]], (len(positions), 1, 1)))
+
+
+def made(kind: Callable[..., Any], /, **arguments: Any) -> Callable[..., Any]:
+    """Return what makes an object of arguments, of which some may be changed."""
+    return lambda **changes: kind(**{**arguments, **changes})
+
+
+CREATE = made(ThreadPredictor.create, material="polyamide_7_0", length=0.019, segments=25)
+FILTER = made(NeedleSafetyFilter, scene=EMPTY, needle_length=0.004)
+PREDICTOR = made(ThreadPredictor, thread=THREAD, scene=EMPTY)
+FORECASTER = made(ThreadForecaster, thread=THREAD, scene=EMPTY)
+MATERIAL = made(Material, name="x", diameter=6e-5, elastic_modulus=2e9, source="")
+MEDIUM = made(Medium, drag_across=1.0, drag_along=0.5)
+THREADS = made(Thread, **{name: getattr(THREAD, name) for name in Thread.__dataclass_fields__})
+
+
+def of_call(**changes: Any) -> Any:
+    """Filter a command."""
+    given = {"commanded": 0.002 * EAST, "tail": np.zeros(2), "heading": EAST, **changes}
+    return NeedleSafetyFilter(EMPTY, max_acceleration=0.5).filter(**given)
+
+
+def of_start(pose: NeedlePose = POSE, scene: Scene = EMPTY, **changes: Any) -> Any:
+    """Start a thread."""
+    return ThreadPredictor(THREAD, scene).start(pose, **changes)
+
+
+def of_step(**changes: Any) -> Any:
+    """Start a thread at the origin, and follow the needle on."""
+    predictor = ThreadPredictor(THREAD, EMPTY)
+    predictor.start(POSE)
+    return predictor.step(NeedlePose(**{"stamp": 0.02, "tail": (0.0, 1e-4), "heading": (1.0, 0.0), **changes}))
+
+
+def of_forecast(**changes: Any) -> Any:
+    """Forecast a thread that lies straight."""
+    return FORECASTER().forecast(ForecastStart(**{"pose": POSE, "vertices": NODES, **changes}), np.zeros(2), 0.1)
+
+
+def of_barrier(**changes: Any) -> Any:
+    """Give a barrier to a filter."""
+    return NeedleSafetyFilter(EMPTY, [Below(**changes)])
+
+
+TABLE: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
+    (FILTER, {"max_speed": -0.001}, "safety filter.max_speed: got -0.001, expected a number from 1e-06 to 0.5 m/s"),
+    (FILTER, {"max_speed": 10.0}, "max_speed: got 10.0, expected a number .* given in m/s?"),
+    (FILTER, {"hold_time": -0.2}, "hold_time: got -0.2, expected a number from 0.001 to 10 s"),
+    (FILTER, {"hold_time": 0}, "hold_time: got 0, expected a number"),
+    (FILTER, {"approach_rate": -1.0}, "approach_rate: got -1.0"),
+    (FILTER, {"max_acceleration": -0.5}, "max_acceleration: got -0.5"),
+    (FILTER, {"needle_length": -0.004}, "needle_length: got -0.004"),
+    (FILTER, {"needle_length": 4}, "needle_length: got 4, .* given in metres?"),
+    (FILTER, {"needle_curvature": 1e3}, "needle_curvature: got 1000.0, expected at most"),
+    (FILTER, {"keep_out": [5e-4]}, "keep_out: got .0.0005., expected a number"),
+    (FILTER, {"scene": "dish"}, "scene: got 'dish', expected an instance of Scene"),
+    (of_call, {"max_speed": -0.001}, "max_speed: got -0.001, expected a number of at least 0 m/s, or inf"),
+    (of_call, {"slowdown": 1.5}, "slowdown: got 1.5, expected a number from 0 to 1"),
+    (of_call, {"tail": [0.0, 3.0]}, "tail: got .0.0, 3.0., expected finite numbers from -1 to 1 m; given in metres?"),
+    (of_call, {"heading": np.zeros(3)}, "heading: got shape (3,), expected shape (2,)"),
+    (of_call, {"previous": 0.001}, "previous: got shape (), expected shape (2,)"),
+    (of_barrier, {"gain": -1.0}, "below.gain: got -1.0, expected a number of at least 1e-06 1/s, or inf"),
+    (of_barrier, {"slack_weight": [1.0]}, "below.slack_weight: got .1.0."),
+    (CREATE, {"length": 19}, "thread.length: got 19, expected a number from 0.0001 to 2 m; given in metres?"),
+    (CREATE, {"segments": 25.0}, "thread.segments: got 25.0, expected a whole number from 3 to 2000"),
+    (CREATE, {"material": ["silk"]}, "material: got .'silk'., expected one of polyamide_7_0"),
+    (CREATE, {"viscosity": "1"}, "viscosity: got '1', expected a number"),
+    (CREATE, {"max_step": 0.0}, "thread predictor.max_step: got 0.0"),
+    (PREDICTOR, {"thread": 3}, "thread: got 3, expected an instance of Thread"),
+    (PREDICTOR, {"max_substeps": 0}, "max_substeps: got 0"),
+    (PREDICTOR, {"fixed_nodes": (2.5,)}, "fixed_nodes: got (2.5,), expected a list of whole numbers"),
+    (THREADS, {"diameter": 60.0}, "thread.diameter: got 60.0"),
+    (THREADS, {"diameter": 0.06}, "thread.diameter: got 0.06, .* given in metres?"),
+    (THREADS, {"rest_curvature": (1.0, 2.0)}, "rest_curvature: got (1.0, 2.0), expected one number, or 24"),
+    (MEDIUM, {"drag_across": -1.0}, "medium.drag_across: got -1.0"),
+    (MATERIAL, {"elastic_modulus": math.nan}, "material.elastic_modulus: got nan"),
+    (made(EstimatorOptions), {"history": [1.0]}, "estimator.history: got .1.0."),
+    (FORECASTER, {"step": 0.0}, "forecaster.step: got 0.0, expected a number from 0.0001 to 1 s"),
+    (FORECASTER, {"attachment_offset": 3.0}, "attachment_offset: got 3.0, expected a list"),
+    (made(Dish), {"diameter": 35.0}, "dish.diameter: got 35.0, .* to 0.5 m; given in metres?"),
+    (made(Disc, centre=(0.0, 0.0), radius=0.001), {"radius": 15.0}, "disc.radius: got 15.0, .* given in metres?"),
+    (made(Disc, centre=(0.0, 0.0), radius=0.001), {"centre": (0.0,)}, "disc.centre: got (0.0,), expected two coord"),
+    (made(Polygon, outline=()), {"outline": 5}, "polygon.outline: got 5, expected points of two coordinates"),
+    (made(Workspace, shapes=(), reach=0.01), {"shapes": [3]}, "shapes.0.: got 3, expected an instance of Disc"),
+    (made(Scene), {"shapes": ["post"]}, "scene.shapes.0.: got 'post', expected an instance of SceneShape"),
+    (of_start, {"pose": NeedlePose(0.0, np.array([5.0, 0.0]), EAST)}, "needle pose position: .* 0.0425 m from"),
+    (of_start, {"pose": NeedlePose(0.0, np.zeros(3), np.eye(3)[0])}, "needle pose: got tail .* expected shapes (2,)"),
+    (of_start, {"centreline": STRAIGHT * 5.0 / 19.0}, "got 0.005 m long, expected 0.019 m, .* strict=False"),
+    (of_start, {"centreline": 2.0 * STRAIGHT}, "centreline: got 0.038 m long, expected 0.019 m"),
+    (of_start, {"centreline": 1e3 * STRAIGHT}, "centreline: got numbers|centreline: got .-19.0, 0.0., .* metres?"),
+    (of_start, {"scene": SCENE}, "centreline: got a thread that lies in post, expected one clear of wall and shapes"),
+    (of_start, {"scene": SCENE, "centreline": STRAIGHT}, "centreline: got a thread that lies in post"),
+    (of_start, {"centreline": np.zeros(4)}, "centreline: got shape (4,), expected shape (m, 2)"),
+    (of_step, {"tail": (0.05, 0.0)}, "needle pose position: got .0.05, 0.0., .* at most 0.0425 m"),
+    (of_step, {"tail": (5.0, 0.0)}, "needle pose position: got .5.0, 0.0., .* given in metres?"),
+    (of_step, {"stamp": "now"}, "needle pose stamp: got now, expected a finite time"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "given", "words"), TABLE)
+def test_a_value_that_cannot_be_is_refused_by_name_value_and_expectation(
+    call: Callable[..., Any], given: dict[str, Any], words: str
+):
+    pattern = re.sub(r"([()?])", r"\\\1", words)
+    with pytest.raises((ConfigurationError, InvalidInputError), match=pattern) as refused:
+        call(**given)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_centreline_that_ends_early_is_continued_where_that_is_asked_for_and_only_there():
+    found = of_start(centreline=STRAIGHT * 5.0 / 19.0, strict=False).positions
+    np.testing.assert_allclose(found[-1], [-0.019, 0.0], atol=1e-9)
+    assert of_start(scene=SCENE, strict=False).positions.shape == (26, 2)
+    np.testing.assert_allclose(of_start(centreline=STRAIGHT * 1.05).positions[-1], [-0.019, 0.0], atol=1e-9)
+
+
+def test_numbers_of_numpy_and_lists_are_taken_as_what_they_are():
+    predictor = CREATE(length=np.float32(0.019), segments=np.int64(25), scene=EMPTY, fixed_nodes=np.array([25]))
+    assert predictor.thread.segments == 25
+    assert predictor.fixed_nodes == (25,)
+    start: Any = NeedlePose
+    predictor.start(start(0, [0, 0], [1, 0]), STRAIGHT.tolist())
+    assert of_call(commanded=[0.002, 0.0], tail=[0.0, 0.0], heading=(1, 0)).filtered.tolist() == [0.002, 0.0]
+    assert made(Disc)(centre=np.array([0, 1e-3]), radius=np.float64(1e-3)) == Disc((0.0, 1e-3), 1e-3)
+
+
+# What is returned and not made by users, and what has no numbers.
+RECORDS = {"BarrierMargins", "FilteredCommand", "Forecast", "Gradient", "Margins", "Prediction", "ThreadEstimate"}
+OTHERS = {"MATERIALS", "Attachment", "ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"}
+OF_FILES = {"calibrate_bags", "read_scene", "replay_offline"}  # test/jobs, test/scene
+MADE: dict[str, tuple[Callable[..., Any], str]] = {
+    "Barrier": (of_barrier, "gain slack_weight"),
+    "Disc": (made(Disc, centre=(0.0, 0.0), radius=0.001), "centre radius"),
+    "Dish": (made(Dish), "diameter depth wall_friction self_contact"),
+    "EstimatorOptions": (made(EstimatorOptions), " ".join(EstimatorOptions.__dataclass_fields__)),
+    "EstimatorSession": (made(EstimatorSession, estimator=3), "estimator"),
+    "ForecastStart": (
+        of_forecast,
+        "pose vertices velocities interval tip_velocity needle_force thread",
+    ),
+    "Material": (MATERIAL, "diameter elastic_modulus stiffness_weight"),
+    "Medium": (MEDIUM, " ".join(Medium.__dataclass_fields__)),
+    "Mesh": (made(Mesh, vertices=np.eye(3), faces=[[0, 1, 2]]), "vertices faces"),
+    "NeedlePose": (of_step, "stamp tail heading deviation"),
+    "NeedleSafetyFilter": (
+        FILTER,
+        "scene barriers keep_out approach_rate hold_time max_speed max_acceleration needle_length "
+        "needle_curvature",
+    ),
+    "Polygon": (made(Polygon, outline=((0, 0), (1, 0), (0, 1))), "outline holes"),
+    "Scene": (made(Scene), "dish shapes"),
+    "SceneShape": (made(SceneShape, name="a", kind="wall", geometry=Disc((0, 0), 1e-3)), "geometry friction"),
+    "Thread": (THREADS, "length segments diameter bending_stiffness medium attachment rest_curvature"),
+    "ThreadEstimator": (made(ThreadEstimator, predictor=3), "predictor options"),
+    "ThreadForecaster": (
+        FORECASTER,
+        "thread scene safety law friction_averaging attachment_offset drag step margin_range "
+        "contact_tolerance residual_tolerance max_step max_substeps fixed_nodes workers",
+    ),
+    "ThreadPredictor": (
+        CREATE,
+        "material length segments attachment viscosity scene barriers formulation solver paper "
+        "margin_range contact_tolerance residual_tolerance max_step max_substeps fixed_nodes",
+    ),
+    "Workspace": (
+        made(Workspace, shapes=(Disc((0, 0), 1e-3),), reach=0.01),
+        "shapes reach dimension wall_radius friction wall_friction",
+    ),
+    "check_gradient": (made(check_gradient, barrier=Below(), positions=STRAIGHT), "positions"),
+    "NeedleSafetyFilter.filter": (
+        of_call,
+        "commanded tail heading slowdown max_speed previous elapsed time first_time",
+    ),
+    "ThreadPredictor.start": (of_start, "centreline"),
+}  # fmt: skip
+WRONG = [-1.0, -1e-3, math.nan, math.inf, -math.inf, 0, [], [1.0, 2.0, 3.0], [[0.0]], "seven", np.zeros((2, 2, 2)),
+         10**400, True, {}, object()]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_whatever_a_public_constructor_is_given_it_says_what_is_wrong(name: str):
+    make, arguments = MADE[name]
+    for argument in arguments.split():
+        refused = []
+        for value in WRONG:
+            try:
+                make(**{argument: value})
+            except MagnetosutureError as error:
+                refused.append(str(error))
+        assert len(refused) >= 5
+        assert not any("\n" in text for text in refused)
+
+
+def test_every_public_constructor_is_tried():
+    assert set(magnetosuture_thread.__all__) - RECORDS - OTHERS - OF_FILES <= set(MADE)
