@@ -54,7 +54,8 @@ FOREIGN_WORDS = {
     "corner_radus",
     "AWS_ENDPOINT_URL",
     "ROS_SECURITY_ENCLAVE_OVERRIDE",
-}  # of rclcpp; a slip that is shown as such
+    "ID_PATH",
+}  # of rclcpp and udev; a slip that is shown as such
 SCRIPTS = set(re.findall(r'^(\w+) = "magnetosuture_thread\.', (ROOT / "pyproject.toml").read_text(), re.MULTILINE))
 TARGETS = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 LAUNCH_ARGUMENTS = set(re.findall(r'argument\("(\w+)"', (ROOT / "launch/magnetosuture.launch.py").read_text()))

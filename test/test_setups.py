@@ -193,7 +193,8 @@ def test_a_needle_in_millimetres_is_refused(tmp_path: Path):
     path.write_text("/**: {ros__parameters: {needle_length: 7.0}}\n")
     with pytest.raises(ConfigurationError) as caught:
         read_setup(str(path))
-    assert str(caught.value) == f"{path}: vision_tracker.needle_length: got 7.0, expected a number from 0.001 to 0.05 m"
+    expected = "got 7.0, expected a number from 0.001 to 0.05 m; given in metres?"
+    assert str(caught.value) == f"{path}: vision_tracker.needle_length: {expected}"
 
 
 def test_an_unknown_setup_is_refused_with_the_known_ones():

@@ -224,9 +224,10 @@ def measure_bridge(
         folder = Path(name)
         ports = [str(folder / f"board_{index}") for index in range(2)]
         stage = PowerStage(ports, SUPPLY, RESISTANCE, INDUCTANCE)
-        # No thread is predicted here, and nothing shall go slower for that.
-        alone = {"without_prediction": "slow", "speed_without_prediction": settings.max_speed}
-        parameters = {"driver": "roboclaw", "roboclaw_ports": ports, "coil_resistance": RESISTANCE, **alone}
+        # No thread is predicted here, and nothing shall go slower for that; there is no needle that could follow.
+        alone = {"without_prediction": "slow", "speed_without_prediction": settings.max_speed, "pose_uncertainty": 0.01}
+        boards = {"roboclaw_ports": ports, "roboclaw_addresses": [board.address for board in stage.boards]}
+        parameters = {"driver": "roboclaw", **boards, "coil_resistance": RESISTANCE, **alone}
         file = folder / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
         arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]

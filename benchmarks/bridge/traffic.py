@@ -21,7 +21,7 @@ from magnetosuture_thread.nodes.run import run
 
 KINDS = ("commander", "tracker", "fuzzer")
 RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
-SPEED = 0.005  # m/s
+SPEED = 0.001  # m/s; too slow for the bridge to judge whether a needle follows whose pose is always the same
 TAIL, HEADING = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
 ODD = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 

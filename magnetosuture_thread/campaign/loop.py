@@ -235,10 +235,6 @@ class ClosedLoop:
         self.bridge.on_margins(
             stamp, margins is not None, margins.friction.slowdown if margins else 1.0, result.scene_version, now
         )
-        forces = result.prediction.forces if result.prediction is not None else None
-        if self.bridge.feedforward is not None:
-            force = np.full(2, np.nan) if forces is None else forces.needle_force
-            self.bridge.feedforward.update(force, stamp, now)
         self._condition = replace(condition_of(result), drift=self._drift)
         if self.setup.coils.friction_feedback != "all":
             self._condition = replace(self._condition, slowdown=1.0)

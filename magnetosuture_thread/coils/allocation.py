@@ -51,6 +51,7 @@ class NeedleMechanics:
         drag: force along the body for one m/s, with what the thread adds to it [N s/m].
         drag_across: the same across the body [N s/m].
         turning_drag: torque for one rad/s [N m s].
+        slack_drag: drag along the body while the thread is slack and adds nothing [N s/m].
     """
 
     length: float
@@ -59,6 +60,7 @@ class NeedleMechanics:
     drag: float
     drag_across: float
     turning_drag: float
+    slack_drag: float
 
     @cached_property
     def kinematics(self) -> NeedleKinematics:
@@ -161,6 +163,21 @@ class CoilAllocation:
     def chord_direction(self, heading: Vector) -> Vector:
         """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
         return self._needle.chord_direction(heading)
+
+    def slack_speed(self, allocation: Allocation, heading: Vector) -> float:
+        """Return the speed that the force of allocated currents gives a needle that lies along it, with a slack thread.
+
+            |F| / slack_drag
+
+        That is the greatest, as the drag across the needle is higher.
+
+        Args:
+            allocation: the currents, and what they give by the model.
+            heading: unit vector along the needle at its tail, shape (2,).
+        """
+        needle = self._needle
+        along = needle.drag * float(needle.chord_direction(heading) @ allocation.velocity)
+        return math.hypot(along, needle.drag_across * allocation.drift) / needle.slack_drag
 
     def zero(self) -> Allocation:
         """Return zero currents."""

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.allocation import Allocation
 from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.follow_monitor import FollowMonitor
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance, MotionObserver
-from magnetosuture_thread.coils.pose_extrapolator import TOPIC, PoseExtrapolator
+from magnetosuture_thread.coils.pose_extrapolator import CONSISTENT_POSES, TOPIC, Pose, PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor, StampAges
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import STUCK, rest_reason
+from magnetosuture_thread.safety.filter import SPEED, STUCK, FilteredCommand, NeedleSafetyFilter, rest_reason
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.texts import shortened
 
@@ -111,17 +111,18 @@ class CoilBridge:
         extrapolator: extrapolates the needle's pose.
         prediction_monitor: monitors the thread model's margins.
         stamp_ages: how old commands and poses are when they arrive.
-        feedforward: compensates the thread's pull on the needle; None if nothing shall.
+        scene_problem: why the scene that was heard last is not in force, while the currents are zero; empty if it is.
 
     Raises:
         ConfigurationError: the needle has no room in the scene.
     """
 
     def __init__(self, settings: CoilBridgeSettings, latch: ArmingLatch, scene: Scene | None) -> None:
-        self.latch = latch
+        self.latch, self.scene_problem = latch, ""
         self.watchdogs = {name: CommandWatchdog(settings.command_timeout, topic) for name, topic in INPUTS.items()}
         self._hold = min(settings.command_timeout, settings.driver_timeout)  # the coils certainly hold a current
-        kinematics = settings.needle().kinematics
+        needle = settings.needle()
+        kinematics = needle.kinematics
         self.extrapolator = PoseExtrapolator(
             kinematics,
             settings.pose_timeout,
@@ -132,15 +133,14 @@ class CoilBridge:
             max_hold=settings.hold_time,
         )
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
-        self.feedforward = settings.feedforward()
-        self._observer = MotionObserver(kinematics, self._hold) if settings.motion_compensation else None
+        self._observer = MotionObserver(kinematics, self._hold, settings.max_speed)
+        self._follow = FollowMonitor(settings.pose_uncertainty, needle.drag / needle.slack_drag)
         self._settings, self._gains = settings, settings.gain_estimator()
         self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None
         self._losses, self._previous, self._velocity = 0, self._coils.zero(), np.zeros(2)
-        self._last_step, self._was_armed = -math.inf, False
+        self._last_step, self._was_armed, self._blocked, self._blocked_reason = -math.inf, False, -math.inf, ""
         self._stopped: float | None = None
-        self._blocked, self._blocked_reason = -math.inf, ""
         self.set_scene(scene)
 
     @property
@@ -171,8 +171,7 @@ class CoilBridge:
     def rest(self, now: float, arrival: float) -> None:
         """Register that the currents are zero from a time on; see `step` for the times."""
         self._clear()
-        if self._observer is not None:
-            self._observer.rest(now)
+        self._observer.rest(now)
         self.extrapolator.apply_velocity(self._velocity, now, arrival)
 
     def command(self, source: str, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
@@ -201,9 +200,18 @@ class CoilBridge:
     ) -> None:
         """Register a measured needle pose; see `PoseExtrapolator.update`."""
         self.stamp_ages.add(TOPIC, now - stamp, arrival)
-        self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance)
-        if self._observer is not None:
-            self._observer.update(tail, heading, stamp)
+        try:
+            self.extrapolator.update(tail, heading, stamp, number, now, arrival, covariance, self.latch.armed)
+        except InvalidInputError:
+            if self.latch.armed and self.extrapolator.rejections >= CONSISTENT_POSES:
+                self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
+            raise
+        motion = self._observer.update(tail, heading, stamp, self._follow.is_trusted(stamp))
+        if self._filter is None or self._filter.clearance(tail, heading) < self._filter.keep_out:
+            self._follow.clear()  # what the needle lies at may hold it
+        elif motion is not None and self.latch.armed and (problem := self._follow.update(motion)):
+            self.latch.trip(problem)
+        if self._settings.motion_compensation:
             self._gains.update(tail, heading, stamp)
             self._coils.set_gains(self._gains.gains)
 
@@ -220,7 +228,8 @@ class CoilBridge:
         if self._filter is None:
             raise InvalidInputError("arm", NO_SCENE, "a scene, as a parameter or on its topic")
         self.latch.arm(driver.problem if not driver.ready else "")
-        self._losses = driver.losses
+        self._losses, self.extrapolator.rejections = driver.losses, 0
+        self._follow.clear()
         for watchdog in self.watchdogs.values():
             watchdog.clear()
 
@@ -268,14 +277,19 @@ class CoilBridge:
         reasons = self._stop_reasons(arrival, then, driver, selected, no_prediction)
         active: tuple[str, ...] = (NO_PREDICTION,) if no_prediction else ()
         if reasons or pose is None or self._filter is None:
+            self._follow.end_probe()
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
+        if self._follow.probe_rate and selected.velocity.any():
+            selected = replace(selected, velocity=self._probe_velocity(pose))
         if not selected.velocity.any():
+            self._follow.end_probe()
             output, self._stopped = replace(self._zero_output(now, arrival, selected, ()), publish=True), None
             return output
         max_speed = min(
             self._settings.max_speed, self._settings.speed_without_prediction if no_prediction else math.inf
         )
+        compensates = self._settings.motion_compensation
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
         slowed = selected.source == OPERATOR or self._settings.friction_feedback == "all"
         filtered = self._filter.filter(
@@ -287,36 +301,47 @@ class CoilBridge:
             previous=self._velocity,
             elapsed=elapsed,
             time=now,
+            first_time=self.extrapolator.first_stamp,
         )
         active += filtered.active
-        if filtered.reason and self._observer is None:
+        if filtered.reason and not compensates:
             return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
-        max_change, pull = self._settings.max_current_slew * elapsed, np.zeros(2)
-        disturbance = None if self._observer is None else self._observer.disturbance(pose.heading)
-        if self.feedforward is not None and not no_prediction:
-            pull = self.feedforward.velocity(filtered.filtered, pose.heading, now, arrival)
+        max_change = self._settings.max_current_slew * elapsed
+        disturbance = self._observer.disturbance(pose.heading) if compensates else None
         sidestep = min(filtered.slowdown * math.hypot(*selected.velocity), max_speed - math.hypot(*filtered.filtered))
         sidestep = max(0.0, sidestep)  # while the needle slows down to another limit it is still faster
         allocation, limiting = self._coils.allocate(
-            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, pull, sidestep
+            filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, sidestep
         )
         e, limits = self._coils.chord_direction(pose.heading), (limiting, CURRENT_LIMIT if allocation.saturated else "")
         active += tuple(name for name in limits if name and name not in active)
         measured = MotionDisturbance() if disturbance is None else disturbance
         expected = allocation.velocity + measured.velocity(e)
-        drift = 0.0 if disturbance is None else allocation.drift + measured.drift
+        own_drift = allocation.drift if compensates else 0.0  # else it counts as part of the turn
+        drift = own_drift + measured.drift
         is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
         # A needle that is pulled is held by currents where it may not go on.
-        if (is_stuck and self._observer is None) or np.abs(allocation.currents).max() < NO_CURRENT:
+        if (is_stuck and not compensates) or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
         self.extrapolator.apply_velocity(expected, now, arrival, drift)
-        if self._observer is not None:
-            self._observer.apply(now, pose.heading, float(e @ allocation.velocity), allocation.drift)
+        n = np.array([-e[1], e[0]])
+        applied = float(e @ allocation.velocity) * e + own_drift * n
+        # Where the force that is allowed does not suffice, what was intended is the filtered velocity.
+        intended = float(e @ filtered.filtered) * e if limiting == SPEED else applied + self._observer.velocity
+        turn_rate = 2.0 / self.extrapolator.chord * (float(n @ allocation.velocity) - own_drift)
+        self._observer.apply(now, applied, intended, turn_rate)
+        self._follow.register_turn(turn_rate * period)
+        if compensates:
             self._gains.apply(now, allocation.currents)
         return self._output(selected, (), True, active, filtered.slowdown, measured.drift)
+
+    def _probe_velocity(self, pose: Pose) -> Vector:
+        """Return the tip velocity that turns the needle to see whether it follows, shape (2,) [m/s]."""
+        x, y = self._coils.chord_direction(pose.heading).tolist()
+        return 0.5 * self.extrapolator.chord * self._follow.probe_rate * np.array([-y, x])
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
         """Return the input to follow at a time of the stamps' clock and a monotonic time [s]."""
@@ -345,6 +370,7 @@ class CoilBridge:
         reasons = (
             self.latch.stop_reason,
             "" if driver.ready or self.latch.latched_reason else f"driver: {driver.problem}",
+            self.scene_problem,
             NO_SCENE if self._filter is None else self.prediction_monitor.scene_mismatch(self.scene_version, arrival),
             selected.problem,
             self.extrapolator.stale_reason(*then),

@@ -11,6 +11,7 @@ from magnetosuture_thread.coils.allocation import Allocation, CoilAllocation
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.pose_extrapolator import Pose
 from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.safety.filter import SPEED
 
 Vector = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ class CertifiedAllocation:
 
     Args:
         coils: allocate the currents.
-        max_speed: of the tip by the currents [m/s].
+        max_speed: of the needle by the force of the currents, with a slack thread [m/s].
     """
 
     def __init__(self, coils: CoilAllocation, max_speed: float) -> None:
@@ -64,30 +65,26 @@ class CertifiedAllocation:
         previous: Allocation,
         max_change: float,
         disturbance: MotionDisturbance | None,
-        pull: Vector,
         max_sidestep: float = 0.0,
     ) -> tuple[Allocation, str]:
         """Return the currents, and what limits them; empty if nothing does.
 
         Args:
-            velocity: wanted of the tip, shape (2,) [m/s].
+            velocity: filtered, of the tip, shape (2,) [m/s].
             pose: of the needle now.
             safety: certifies motions.
             previous: of the last step.
             max_change: maximum change of each current [A].
             disturbance: measured, which the currents compensate; None where nothing is measured.
-            pull: predicted velocity of the tip by the thread's pull, which they compensate too, shape (2,) [m/s]; both
-                motions are certified, with it and without.
             max_sidestep: at which the needle may be taken off sideways; never where nothing is measured [m/s].
         """
-        wanted = self._within_limit(velocity - pull)
         if disturbance is None:
-            return self._allocate(wanted, pose, safety, previous, max_change, None, pull, 0.0)
+            return self._allocate(velocity, pose, safety, previous, max_change, None, 0.0)
         sidestep = min(max_sidestep, max(-max_sidestep, safety.sidestep(pose.tail, pose.heading)))
         disturbed = disturbance.velocity(self._coils.chord_direction(pose.heading))
         best, max_share = (self._coils.zero(), ""), -1.0
         for step in (sidestep, 0.0) if sidestep else (0.0,):
-            found = self._allocate(wanted, pose, safety, previous, max_change, disturbance, pull, step)
+            found = self._allocate(velocity, pose, safety, previous, max_change, disturbance, step)
             motion, drift = found[0].velocity + disturbed, found[0].drift + disturbance.drift
             share, _ = safety.safe_share(motion, pose.tail, pose.heading, drift)
             if share > max_share:
@@ -98,13 +95,12 @@ class CertifiedAllocation:
 
     def _allocate(
         self,
-        wanted: Vector,
+        velocity: Vector,
         pose: Pose,
         safety: NeedleSafetyFilter,
         previous: Allocation,
         max_change: float,
         disturbance: MotionDisturbance | None,
-        pull: Vector,
         sidestep: float,
     ) -> tuple[Allocation, str]:
         """Return currents for a velocity of the tip, and of the whole needle across its chord; see `allocate`."""
@@ -114,27 +110,28 @@ class CertifiedAllocation:
             e = self._coils.chord_direction(pose.heading)
             disturbed, aside = disturbance.velocity(e), sidestep * np.array([-e[1], e[0]])
             to_compensate = disturbance._replace(drift=disturbance.drift - sidestep)
-        velocity = wanted + aside - disturbed
+        velocity = velocity + aside - disturbed
 
         def certified(found: Allocation, added: Vector) -> tuple[float, str]:
             drift = 0.0 if disturbance is None else found.drift + disturbance.drift
             return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
 
-        def allocated(target: Vector) -> Allocation:
-            return self._coils.allocate(
+        def allocated(target: Vector) -> tuple[Allocation, str]:
+            found = self._coils.allocate(
                 target, pose.tail, pose.heading, previous.currents, max_change, to_compensate, pose.age
             )
+            speed = self._coils.slack_speed(found, pose.heading)
+            return (found.scaled(self._max_speed / speed), SPEED) if speed > self._max_speed else (found, "")
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         resting: Allocation | None = None  # against the disturbance alone
         for _ in range(1 + MAX_CORRECTIONS):
-            found = allocated(target)
+            found, bound = allocated(target)
             share, name = certified(found, disturbed)
-            if pull.any():
-                share, name = min((share, name), certified(found, disturbed + pull))
+            name = name or bound
             kept, turning = found.scaled(share), found.velocity + disturbed - aside
             if share < 1.0 and disturbance is not None:
-                resting = resting or allocated(aside - disturbed)
+                resting = resting or allocated(aside - disturbed)[0]
                 if certified(resting, disturbed)[0] < 1.0:
                     turning, drift = found.velocity - resting.velocity, found.drift - resting.drift
                     share, name = safety.safe_share(turning, pose.tail, pose.heading, drift)
@@ -149,8 +146,3 @@ class CertifiedAllocation:
             clear, _ = safety.nearest_clear(turning, pose.tail, pose.heading)
             target = target - (turning - clear)
         return best, limiting
-
-    def _within_limit(self, velocity: Vector) -> Vector:
-        """Return a velocity reduced to the maximum speed of the tip."""
-        speed = math.hypot(*velocity)
-        return velocity if speed <= self._max_speed else velocity * (self._max_speed / speed)

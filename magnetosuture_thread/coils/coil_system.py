@@ -214,12 +214,13 @@ class CoilSystem:
         if self.driver is not None and self.output is not None:
             self.driver.apply(np.zeros_like(self.output.allocation.currents), math.inf)
 
-    def step(self, now: float, arrival: float) -> BridgeOutput | None:
+    def step(self, now: float, arrival: float, scene_problem: str = "") -> BridgeOutput | None:
         """Compute the coil currents and apply them; None while unconfigured.
 
         Args:
             now: time of the stamps' clock [s].
             arrival: a monotonic time [s].
+            scene_problem: see `CoilBridge`.
         """
         if self.bridge is None or self.driver is None:
             return None
@@ -230,6 +231,7 @@ class CoilSystem:
                 self.arm(True)
             except InvalidInputError as error:
                 self.latch.trip(str(error))
+        self.bridge.scene_problem = scene_problem
         self.output = self.bridge.step(now, arrival, state)
         self.driver.apply(self.output.allocation.currents, arrival)
         return self.output

@@ -54,7 +54,8 @@ class PoseExtrapolator:
     they have certainly stopped, are then not used.
 
     A pose with an end outside the dish, or farther from the last one than the needle can move, is rejected. After
-    that all poses are, until `CONSISTENT_POSES` consecutive ones are in the dish and consistent with each other.
+    that all poses are, until one agrees with the last accepted one again, or `CONSISTENT_POSES` consecutive ones are
+    in the dish and consistent with each other. The latter is not enough while armed.
 
     Args:
         needle: its kinematics.
@@ -67,6 +68,9 @@ class PoseExtrapolator:
 
     Attributes:
         dish_radius: infinite without a scene [m].
+        rejections: consecutive poses that were rejected.
+        rejection: why the last pose was; empty if it was accepted.
+        first_stamp: of the first pose; infinite before [s].
     """
 
     def __init__(
@@ -80,7 +84,8 @@ class PoseExtrapolator:
         min_hold: float = math.inf,
         max_hold: float = math.inf,
     ) -> None:
-        self.dish_radius = math.inf
+        self.dish_radius = self.first_stamp = math.inf
+        self.rejections = 0
         self._needle, self._timeout, self._reach = needle, timeout, reach
         self._max_speed, self._uncertainty = max_speed, uncertainty
         self._min_hold, self._max_hold = min_hold, max_hold
@@ -88,15 +93,21 @@ class PoseExtrapolator:
         self._newest = -math.inf  # stamp of the last pose, accepted or not
         self._arrival = -math.inf  # of the last accepted one
         self._accepted: _Measured | None = None
-        self._rejection = ""
+        self.rejection = ""
         self._candidate: _Measured | None = None
         self._consistent = 0  # consecutive consistent poses
+        self._rejected_since = math.inf  # stamp of the first of consecutive poses that were rejected
         self._unknown_until = -math.inf  # poses stamped before this time are not used
         self._extrapolated: Pose | None = None
         self._until = -math.inf  # time of the extrapolated pose
         self._velocity = ZERO_VELOCITY
         self._applied_at = -math.inf  # monotonic time at which it was applied
         self._history: deque[tuple[float, BodyVelocity]] = deque()  # velocities, each with its start
+
+    @property
+    def chord(self) -> float:
+        """Distance from the needle's tail to its tip [m]."""
+        return self._needle.chord
 
     def update(
         self,
@@ -107,6 +118,7 @@ class PoseExtrapolator:
         now: float,
         arrival: float,
         covariance: Vector | None = None,
+        armed: bool = False,
     ) -> None:
         """Register a measured pose.
 
@@ -118,6 +130,7 @@ class PoseExtrapolator:
             now: the same clock now [s].
             arrival: a monotonic clock now [s].
             covariance: of x, y and the heading's angle, shape (3, 3) [m, m, rad]; None where it is not known.
+            armed: whether the needle may be moved.
 
         Raises:
             InvalidInputError: the pose is not finite, too old, from the future, older than the last one, not
@@ -131,11 +144,12 @@ class PoseExtrapolator:
             raise InvalidInputError(TOPIC, f"{publishers} publishers at once", "one")
         if stamp < self._newest:  # time was set back
             self._accepted = self._candidate = None
+            self._rejected_since = math.inf
             self._unknown_until = -math.inf
             self._history.clear()
-        self._newest = stamp
+        self._newest, self.first_stamp = stamp, min(self.first_stamp, stamp)
         measured = _Measured(tail, self._needle.tip(tail, heading), stamp, self._pose_uncertainty(covariance))
-        self._check_plausible(measured)
+        self._check_plausible(measured, armed)
         self._check_stall(arrival)
         if stamp < self._unknown_until:
             raise InvalidInputError(TOPIC, "a pose from a stall of the loop", "one after the coils have stopped")
@@ -155,8 +169,8 @@ class PoseExtrapolator:
         """
         if self._publishers.count(arrival) > 1:
             return f"several publishers of {TOPIC} at once"
-        if self._rejection:
-            return self._rejection
+        if self.rejection:
+            return f"needle pose rejected: {self.rejection}"
         if self._accepted is None:
             return "no needle pose yet"
         if max(arrival - self._arrival, now - self._accepted.stamp) > self._timeout:
@@ -194,42 +208,38 @@ class PoseExtrapolator:
         # By the worse of both, as `stale_reason`: the stamps' clock may be ahead, or be set back.
         return replace(self._extrapolated, age=max(0.0, now - self._accepted.stamp, arrival - self._arrival))
 
-    def _check_plausible(self, measured: _Measured) -> None:
+    def _check_plausible(self, measured: _Measured, armed: bool) -> None:
         """Reject an implausible pose; see the class."""
-        problem = self._check_bounds(measured)
-        if not self._rejection:
-            problem = problem or self._check_jump(self._accepted, measured)
-            if not problem:
-                return
-            self._rejection = f"needle pose rejected: {problem[0]}, {problem[1]}"
-            self._candidate, self._consistent = None, 0
-        if problem and problem[2]:
-            self._candidate, self._consistent = None, 0
-        elif self._candidate is None or self._check_jump(self._candidate, measured):
-            self._candidate, self._consistent = measured, 1
-        else:
-            self._candidate, self._consistent = measured, self._consistent + 1
-        if self._consistent >= CONSISTENT_POSES:
-            self._rejection, self._candidate, self._consistent = "", None, 0
-            return
-        given, expected = (problem[0], problem[1]) if problem else ("a pose after a rejected one", "")
-        expected = expected or f"{CONSISTENT_POSES} consecutive consistent poses"
-        raise InvalidInputError(f"{TOPIC}.pose", given, expected)
+        outside = self._check_bounds(measured)
+        problem = outside or self._check_jump(self._accepted, measured)
+        if problem is not None:
+            agrees = self._candidate is not None and not self._check_jump(self._candidate, measured)
+            self._consistent = 0 if outside else self._consistent + 1 if agrees else 1
+            self._candidate = None if outside else measured
+            if armed or self._consistent < CONSISTENT_POSES:
+                self.rejection = f"{problem[0]}, {problem[1]}"
+                self._rejected_since = min(self._rejected_since, measured.stamp)
+                self.rejections += 1
+                raise InvalidInputError(f"{TOPIC}.pose", *problem)
+        self.rejection, self._rejected_since, self.rejections = "", math.inf, 0
+        self._candidate, self._consistent = None, 0
 
-    def _check_bounds(self, measured: _Measured) -> tuple[str, str, bool] | None:
+    def _check_bounds(self, measured: _Measured) -> tuple[str, str] | None:
         """Return what is wrong with an end outside the dish or beyond reach, and the expectation."""
         limit = min(self._reach, self.dish_radius + self._uncertainty + measured.uncertainty)
         for name, end in (("tail", measured.tail), ("tip", measured.tip)):
             distance = math.hypot(*end)
             if distance > limit:
-                return f"its {name} is {distance:g} m from the dish's centre", f"within {limit:g} m", True
+                return f"its {name} is {distance:g} m from the dish's centre", f"within {limit:g} m"
         return None
 
-    def _check_jump(self, last: _Measured | None, measured: _Measured) -> tuple[str, str, bool] | None:
+    def _check_jump(self, last: _Measured | None, measured: _Measured) -> tuple[str, str] | None:
         """Return what is wrong with an end that moved farther than the needle can, and the expectation."""
         if last is None:
             return None
-        elapsed = measured.stamp - last.stamp
+        # From a stop on, only the thread moves the needle; without poses the coils stop after timeout and hold.
+        stopped = self._rejected_since if last is self._accepted else math.inf
+        elapsed = min(measured.stamp, stopped, last.stamp + self._timeout + self._max_hold) - last.stamp
         max_distance = self._max_speed * elapsed + self._uncertainty + measured.uncertainty + last.uncertainty
         for name, end, before in (("tail", measured.tail, last.tail), ("tip", measured.tip, last.tip)):
             distance = math.hypot(*(end - before))
@@ -237,7 +247,6 @@ class PoseExtrapolator:
                 return (
                     f"its {name} jumped by {distance:.2g} m in {elapsed:.2g} s",
                     f"at most {max_distance:.2g} m",
-                    False,
                 )
         return None
 

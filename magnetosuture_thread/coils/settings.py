@@ -11,7 +11,6 @@ from typing import ClassVar
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
-from magnetosuture_thread.coils.feedforward import ThreadFeedforward
 from magnetosuture_thread.coils.field import CoilModel, CoilProperties, coils_around, make_coils
 from magnetosuture_thread.coils.gain_estimator import CoilGainEstimator
 from magnetosuture_thread.configuration import Configuration, quantity
@@ -135,13 +134,9 @@ class CoilBridgeSettings(Configuration):
     needle_drag_across: float = quantity(
         0.033, "drag across the needle at 1 m/s", unit="N s/m", minimum=1e-5, maximum=10.0
     )
-    thread_feedforward: bool = quantity(
-        False, "whether the coils compensate the predicted pull of the thread on the needle, by thread/predicted"
-    )
     thread_drag: float = quantity(
         0.0,
-        "part of needle_drag that a straight thread behind the needle adds; thread_feedforward and motion_compensation "
-        "go by it",
+        "part of needle_drag that a straight thread behind the needle adds; a slack thread adds nothing",
         unit="N s/m",
         minimum=0.0,
         maximum=10.0,
@@ -161,8 +156,15 @@ class CoilBridgeSettings(Configuration):
         minimum=0.01,
         maximum=1000.0,
     )
-    roboclaw_ports: tuple[str, ...] = quantity((), "serial port of each board, which has two coils in a row")
-    roboclaw_addresses: tuple[int, ...] = quantity((), "address of each board, 128 if empty", minimum=128, maximum=135)
+    roboclaw_ports: tuple[str, ...] = quantity(
+        (), "serial port of each board, which has two coils in a row, by a path under /dev/serial/by-path"
+    )
+    roboclaw_addresses: tuple[int, ...] = quantity(
+        (),
+        "address of each board, 128 if empty; different ones, unless each port has a path that stays with its plug",
+        minimum=128,
+        maximum=135,
+    )
     roboclaw_baud_rate: int = quantity(115200, "of the serial lines; USB has none", minimum=2400, maximum=1000000)
     driver_timeout: float = shared_parameter("driver_timeout")
     roboclaw_answer_timeout: float = quantity(
@@ -195,6 +197,7 @@ class CoilBridgeSettings(Configuration):
             drag,
             self.needle_drag_across,
             self.needle_turning_drag,
+            self.needle_drag - self.thread_drag,
         )
 
     @cached_property
@@ -236,14 +239,6 @@ class CoilBridgeSettings(Configuration):
     def hold_time(self) -> float:
         """Maximum time for which a velocity may last without a step: driver timeout and one period [s]."""
         return self.driver_timeout + 1.0 / self.rate
-
-    def feedforward(self) -> ThreadFeedforward | None:
-        """Return what compensates the thread's pull; None if nothing shall."""
-        if not self.thread_feedforward:
-            return None
-        needle = self.needle()
-        added = self.thread_drag - (self.needle_drag - needle.drag)  # as much of the thread's as the model holds
-        return ThreadFeedforward(needle, added, self.prediction_timeout)
 
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
         """Return the safety filter for the wall and the shapes of a scene.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.obstacles import Workspace
@@ -303,11 +303,10 @@ def reference_thread(
             medium=Medium(float(given["zeta_perp_Pa_s"]), float(given["zeta_par_Pa_s"])),
             attachment=attachment,
         )
-    except NOT_ONE as error:
+    except (*NOT_ONE, ConfigurationError) as error:
         raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
-    values = (thread.length, thread.diameter, thread.bending_stiffness, thread.medium.drag_along)
-    if not (all(np.isfinite(value) and value > 0.0 for value in values) and thread.segments >= 3):
-        raise BagError(path, "has a thread whose length, diameter, stiffness, drag or segments are not positive")
+    if not thread.bending_stiffness * thread.medium.drag_along > 0.0:
+        raise BagError(path, "has a thread whose stiffness or drag are not positive")
     family = "silk_6_0" if "silk" in kind else "polyamide_7_0"
     return thread, PaperOptions.tuned(MATERIALS[family].stiffness_weight)
 

@@ -53,7 +53,7 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
     def allocate(self, settings: NeedlePlannerSettings) -> None:
         """Load the planner's kernels, and offer what it does."""
         self._session = ProcedureSession(settings, self._scene.load(settings.scene), self._planning.submit)
-        with self.health.busy("loading the planner's kernels; the first start on a machine compiles them"):
+        with self.health.load("the planner's kernels"):
             compile_planning()
         self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))
         self._setpoints = self.held(topics.TIP_SETPOINT.publisher(self))

@@ -26,8 +26,6 @@ from magnetosuture_thread.nodes.thread_outputs import ThreadOutputs
 from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.thread_observation import ThreadObservation
 
-LOADING = "loading the model's kernels; the first start on a machine compiles them"
-
 
 class ThreadModelNode(StandbyNode[ThreadModelSettings]):
     """Predicts and estimates the thread at every needle pose.
@@ -55,9 +53,8 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
 
     def allocate(self, settings: ThreadModelSettings) -> None:
         """Make the model, and load its kernels."""
-        self.get_logger().info(LOADING)
         scene = self._scene.load(settings.scene)
-        with self.health.busy(LOADING):
+        with self.health.load("the model's kernels"):
             self._session = ThreadSession(settings, scene)
             self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
         self._changes = ThreadSettings(self, self._session, self.health)

@@ -30,7 +30,6 @@ from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
-LOADING = "loading the tracker's kernels; the first start on a machine compiles them, for a minute or more"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
 
@@ -65,8 +64,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
 
     def allocate(self, settings: VisionTrackerSettings) -> None:
         """Load the kernels, and subscribe to the camera."""
-        self.get_logger().info(LOADING)
-        with self.health.busy(LOADING):
+        with self.health.load("the tracker's kernels"):
             warm_up()
         self._session = self._new_session(settings, self._scene.load(settings.scene))
         self._camera = CAMERA[settings.image_transport].name

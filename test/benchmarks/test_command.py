@@ -16,7 +16,7 @@ from magnetosuture_thread.errors import GraphError
 
 ROOT = Path(__file__).parents[2]
 FIGURES = {
-    *("seconds", "steps", "episodes", "driven", "pressed", "stalls", "violations"),
+    *("seconds", "steps", "episodes", "driven", "pressed", "stalls", "faults", "violations"),
     *("deepest", "worst", "cpu_seconds"),
 }
 

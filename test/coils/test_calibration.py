@@ -119,7 +119,8 @@ def test_the_bridge_names_parameter_and_file(tmp_path: Path):
     path = written(tmp_path, GIVEN.to_yaml().replace("0.048", "48.0"))
     with pytest.raises(ConfigurationError) as caught:
         CoilBridgeSettings(calibration=str(path))
-    expected = f"coil_bridge.calibration, {path}: coils[1].distance: got 48.0, expected a number from 0.01 to 1 m"
+    what = f"coil_bridge.calibration, {path}: coils[1].distance"
+    expected = f"{what}: got 48.0, expected a number from 0.01 to 1 m; given in metres?"
     assert str(caught.value) == expected
 
 

@@ -115,8 +115,9 @@ def test_the_thread_is_the_one_in_the_file(tmp_path: Path):
         ({"material": None}, "has no thread in its metadata"),
         ({"material": {**MATERIAL, "L_m": "long"}}, "has no thread in its metadata"),
         ({"material": {k: v for k, v in MATERIAL.items() if k != "EI_Nm2"}}, "EI_Nm2"),
-        ({"material": {**MATERIAL, "L_m": -0.019}}, "not positive"),
-        ({"material": {**MATERIAL, "EI_Nm2": float("inf")}}, "not positive"),
+        ({"material": {**MATERIAL, "L_m": -0.019}}, "thread.length: got -0.019"),
+        ({"material": {**MATERIAL, "EI_Nm2": float("inf")}}, "thread.bending_stiffness: got inf"),
+        ({"material": {**MATERIAL, "EI_Nm2": 0.0}}, "not positive"),
         ({"boundary": "knotted"}, "knotted"),
     ],
 )

@@ -8,14 +8,27 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TwistStamped, Vector3
-from magnetosuture_msgs.msg import CoilBridgeState, PredictedThread
+from geometry_msgs.msg import TwistStamped
+from magnetosuture_msgs.msg import CoilBridgeState
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from test.nodes.bridge import EAST, LONG, TAIL, applied, armed, command, drive, drive_until, driven, reasons
+from magnetosuture_thread.scene import Dish, Scene, read_scene
+from test.nodes.bridge import (
+    EAST,
+    LONG,
+    SCENE,
+    TAIL,
+    applied,
+    armed,
+    command,
+    drive,
+    drive_until,
+    driven,
+    reasons,
+)
 
 
 def test_a_command_reaches_the_driver_and_the_topics(graph):
@@ -57,41 +70,8 @@ def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
 
     graph.wait(refused, "a refusal")
     assert not driven(node)
-    # Only several poses in a row that agree are believed after one that was not.
-    drive_until(graph, lambda: driven(node), "good poses to be believed")
-
-
-def test_the_threads_pull_is_compensated_by_the_coils(graph):
-    armed(graph, **LONG, thread_feedforward=True)
-    diagnostics, states = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.BRIDGE_STATE)
-
-    def applied_speeds() -> list[float]:
-        return [state.applied.x for state in states]
-
-    drive_until(graph, lambda: pytest.approx(0.005, rel=0.05) in applied_speeds(), "the velocity that is commanded")
-    assert max(applied_speeds()) < 0.0055
-
-    def pull(force: float, frame: str = "dish") -> None:
-        header = MESSAGES.header(graph.now())
-        header.frame_id = frame
-        graph.publish(
-            topics.PREDICTED_THREAD, PredictedThread(header=header, tension=[0.0], needle_force=Vector3(x=force))
-        )
-
-    force = -0.004 * CoilBridgeSettings().needle_drag  # 4 mm/s of 5, reduced to half of the command
-
-    def compensated() -> bool:
-        pull(force)
-        drive(graph)
-        return pytest.approx(0.0075, rel=0.05) in applied_speeds()
-
-    graph.wait(compensated, "the velocity of the command and of the pull")
-    for value, frame, words in (
-        (math.inf, "dish", "at most 1 N"),
-        (force, "camera", "thread/predicted.header.frame_id"),
-    ):
-        pull(value, frame)
-        graph.wait(lambda words=words: any(words in str(d.status[0].values) for d in diagnostics), "a refusal")
+    # Several in a row are a fault of the armed bridge.
+    graph.wait(lambda: refused() and "needle does not follow" in node.system.latch.fault, "the fault")
 
 
 def test_between_commands_the_currents_follow_the_needle(graph):
@@ -243,6 +223,24 @@ def test_currents_stay_within_their_limit_and_saturation_is_said(graph):
     assert max(np.abs(a).max() for a in applied(node)) <= 0.5
     saturated = next(m for m in states if m.saturated)
     assert 0.0 < saturated.applied.x < saturated.filtered.x
+
+
+@pytest.mark.parametrize("damaged", [True, False], ids=["damaged", "no room"])
+def test_a_scene_that_is_refused_stops_the_needle_until_a_good_one_comes(graph, damaged: bool):
+    """The setup's scene goes on to be in force, but nobody knows whether it still is what stands in the dish."""
+    node, states = armed(graph, **LONG), graph.listen(topics.BRIDGE_STATE)
+    drive_until(graph, lambda: driven(node), "the needle to be driven")
+    refused = MESSAGES.scene_message(graph.now(), Scene() if damaged else Scene(Dish(0.006)))
+    refused.wall_friction = 0.1 if damaged else 0.0
+    graph.publish(topics.SCENE, refused)
+    words = "scene.version: got" if damaged else "room for the needle"
+    graph.wait(lambda: "scene refused: " in reasons(states) and words in reasons(states), "the reason")
+    stopped = len(applied(node))
+    drive(graph)
+    graph.wait(lambda: len(applied(node)) > stopped + 10, "steps")
+    assert not any(currents.any() for currents in applied(node)[stopped:])
+    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene(SCENE)))
+    drive_until(graph, lambda: applied(node)[-1].any(), "the needle to be driven again")
 
 
 def test_two_publishers_at_once_stop_the_needle(graph):

@@ -160,7 +160,7 @@ def test_a_finalized_bridge_is_reported_as_such(graph):
     assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert stage(graph) == "finalized"
     graph.wait(lambda: reasons(states) == "finalized", "the state")
-    graph.wait(lambda: diagnostics[-1].status[0].message == "finalized", "the diagnostics")
+    graph.wait(lambda: bool(diagnostics) and diagnostics[-1].status[0].message == "finalized", "the diagnostics")
 
 
 def test_all_can_be_set_before_a_bridge_is_first_configured(graph):
@@ -238,7 +238,8 @@ def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, tmp_path: Pa
     states = heard[topics.BRIDGE_STATE.name]
     boards = {"power_stage": "roboclaw", "power_stage_ports": ports, "scene": READY["scene"], "frame_rate": 5.0}
     rig = graph.add(RigSimulatorNode, **boards).rig
-    with process(graph, driver="roboclaw", roboclaw_ports=f"[{', '.join(ports)}]") as bridge:
+    given = {"roboclaw_ports": f"[{', '.join(ports)}]", "roboclaw_addresses": "[128, 129]"}
+    with process(graph, driver="roboclaw", **given) as bridge:
         armed_and_driving(graph, heard, lambda: bool(np.abs(rig.currents).max() > 0.1))
         bridge.send_signal(signal.SIGSTOP)
         graph.wait(lambda: bool(np.abs(rig.currents).max() < 1e-3), "the boards to stop")
@@ -261,7 +262,7 @@ def test_a_scene_that_waited_while_the_bridge_was_frozen_hides_no_fault(graph, m
         now, arrival = node._times()
         monkeypatch.setattr(node, "_times", lambda: (now + 0.5, arrival + 0.5))
         node.on_scene(read_scene("hernia_ring"))
-        assert "stood still for 0.5" in node.system.latch.fault
+        assert node.system.latch.fault.startswith("the bridge stood still for 0.")  # 0.5 s and what the machine takes
         assert not node.system.output.allocation.currents.any()
 
 

@@ -242,7 +242,7 @@ def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
     needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     ports = (str(tmp_path / "a"), str(tmp_path / "b"))
     node = graph.add(RigSimulatorNode, power_stage="roboclaw", power_stage_ports=list(ports), **SMALL)
-    driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports))
+    driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports, roboclaw_addresses=(128, 129)))
     driver.open()
     try:
         graph.wait(lambda: driver.state().ready and len(needles) > 3, "the boards")

@@ -85,7 +85,7 @@ def test_a_procedure_without_a_setup_or_with_a_scene_that_is_none_is_refused(tmp
 def test_a_procedure_that_its_setup_cannot_carry_out_is_refused(tmp_path: Path):
     fast = {"goals": [{"withdraw": {}}, {"withdraw": {}, "limits": {"speed": 0.05}}], "setup": "dish_50mm"}
     with pytest.raises(
-        ConfigurationError, match=r"goals\[1\]\.limits\.speed.*coil_bridge\.max_speed of dish_50mm, 0\.01"
+        ConfigurationError, match=r"goals\[1\]\.limits\.speed.*coil_bridge\.max_speed of dish_50mm, 0\.025"
     ):
         read_procedure_setup(parse_procedure(fast, "fast"))
     wide = {"goals": [{"withdraw": {}}], "setup": "dish_50mm", "scene": "dish_150mm"}

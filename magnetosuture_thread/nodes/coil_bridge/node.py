@@ -12,19 +12,20 @@ from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
 from rclpy.timer import Timer
 
-from magnetosuture_thread import Scene
+from magnetosuture_thread import InvalidInputError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.pull import INPUT_ERRORS, PullSubscription
 from magnetosuture_thread.nodes.coil_bridge.report import BridgeServices, CoilReport
 from magnetosuture_thread.nodes.coil_bridge.stop_file import stop_record
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
 from magnetosuture_thread.nodes.run import raise_priority, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
+
+INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
@@ -36,7 +37,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
-        self.system = CoilSystem()
+        with self.health.load("the bridge's kernels"):  # before any driver is open
+            self.system = CoilSystem()
         self.system.recall(stop_record(self))
         self._stamps: dict[str, Any] = {}  # of the last valid command of each input
         self._reactivate = False  # whether a reset activates the node again
@@ -44,7 +46,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
         self._report = CoilReport(self, self.system, self._steady)
-        self._pull = PullSubscription(self, self.refuse)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
         self._scene = SceneFollower(self, self.health, None, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
@@ -64,7 +65,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
         self.system.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
-        self._pull.follow(bridge)
 
     def activate(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -79,7 +79,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
         self._watchdog, self._reactivate = None, False
-        self._pull.follow(None)
         self._stamps.clear()
         ends = self.is_shutting_down or self.has_ended
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
@@ -184,7 +183,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def _step(self) -> None:
         """Compute, apply and publish the currents."""
-        output = self.system.step(*self._times())
+        output = self.system.step(*self._times(), self._scene.problem)
         if output is not None and output.publish:
             self._report.publish_output(None if output.reasons else self._stamps.get(output.source), output)
         self._report.publish_state(force=False)

@@ -104,8 +104,6 @@ class Surface:
         if not 0.0 <= self.friction <= MAX_FRICTION:
             raise ConfigurationError("surface.friction", self.friction, f"a coefficient from 0 to {MAX_FRICTION:g}")
         discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
-        if not (np.isfinite(discs).all() and (discs[:, 2] > 0.0).all()):
-            raise ConfigurationError("surface.discs", discs.tolist(), "finite centres and positive radii [m]")
         rings = [_directed(ring) for ring in self.polygons]
         corners = np.concatenate([np.zeros((0, 2)), *rings])
         starts = np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64)

@@ -210,7 +210,6 @@ def test_what_a_point_touches():
     "wrong",
     [
         Surface(wall_radius=0.0),
-        Surface((Disc((0.0, 0.0), -1.0),)),
         Surface(polygons=(np.zeros((4, 2)),)),
         Surface(polygons=(np.array([[0.0, 0.0], [1.0, 0.0], [math.nan, 1.0]]),)),
         Surface(stiffness=math.inf),

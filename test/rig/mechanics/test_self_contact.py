@@ -62,7 +62,7 @@ def test_the_model_predicts_the_rigs_loop():
     shapes = pull_out(rig_of(nodes, Surface(self_contact=True)), nodes)
     thread = Thread("soft", LENGTH, SEGMENTS, DIAMETER, 2e-12, Medium(1.0, 0.5), Attachment.PINNED)
     predictor = ThreadPredictor(thread, Scene(Dish(self_contact=True)))
-    predictor.start(NeedlePose(0.0, nodes[0], EAST), nodes)
+    predictor.start(NeedlePose(0.0, nodes[0], EAST), nodes, strict=False)
     errors = []
     for k, shape in enumerate(shapes, 1):
         out = 2.4e-3 * math.sin(math.pi * k / 160) ** 2

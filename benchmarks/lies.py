@@ -1,0 +1,206 @@
+"""Lie to the coil bridge about the needle's pose, from a random moment on, and measure how the true needle moves.
+
+The closed loop of campaigns runs a setup's path follower on a rig that differs from what the bridge believes, see
+`campaign/variation.py`. The poses of the tracker are then replaced by others. How fast and how far the needle goes, and
+how close it comes to wall and shapes, is told by the rig and by shapely. Simulated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.keep_out import World
+from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
+from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.setups import read_setup
+
+Vector = NDArray[np.float64]
+SETUPS = ("hernia_ring", "dish_50mm", "petri_35mm_polyamide", "petri_35mm_polyamide_post", "petri_150mm_silk")
+BEGIN, AFTER = (2.0, 8.0), 2.0  # s; when a lie begins, and for how long it is watched
+AVERAGING = 10  # periods of the bridge over which a speed is taken
+CLEAR = 2e-3  # m; from wall and shapes, for a lie that must not break the keep-out
+HALF_TURN, QUARTER_TURN = -np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
+
+
+def _mapped(measured: Measurement, turn: Vector, shift: Vector) -> Measurement:
+    """Return a measurement turned about the dish's centre and shifted, shapes (2, 2) and (2,) [m]."""
+    seen = measured.observation
+    if seen is not None:
+        seen = replace(seen, pieces=tuple(replace(p, points=p.points @ turn.T + shift) for p in seen.pieces))
+    return replace(measured, tail=turn @ measured.tail + shift, heading=turn @ measured.heading, observation=seen)
+
+
+class Liar:
+    """Replaces measurements from a time on.
+
+    Args:
+        kind: of the lie, one of `LIES`.
+        begin: time of the first lie [s].
+        random: of its noise.
+    """
+
+    def __init__(self, kind: str, begin: float, random: np.random.Generator) -> None:
+        self._make, self._begin, self.random = LIES[kind], begin, random
+        self.past: deque[Measurement] = deque(maxlen=10)
+        self.walked, self.count = np.zeros(2), 0
+
+    def tell(self, measured: Measurement) -> Measurement:
+        """Return a measurement as the bridge gets it."""
+        if measured.stamp - START < self._begin or not self.past:
+            self.past.append(measured)
+            return measured
+        told = self._make(self, measured)
+        self.count += 1
+        return replace(told, due=measured.due, stamp=measured.stamp)
+
+    @property
+    def last(self) -> Measurement:
+        """The last honest measurement."""
+        return self.past[-1]
+
+    def walk(self) -> Vector:
+        """Return where a random walk is now, shape (2,) [m]."""
+        self.walked = self.walked + 2e-4 * self.random.standard_normal(2)
+        return self.walked
+
+
+def _circle(liar: Liar, measured: Measurement) -> Measurement:
+    angle = 3.0 * (measured.stamp - liar.last.stamp)
+    return _mapped(liar.last, np.eye(2), 1e-3 * np.array([math.cos(angle) - 1.0, math.sin(angle)]))
+
+
+def _drift(liar: Liar, measured: Measurement) -> Measurement:
+    return _mapped(measured, np.eye(2), np.array([5e-3 * (measured.stamp - liar.last.stamp), 0.0]))
+
+
+def _moved(liar: Liar, measured: Measurement, turn: Vector) -> Measurement:
+    """Return a needle whose motion since the lie began is turned."""
+    moved = measured.tail - liar.last.tail
+    return _mapped(measured, np.eye(2), turn @ moved - moved)
+
+
+LIES: dict[str, Callable[[Liar, Measurement], Measurement]] = {
+    "frozen": lambda liar, _: liar.last,
+    "frozen, 10 um of noise": lambda liar, _: _mapped(liar.last, np.eye(2), 1e-5 * liar.random.standard_normal(2)),
+    "the last ten frames": lambda liar, _: liar.past[liar.count % len(liar.past)],
+    "heading turned by 180 degrees": lambda _, m: replace(m, heading=-m.heading),
+    "image turned by 180 degrees": lambda _, m: _mapped(m, HALF_TURN, np.zeros(2)),
+    "image turned by 90 degrees": lambda _, m: _mapped(m, QUARTER_TURN, np.zeros(2)),
+    "image mirrored": lambda _, m: _mapped(m, np.diag([-1.0, 1.0]), np.zeros(2)),
+    "moves oppositely": lambda liar, m: _moved(liar, m, HALF_TURN),
+    "moves sideways": lambda liar, m: _moved(liar, m, QUARTER_TURN),
+    "5 mm beside": lambda _, m: _mapped(m, np.eye(2), np.array([5e-3, 0.0])),
+    "walks at random": lambda liar, _: _mapped(liar.last, np.eye(2), liar.walk()),
+    "goes in a circle": _circle,
+    "drifts at 5 mm/s": _drift,
+    "none": lambda _, m: m,
+}
+
+
+class LyingLoop(ClosedLoop):
+    """A closed loop whose measurements pass a liar."""
+
+    liar: Liar
+
+    def _measure(self, frame: RigFrame) -> Measurement | None:
+        measured = super()._measure(frame)
+        return None if measured is None else self.liar.tell(measured)
+
+
+def run_lie(case: tuple[str, str, int]) -> dict[str, Any]:
+    """Run one lie, from a setup's name, the lie's and a seed; return what the true needle did."""
+    name, kind, seed = case
+    setup, random = read_setup(name), np.random.default_rng([seed, 2])
+    varied, begin, follower = vary(setup, seed), float(random.uniform(*BEGIN)), setup.follower.follower()
+    rig = Rig(varied.setup.rig, setup.scene)
+    loop = LyingLoop(
+        setup,
+        rig,
+        lambda stamp, tail, heading, condition: follower.compute_command(stamp, tail, heading).velocity,
+        seed,
+        losses=varied.losses,
+        coil_gains=varied.coil_gains,
+    )
+    loop.liar = Liar(kind, begin, random)
+    world, kinematics, latch = World(setup.scene), setup.coils.needle().kinematics, loop.bridge.latch
+    middles, clearances, stopped, travel = list[Vector](), list[float](), math.nan, math.nan
+    while rig.time < begin + AFTER and not (rig.time < begin and latch.fault):
+        loop.step()
+        if rig.time < begin - AVERAGING / setup.coils.rate:
+            continue
+        at = rig.look(rig.time, rendered=False)
+        heading = np.array([math.cos(at.heading), math.sin(at.heading)])
+        ends = np.array([at.tail, kinematics.tip(at.tail, heading)])
+        middles.append(ends.mean(axis=0))
+        clearances.append(world.clearance([ends]))
+        if latch.fault and math.isnan(stopped):
+            stopped, travel = rig.time - begin, float(np.linalg.norm(middles[-1] - middles[AVERAGING]))
+    case_of = {"setup": name, "lie": kind, "seed": seed}
+    if not middles:
+        return {**case_of, "stopped_before": latch.fault}
+    path = np.array(middles)
+    speeds = np.linalg.norm(path[AVERAGING:] - path[:-AVERAGING], axis=1) * setup.coils.rate / AVERAGING
+    return {
+        **case_of,
+        "stopped_before": "",
+        "fault": latch.fault,
+        "stopped_s": None if math.isnan(stopped) else stopped,
+        "travel_m": None if math.isnan(travel) else travel,
+        "peak_speed_ratio": float(speeds.max()) / setup.coils.max_speed,
+        "broken": bool(clearances[0] > CLEAR and min(clearances) < setup.coils.keep_out),
+    }
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--seeds", type=int, default=20, help="runs of each lie on each setup")
+    parser.add_argument("--setup", action="append", choices=SETUPS, help="one setup; all if none is named")
+    parser.add_argument("--lie", action="append", choices=LIES, help="one lie; all if none is named")
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+
+
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Run all lies; return the figures, and whether every one but an honest tracker's ended in a fault."""
+    cases = list(product(options.setup or SETUPS, options.lie or LIES, range(options.seeds)))
+    with ProcessPoolExecutor(options.workers) as pool:
+        runs = list(pool.map(run_lie, cases))
+    for name in options.setup or SETUPS:
+        table = Table(title=f"{name}: lies about the needle's pose, simulated")
+        for column in ("lie", "latched", "after [s]", "travel [mm]", "speed", "broken"):
+            table.add_column(column, justify="left" if column == "lie" else "right", no_wrap=True)
+        for kind in options.lie or LIES:
+            found = [r for r in runs if (r["setup"], r["lie"]) == (name, kind) and not r["stopped_before"]]
+            latched = [r for r in found if r["stopped_s"] is not None]
+            table.add_row(
+                kind,
+                f"{len(latched)}/{len(found)}",
+                *(
+                    f"{np.median(values):.2f} ({max(values):.2f})" if values else "-"
+                    for values in ([r["stopped_s"] for r in latched], [1e3 * r["travel_m"] for r in latched])
+                ),
+                f"{max((r['peak_speed_ratio'] for r in found), default=0.0):.2f}",
+                f"{sum(r['broken'] for r in found)}",
+            )
+        console.print(table)
+    before = sum(bool(r["stopped_before"]) for r in runs)
+    console.print(
+        "s, mm: until the fault is latched, time and true travel, median (maximum); broken: keep_out, by lies that"
+    )
+    console.print(
+        f"began {1e3 * CLEAR:g} mm from a shape. {before} of {len(runs)} runs stopped before their lie began."
+    )
+    told = [r for r in runs if not r["stopped_before"]]
+    return {"runs": runs}, all((r["stopped_s"] is None) == (r["lie"] == "none") for r in told)

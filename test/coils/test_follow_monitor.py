@@ -1,0 +1,74 @@
+"""A needle that does not follow is a fault; one that is pulled, held or slack is none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magnetosuture_thread.coils.follow_monitor import FollowMonitor, MotionStep
+
+INTERVAL, SPEED = 0.05, 2e-3  # s and m/s
+EAST = np.array([SPEED * INTERVAL, 0.0])
+
+
+def watch(monitor: FollowMonitor, moved: NDArray[np.float64], *, follows_turns: bool = False, count: int = 40) -> str:
+    """Drive a needle along x, whose poses move by a vector in each interval; return the fault."""
+    for k in range(count):
+        turn = monitor.probe_rate * INTERVAL
+        monitor.register_turn(turn)
+        step = MotionStep(1.0 + k * INTERVAL, INTERVAL, EAST, turn, moved, turn if follows_turns else 0.0)
+        if fault := monitor.update(step):
+            return fault
+    return ""
+
+
+@pytest.mark.parametrize("share", [0.15, 0.5, 1.0, 2.0, 3.8])
+def test_a_needle_that_a_taut_thread_slows_or_a_slack_one_lets_go_follows(share: float):
+    assert watch(FollowMonitor(5e-4, slack_ratio=3.9), share * EAST) == ""
+
+
+def test_poses_that_stand_still_and_do_not_turn_are_not_the_needles():
+    fault = watch(FollowMonitor(5e-4), np.zeros(2))
+    assert fault == "needle does not follow: 0.5 mm expected, 0 mm measured in 0.25 s"
+
+
+def test_a_needle_that_a_thread_holds_turns_with_the_field_and_is_no_fault():
+    monitor = FollowMonitor(5e-4)
+    assert watch(monitor, np.zeros(2), follows_turns=True) == ""
+    assert monitor.is_trusted(3.0)
+
+
+@pytest.mark.parametrize("moved", [-EAST, np.array([0.0, SPEED * INTERVAL]), 15.0 * EAST])
+def test_poses_that_move_elsewhere_are_not_the_needles(moved: NDArray[np.float64]):
+    assert watch(FollowMonitor(5e-4, slack_ratio=3.9), moved, follows_turns=True).endswith("elsewhere")
+
+
+def test_a_heading_that_turns_farther_than_the_field_is_not_the_needles():
+    monitor = FollowMonitor(5e-4)
+    faults = [monitor.update(MotionStep(1.0 + 0.05 * k, 0.05, EAST, -0.1, EAST, 0.4)) for k in range(4)]
+    assert "it turned 1.2 rad away from the field" in faults[-1]
+
+
+def test_a_motion_that_cannot_be_seen_is_not_judged():
+    monitor = FollowMonitor(5e-4)
+    step = MotionStep(0.0, 0.05, 0.05 * EAST, 0.0, np.zeros(2), 0.0)
+    assert not any(monitor.update(step._replace(stamp=0.05 * k)) for k in range(200))
+
+
+def test_a_needle_that_turns_about_itself_moves_in_no_wrong_direction():
+    """The direction of the expected motion depends on when it turned."""
+    monitor = FollowMonitor(5e-4)
+    for k in range(20):
+        expected, measured = (8e-4 * np.array([math.cos(a), math.sin(a)]) for a in (0.5 * k, 0.5 * k - 1.2))
+        assert monitor.update(MotionStep(0.05 * k, 0.05, expected, 0.5, measured, 0.5)) == ""
+
+
+def test_a_command_that_ends_ends_the_probe_without_a_fault():
+    monitor, still = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, np.zeros(2), 0.0, np.zeros(2), 0.0)
+    while not monitor.probe_rate:
+        watch(monitor, np.zeros(2), count=1)
+    monitor.end_probe()
+    assert not any(monitor.update(still._replace(stamp=1.0 + INTERVAL * k)) for k in range(1, 40))
