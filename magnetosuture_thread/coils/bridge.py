@@ -207,10 +207,10 @@ class CoilBridge:
                 self.latch.trip(f"needle does not follow: {self.extrapolator.rejection}")
             raise
         motion = self._observer.update(tail, heading, stamp, self._follow.is_trusted(stamp))
-        if self._filter is None or self._filter.clearance(tail, heading) < self._filter.keep_out:
-            self._follow.clear()  # what the needle lies at may hold it
-        elif motion is not None and self.latch.armed and (problem := self._follow.update(motion)):
-            self.latch.trip(problem)
+        if motion is not None and self.latch.armed and self._filter is not None:
+            at_shape = self._filter.clearance(tail, heading) < self._filter.keep_out
+            if problem := self._follow.update(motion, at_shape):
+                self.latch.trip(problem)
         if self._settings.motion_compensation:
             self._gains.update(tail, heading, stamp)
             self._coils.set_gains(self._gains.gains)

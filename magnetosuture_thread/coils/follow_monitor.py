@@ -14,6 +14,7 @@ Vector = NDArray[np.float64]
 MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
 MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
 MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
+SHAPE_FACTOR = 4.0  # on that, for a needle at wall or shape: 2 mm with the default pose_uncertainty
 MIN_SHARE = 0.1  # of the expected motion, in its direction, that a needle which follows makes at least
 STILL_SHARE = 0.7  # of the expected motion; a needle that is held, and pulled by its thread, moves less
 MAX_TURN = 1.0  # rad; the field's torque keeps a needle nearer to its direction, against any thread
@@ -78,7 +79,7 @@ class FollowMonitor:
         self._suspicion = ""
 
     def clear(self) -> None:
-        """Forget all motion, as of a needle that is armed anew or that lies at a shape."""
+        """Forget all motion, as of a needle that is armed anew."""
         self._steps.clear()
         self._probed = None
 
@@ -100,8 +101,14 @@ class FollowMonitor:
         """Return whether a probe has lately shown that the poses are the needle's."""
         return stamp <= self._trusted_until
 
-    def update(self, step: MotionStep) -> str:
-        """Take the motion between two poses; return why the needle does not follow, or an empty text."""
+    def update(self, step: MotionStep, at_shape: bool = False) -> str:
+        """Take the motion between two poses; return why the needle does not follow, or an empty text.
+
+        Args:
+            step: the motion.
+            at_shape: whether the needle lies at wall or shape, which may hold it for a while.
+        """
+        min_distance = self._min_distance * (SHAPE_FACTOR if at_shape else 1.0)
         self._steps.append(step)
         while step.stamp - self._steps[0].stamp > MAX_WINDOW:
             self._steps.popleft()
@@ -115,7 +122,7 @@ class FollowMonitor:
                 field_turn, turn = field_turn + entry.expected_turn, turn + entry.measured_turn
                 error = self._error(expected, measured)
             span, distance = span + entry.interval, math.hypot(*expected)
-            if span >= MIN_WINDOW and distance >= self._min_distance:
+            if span >= MIN_WINDOW and distance >= min_distance:
                 break
         excess = max(turn - max(field_turn, 0.0), min(field_turn, 0.0) - turn)
         if excess > MAX_TURN:
@@ -125,9 +132,9 @@ class FollowMonitor:
             f"needle does not follow: {1e3 * distance:.2g} mm expected, {1e3 * moved:.2g} mm measured in {span:.2g} s"
         )
         is_straight = abs(field_turn) < 0.5 * MAX_TURN  # else the direction of E depends on when the needle turned
-        if is_straight and error > max(MAX_ERROR * self._min_distance, MAX_ERROR_SHARE * distance):
+        if is_straight and error > max(MAX_ERROR * min_distance, MAX_ERROR_SHARE * distance):
             return f"{text}, elsewhere"
-        enough = span >= MIN_WINDOW and distance >= self._min_distance and bool(step.expected.any())
+        enough = span >= MIN_WINDOW and distance >= min_distance and bool(step.expected.any())
         if not enough or measured @ expected >= MIN_SHARE * distance**2:
             return ""
         if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance:

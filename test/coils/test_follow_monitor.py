@@ -72,3 +72,10 @@ def test_a_command_that_ends_ends_the_probe_without_a_fault():
         watch(monitor, np.zeros(2), count=1)
     monitor.end_probe()
     assert not any(monitor.update(still._replace(stamp=1.0 + INTERVAL * k)) for k in range(1, 40))
+
+
+def test_what_a_needle_lies_at_may_hold_it_for_a_while_and_not_for_good():
+    monitor, step = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, EAST, 0.0, np.zeros(2), 0.0)
+    faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=True) for k in range(40)]
+    assert not any(faults[:15])
+    assert "needle does not follow: 2 mm expected" in faults[-1]

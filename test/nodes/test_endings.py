@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -262,7 +263,9 @@ def test_a_scene_that_waited_while_the_bridge_was_frozen_hides_no_fault(graph, m
         now, arrival = node._times()
         monkeypatch.setattr(node, "_times", lambda: (now + 0.5, arrival + 0.5))
         node.on_scene(read_scene("hernia_ring"))
-        assert node.system.latch.fault.startswith("the bridge stood still for 0.")  # 0.5 s and what the machine takes
+        found = re.search(r"the bridge stood still for ([0-9.]+) s", node.system.latch.fault)
+        assert found
+        assert float(found[1]) >= 0.5  # and what the machine takes
         assert not node.system.output.allocation.currents.any()
 
 
