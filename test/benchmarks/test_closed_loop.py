@@ -21,12 +21,12 @@ def test_figures_of_pulls_that_are_off_in_turns():
 
 
 def test_a_short_loop():
-    tracked, frames, periods = measure_closed_loop((("petri_35mm_polyamide_post", 25),), duration=4.0)
+    tracked, frames, periods = measure_closed_loop((("petri_35mm_polyamide_post", 25),), duration=6.0)
     assert [row["poses"] for row in (tracked, frames, periods)] == ["tracked, 60 Hz", "exact, 60 Hz", "exact, 200 Hz"]
     assert 1e-5 < frames["peak_n"] < 2e-4
     assert periods["rms_percent"] < 5.0  # of a peak that this loop has not reached yet
     assert frames["rms_percent"] < 0.5 * tracked["rms_percent"]
-    assert tracked["averaged_rms_percent"] < 0.6 * tracked["rms_percent"]
+    assert tracked["averaged_rms_percent"] < 0.5 * tracked["rms_percent"]
     assert 0.0 < tracked["estimate"]["mean_percent"] < 0.1
     assert tracked["estimate"]["mean_percent"] <= tracked["estimate"]["max_percent"] < 0.5
     assert 0.0 < tracked["prediction"]["mean_percent"] < 0.3
