@@ -266,7 +266,7 @@ def test_in_a_namespace_nodes_of_other_rigs_are_not_shown(graph):
 def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
     node = graph.add(CoilBridgeNode)
     graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
-    assert console.nodes()["coil_bridge"]["level"] == "ok"
+    graph.wait(lambda: console.nodes()["coil_bridge"]["level"] == "ok", "a bridge in order")
     assert console.nodes()["coil_bridge"]["values"]["driver"] == "recording"
     assert console.is_active("coil_bridge")
     monkeypatch.setattr(console_graph, "NODE_TIMEOUT", 0.3)
