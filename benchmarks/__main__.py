@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import contact, keep_out, lies
+from benchmarks import contact, golden, keep_out, lies
 from benchmarks.attack import command as attack
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
@@ -27,6 +27,7 @@ from magnetosuture_thread.cli.terminal import make_console, write_json
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
 BENCHMARKS: dict[str, Any] = {
     **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "contact": contact, "lies": lies},
+    "golden": golden,
     **{"attack": attack, "vision": vision, "estimator": estimator, "forecast": forecast, "network": network},
 }
 

@@ -1,0 +1,204 @@
+"""Record what the package computes and offers, to compare two versions of it.
+
+    python -m benchmarks golden record DIR --reference FOLDER [--seeds N] [--only PART ...]
+    python -m benchmarks golden compare OLD NEW
+
+Parts: `bags` (poses, predictions, estimates and margins of the example bags, replayed offline), `reference` (scores on
+reference trajectories), `procedures` (outcomes of each procedure's first seeds, and all outputs of seed 0), `forecast`,
+`pages` (the generated reference: topics, services, parameters, commands, Python names). It uses the command line and
+the public Python names only, so that one version of it serves both versions of the package. Simulated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rosbags.highlevel import AnyReader
+
+from magnetosuture_thread import (
+    Disc,
+    ForecastStart,
+    NeedlePose,
+    NeedleSafetyFilter,
+    Scene,
+    ThreadForecaster,
+    ThreadPredictor,
+)
+
+PROCEDURES = ("dead_end", "figure_eight", "hernia", "slalom", "wrap_and_tighten")
+TOLERANCE = 1e-7  # m, rad or of the value itself
+TIMES = ("step_time", "solve_time", "wall", "speed", "seconds", "latency", "duration")  # of the machine
+
+
+def _run(*arguments: object) -> None:
+    """Run a command of the package."""
+    subprocess.run([sys.executable, "-m", "magnetosuture_thread.cli", *map(str, arguments)], check=True)
+
+
+def _numbers(value: Any, name: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the numbers of a message by field."""
+    if isinstance(value, (bool, int, float, np.ndarray)) and np.asarray(value).dtype.kind in "bifu":
+        yield name, np.atleast_1d(np.asarray(value, np.float64))
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _numbers(item, name)
+    elif hasattr(value, "__dataclass_fields__"):
+        for field in value.__dataclass_fields__:
+            if not field.startswith("__") and not any(word in field for word in TIMES):
+                yield from _numbers(getattr(value, field), f"{name}.{field}")
+
+
+def _save_bag(folder: Path, target: Path) -> None:
+    """Save the numbers of a bag's messages by topic and field."""
+    values = defaultdict(list)
+    with AnyReader([folder]) as reader:
+        for connection, stamp, data in reader.messages():
+            if connection.msgtype.endswith(("Image", "CompressedImage")):
+                continue
+            values[f"{connection.topic} stamp"].append(np.array([stamp], np.float64))
+            for name, numbers in _numbers(reader.deserialize(data, connection.msgtype), connection.topic):
+                values[name].append(numbers)
+    np.savez_compressed(target, **{name.replace("/", "|"): np.concatenate(v) for name, v in values.items()})
+
+
+def _record_bags(into: Path, _: argparse.Namespace) -> None:
+    for bag in sorted(p.parent for p in Path("examples").rglob("metadata.yaml")):
+        _run("replay", bag, "--offline", "--output", into / bag.name)
+        _save_bag(into / bag.name / "bag", into / f"{bag.name}.npz")
+    _run("evaluate", "examples", "--output", into / "evaluation")
+
+
+def _record_reference(into: Path, given: argparse.Namespace) -> None:
+    for formulation in ("rod", "paper"):
+        _run("evaluate", given.reference, "--formulation", formulation, "--json", into / f"{formulation}.json")
+
+
+def _record_procedures(into: Path, given: argparse.Namespace) -> None:
+    for name in PROCEDURES:
+        _run("campaign", name, "--seeds", given.seeds, "--bags", 0, "--workers", 2, "--output", into / name)
+        _save_bag(into / name / "bags/seed_0", into / f"{name}.npz")
+
+
+def _record_forecast(into: Path, _: argparse.Namespace) -> None:
+    """Save a thread that is drawn around a post, its margins, and forecasts under a command that is held."""
+    scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)})
+    predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=40, scene=scene)
+    safety = NeedleSafetyFilter(scene, needle_length=0.004, needle_curvature=60.0, max_speed=0.008, hold_time=0.15)
+    forecaster = ThreadForecaster(predictor.thread, scene, safety, workers=1)
+    predictor.start(NeedlePose(0.0, np.array([-0.001, 0.0054]), np.array([1.0, 0.0])))
+    vertices, margins, forecasts = [], [], []
+    for step in range(1, 150):
+        angle = 0.5 * np.pi - 0.03 * step
+        tail = 0.0056 * np.array([np.cos(angle), np.sin(angle)])
+        pose = NeedlePose(step / 30.0, tail, np.array([np.sin(angle), -np.cos(angle)]))
+        prediction = predictor.step(pose)
+        vertices.append(prediction.vertices)
+        margins.append(prediction.margins["obstacle"].minimum)
+        if step % 30 == 0:
+            for command in ((0.005, 0.0), (0.0, -0.006)):
+                start = ForecastStart(pose, prediction.vertices)
+                forecasts.append(forecaster.forecast(start, np.array(command), 2.0).vertices)
+    np.savez_compressed(into / "post.npz", vertices=vertices, margins=margins, forecasts=np.array(forecasts))
+
+
+def _record_pages(into: Path, _: argparse.Namespace) -> None:
+    subprocess.run([sys.executable, "-m", "sphinx", "-q", "-b", "text", "docs", str(into)], check=True)
+
+
+PARTS = {
+    "bags": _record_bags,
+    "reference": _record_reference,
+    "procedures": _record_procedures,
+    "forecast": _record_forecast,
+    "pages": _record_pages,
+}
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the plain values of a JSON document by path."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}.{key}")
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _leaves(item, f"{name}[{index}]")
+    else:
+        yield name, value
+
+
+def _differences(old: Path, new: Path) -> Iterator[str]:
+    """Yield how two files differ."""
+    if old.suffix == ".npz":
+        with np.load(old) as before, np.load(new) as after:
+            for name in sorted(set(before.files) ^ set(after.files)):
+                yield f"{name}: {'gone' if name in before.files else 'new'}"
+            for name in sorted(set(before.files) & set(after.files)):
+                a, b = before[name], after[name]
+                if a.shape != b.shape:
+                    yield f"{name}: {len(a)} values, {len(b)} now"
+                elif not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
+                    yield f"{name}: differs by {np.nanmax(np.abs(a - b)):.3g}"
+    elif old.suffix == ".json":
+        before, after = (dict(_leaves(json.loads(path.read_text()))) for path in (old, new))
+        for name in sorted(set(before) ^ set(after)):
+            yield f"{name}: {'gone' if name in before else 'new'}"
+        for name in sorted(set(before) & set(after)):
+            a, b = before[name], after[name]
+            same = a == b
+            if isinstance(a, float) and isinstance(b, (int, float)):
+                same = bool(np.isclose(a, b, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True))
+            if not same and not any(word in name for word in TIMES):
+                yield f"{name}: {a!r}, {b!r} now"
+    else:
+        lines = (path.read_text().splitlines() for path in (old, new))
+        yield from list(difflib.unified_diff(*lines, lineterm="", n=0))[2:]
+
+
+def _compare(old: Path, new: Path) -> int:
+    """Print how two recordings differ, and return whether they do."""
+    count = 0
+    for path in sorted(p for p in old.rglob("*") if p.suffix in (".npz", ".json", ".txt")):
+        other = new / path.relative_to(old)
+        found = list(_differences(path, other)) if other.exists() else ["gone"]
+        for line in found:
+            print(f"{path.relative_to(old)}: {line}")
+        count += len(found)
+    print(f"{count} differences")
+    return count
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the benchmark's options."""
+    actions = parser.add_subparsers(dest="action", required=True)
+    record = actions.add_parser("record")
+    record.add_argument("folder", type=Path)
+    record.add_argument("--reference", type=Path, help="a folder of reference trajectories")
+    record.add_argument("--seeds", type=int, default=5)
+    record.add_argument("--only", nargs="+", choices=sorted(PARTS), default=sorted(PARTS))
+    compare = actions.add_parser("compare")
+    compare.add_argument("old", type=Path)
+    compare.add_argument("new", type=Path)
+
+
+def run(given: argparse.Namespace, _: Console) -> tuple[dict[str, Any], bool]:
+    """Record or compare."""
+    if given.action == "compare":
+        count = _compare(given.old, given.new)
+        return {"differences": count}, count == 0
+    for part in given.only:
+        if part == "reference" and given.reference is None:
+            continue
+        into = given.folder / part
+        into.mkdir(parents=True)
+        PARTS[part](into, given)
+    return {}, True
