@@ -65,7 +65,6 @@ ALLOWED = {
         "scene",
         "thread_observation",
     },
-    "catalog": {"barrier", "errors", "evaluation"},
     "calibration": {"workers", "barrier", "errors", "geometry", "scene", "model", "evaluation", "texts"},
     "nodes": {
         *BASE,
@@ -88,7 +87,6 @@ ALLOWED = {
             "workers",
             "interface",
             "campaign",
-            "catalog",
             "planning",
             "geometry",
             "scene",
@@ -129,7 +127,7 @@ ALLOWED = {
             "jobs",
             "reproduce",
         ),
-        *("evaluation", "calibration", "catalog"),
+        *("evaluation", "calibration"),
     },
 }
 
@@ -147,7 +145,7 @@ OWNERS = {
     "osqp": {"model"},
     "dask": {"workers"},
     "distributed": {"workers"},
-    "duckdb": {"catalog"},
+    "pyarrow": {"jobs"},
     "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},

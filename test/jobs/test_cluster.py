@@ -127,7 +127,7 @@ def test_bags_are_evaluated_alike(scheduler: str, short_bag: Path, tmp_path: Pat
     assert [{**row, **dict.fromkeys(TIMES)} for row in here] == [{**row, **dict.fromkeys(TIMES)} for row in there]
     assert [bool(row["problem"]) for row in there] == [False, True]
     names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("out", "outtcp")]
-    assert names == 2 * [["pull.html", "table.csv", "table.json"]]
+    assert names[0] == names[1]
 
 
 def test_a_calibration_is_the_same_file(scheduler: str, tmp_path: Path):
