@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 from typing import Any
 
 import pytest
@@ -42,36 +41,6 @@ def test_jog_sends_commands_until_its_end():
         assert len(here.graph.commands) == count
 
     run(test, max_speed=0.02)
-
-
-def test_first_command_is_sent_at_once():
-    """At 10 Hz of commands ten keys in a row would take a second; each is passed on as it comes."""
-
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        angles = [0.1 * number for number in range(10)]
-        for angle in angles:
-            await page.jog(math.cos(angle), math.sin(angle))
-        await until(lambda: len(here.graph.commands) >= 10)
-        turned = [math.atan2(y, x) for x, y in here.graph.velocities[:10]]
-        assert turned == pytest.approx(angles)
-
-    run(test, rate=10.0, hold_timeout=1.0)
-
-
-def test_silent_page_stops_the_needle():
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        await page.jog(1, 0)
-        await until(lambda: here.graph.last == REST)
-        first, last = here.graph.commands[0][0], here.graph.commands[-1][0]
-        assert last - first >= here.settings.hold_timeout - 0.02
-        assert page.lease["holder"] == page.number
-        assert here.graph.velocities.count(REST) == 1
-
-    run(test)
 
 
 def test_lost_connection_stops_the_needle_before_the_timeout():
@@ -228,24 +197,6 @@ def test_disarming_elsewhere_requires_a_release():
     run(test, hold_timeout=1.0)
 
 
-def test_hiding_the_page_during_a_jog_requires_a_release():
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        await page.jog(1, 0)
-        await page.send(type="visibility", visible=False)
-        await page.send(type="visibility", visible=True)
-        await page.jog(1, 0)
-        await page.send(type="record", recording=True)
-        await until(lambda: here.host.requests)
-        assert here.graph.velocities == [EAST, REST]
-        await page.send(type="end_jog")
-        await page.jog(1, 0)
-        await until(lambda: here.graph.last == EAST)
-
-    run(test, hold_timeout=1.0)
-
-
 def test_a_procedure_is_held_by_the_page_with_control_alone_and_not_by_late_messages():
     async def test(here: Console) -> None:
         page, other = await here.page(), await here.page()
@@ -339,26 +290,3 @@ def test_a_page_has_four_requests_pending_at_most_and_stops_all_the_same():
         await requests.close()
 
     asyncio.run(test())
-
-
-def test_any_message_of_the_page_with_control_keeps_it():
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        here.server._jog._lease._last_message = -math.inf  # as after a long silence
-        await page.send(type="visibility", visible=True)
-        await until(lambda: not here.server._jog.available)
-
-    run(test)
-
-
-def test_a_late_jog_message_ends_the_motion_at_once_and_one_alone_disconnects_nobody():
-    async def test(here: Console) -> None:
-        page = await here.jogging_page()
-        await page.jog(1, 0, sent=0.0)
-        await until(lambda: page.of("error"))
-        assert here.graph.last == REST
-        await page.jog(0, 1)
-        await until(lambda: here.graph.last == NORTH)
-
-    run(test, hold_timeout=1.0)

@@ -26,12 +26,12 @@ from rclpy.context import Context
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.inbox import Inbox
+from magnetosuture_thread.nodes.console.graph import Inbox
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "post_wrap"
 OTHER = "petri_35mm_polyamide_post"
-WAIT = 60.0  # s
+WAIT = 120.0  # s
 
 
 class Console:
@@ -57,7 +57,7 @@ class Console:
     def end(self) -> int:
         """Press Ctrl-C, and return its exit code."""
         self.process.send_signal(signal.SIGINT)
-        code = self.process.wait(30.0)
+        code = self.process.wait(60.0)
         self._reading.join(10.0)
         return code
 
@@ -360,7 +360,7 @@ def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixt
 def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
     for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
         monkeypatch.delitem(sys.modules, name)
-    jobs = {f"magnetosuture_thread.jobs.{name}" for name in ("console", "console_hosts", "replay", "simulate")}
+    jobs = {f"magnetosuture_thread.jobs.{name}" for name in ("console", "graph", "replay", "simulate")}
     for name in [name for name in sys.modules if name in jobs or name.split(".")[0] == "rclpy"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rclpy", None)
