@@ -13,7 +13,7 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.outbox import MAX_UNACKNOWLEDGED, Outbox
+from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 

@@ -17,6 +17,8 @@ from magnetosuture_thread.geometry.needle_arc import needle_axis
 from test.console.conftest import ServedConsole
 from test.console.scene import picture, state, thread
 
+pytestmark = pytest.mark.slow
+
 WAIT_TIMEOUT = 15.0  # [s]
 REST = (0.0, 0.0)
 LAPTOP: ViewportSize = {"width": 1366, "height": 768}

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from playwright.sync_api import expect
 
 from test.console.scene import estimated_state, state
 from test.console.test_page import Operator, between, operator
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["operator"]  # the fixture
 

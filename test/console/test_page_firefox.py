@@ -15,6 +15,8 @@ import pytest
 
 from test.console.conftest import ServedConsole
 
+pytestmark = pytest.mark.slow
+
 WAIT_TIMEOUT = 60.0  # [s]
 UP, SPACE = "\ue013", " "
 REST, NORTH = (0.0, 0.0), pytest.approx((0.0, 0.003), abs=1e-9)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from playwright.sync_api import expect
 
 from test.console.scene import forecast_state, state
 from test.console.test_page import Operator, operator
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["operator"]  # the fixture
 

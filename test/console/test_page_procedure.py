@@ -8,6 +8,8 @@ from playwright.sync_api import expect
 from test.console.scene import procedure_state
 from test.console.test_page import Operator, operator
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["operator"]  # the fixture
 
 

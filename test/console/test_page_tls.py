@@ -13,6 +13,8 @@ from playwright.sync_api import Browser, Page, expect
 
 from test.console.conftest import ServedConsole
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def over_tls(certificate: tuple[Path, Path]) -> Iterator[ServedConsole]:

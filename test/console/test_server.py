@@ -252,7 +252,7 @@ def test_rubbish_of_a_page_without_the_token_costs_the_page_with_control_nothing
         await until(lambda: here.graph.last == NORTH)
         assert holder.lease["holder"] == holder.number
 
-    monkeypatch.setattr("magnetosuture_thread.console.client_messages.parse_client_message", parse)
+    monkeypatch.setattr("magnetosuture_thread.console.client.parse_client_message", parse)
     monkeypatch.setattr("magnetosuture_thread.console.server.MAX_NEW_WATCHERS", 5)
     run(test, hold_timeout=1.0)
 

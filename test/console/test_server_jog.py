@@ -9,14 +9,7 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.console.client import RequestHandler
-from magnetosuture_thread.console.client_messages import (
-    BridgeAction,
-    ClientMessage,
-    Pause,
-    ProcedureRequest,
-    RecordBag,
-    SelectSetup,
-)
+from magnetosuture_thread.console.client_messages import ClientMessage
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.errors import InvalidInputError
 from test.console.scene import RecordingGraph, RecordingHost
@@ -215,6 +208,21 @@ def test_a_procedure_is_held_by_the_page_with_control_alone_and_not_by_late_mess
     run(test)
 
 
+ARM, STOP = (ClientMessage("bridge_action", {"action": action}) for action in ("arm", "stop"))
+PAUSE, RECORD = ClientMessage("pause", {"paused": True}), ClientMessage("record", {"recording": True})
+SELECT = ClientMessage("select_setup", {"setup": "hernia_ring"})
+
+
+def bridge_action(action: str) -> ClientMessage:
+    """Return a request to the coil bridge."""
+    return ClientMessage("bridge_action", {"action": action})
+
+
+def procedure(action: str) -> ClientMessage:
+    """Return a request to the needle planner."""
+    return ClientMessage("procedure", {"action": action, "procedure": "", "hold_to_run": False})
+
+
 def requests_and_jog() -> tuple[RequestHandler, JogController, RecordingGraph]:
     """Return a handler of requests, and the jog controller and the graph that it acts on."""
     graph = RecordingGraph()
@@ -230,15 +238,15 @@ def start(requests: RequestHandler, client: int, message: ClientMessage) -> None
 @pytest.mark.parametrize(
     "message",
     [
-        *(BridgeAction(action) for action in ("stop", "disarm", "arm", "reset")),
-        *(ProcedureRequest(action, "", False) for action in ("pause", "abort", "plan", "resume")),
-        *(SelectSetup("hernia_ring"), Pause(True), RecordBag(True)),
+        *(bridge_action(action) for action in ("stop", "disarm", "arm", "reset")),
+        *(procedure(action) for action in ("pause", "abort", "plan", "resume")),
+        *(SELECT, PAUSE, RECORD),
     ],
 )
 def test_a_page_without_control_ends_what_moves_and_requests_nothing_else(message: ClientMessage):
     async def test() -> None:
         requests, _, _ = requests_and_jog()
-        ends = getattr(message, "action", "") in ("stop", "disarm", "pause", "abort")
+        ends = message.values.get("action") in ("stop", "disarm", "pause", "abort")
         with contextlib.nullcontext() if ends else pytest.raises(InvalidInputError, match="take control first"):
             start(requests, 7, message)
         await requests.close()
@@ -249,10 +257,10 @@ def test_a_page_without_control_ends_what_moves_and_requests_nothing_else(messag
 @pytest.mark.parametrize(
     ("message", "ends"),
     [
-        (RecordBag(True), False),
-        (BridgeAction("arm"), False),
-        *((BridgeAction(action), True) for action in ("stop", "disarm", "reset")),
-        *((other, True) for other in (Pause(True), SelectSetup("hernia_ring"), ProcedureRequest("plan", "", False))),
+        (RECORD, False),
+        (ARM, False),
+        *((bridge_action(action), True) for action in ("stop", "disarm", "reset")),
+        *((other, True) for other in (PAUSE, SELECT, procedure("plan"))),
     ],
 )
 def test_a_jog_goes_on_while_a_recording_begins_and_ends_with_all_that_changes_what_runs(
@@ -275,18 +283,18 @@ def test_a_page_has_four_requests_pending_at_most_and_stops_all_the_same():
         requests, jog, graph = requests_and_jog()
         jog.acquire_control(1)
         for _ in range(4):
-            start(requests, 1, Pause(True))
+            start(requests, 1, PAUSE)
         with pytest.raises(InvalidInputError, match="4 pending requests"):
-            start(requests, 1, Pause(True))
-        start(requests, 1, BridgeAction("stop"))
+            start(requests, 1, PAUSE)
+        start(requests, 1, STOP)
         jog.release_control(1)
         jog.acquire_control(2)
-        start(requests, 2, Pause(True))  # those of another page count apart
+        start(requests, 2, PAUSE)  # those of another page count apart
         await until(lambda: not requests._pending)
         assert graph.actions == ["stop"]
         jog.release_control(2)
         jog.acquire_control(1)
-        start(requests, 1, Pause(True))
+        start(requests, 1, PAUSE)
         await requests.close()
 
     asyncio.run(test())

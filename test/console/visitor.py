@@ -16,7 +16,7 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from test.console.scene import RecordingGraph, RecordingHost
 
 TOKEN = "a-token-of-the-tests"
-WAIT_TIMEOUT = 10.0  # [s]
+WAIT_TIMEOUT = 30.0  # [s]
 REST = (0.0, 0.0)
 EAST, NORTH = (0.003, 0.0), (0.0, 0.003)  # what a page asks for that holds a direction [m/s]
 

@@ -19,7 +19,7 @@ from test.jobs.test_console import running, wire
 
 __all__ = ["browser"]
 
-pytestmark = pytest.mark.whole_graph
+pytestmark = [pytest.mark.whole_graph, pytest.mark.slow]
 
 DRIFT = 1.8e-4  # m/s; at rest the needle may still be pulled by its thread: 0.1 mm in eleven frames at 20 Hz
 
