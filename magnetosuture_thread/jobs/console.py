@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import queue
 import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +26,7 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay import GraphInput
 from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, SETUP_NOTE, Log, open_bag
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.graph import RECORDED_TOPICS, ConsoleGraph, record_topics
+from magnetosuture_thread.nodes.console.graph import RECORDED_TOPICS, ConsoleGraph, Inbox
 from magnetosuture_thread.nodes.console.node import RIG, GraphHost, joined
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.program import STOPS
@@ -35,6 +34,7 @@ from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import Setup, read_setup
 
 POLL_PERIOD = 0.2  # s between two checks of the nodes
+QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
 REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
 # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
 # go before the browser and the rig, and behind the bridge.
@@ -149,15 +149,10 @@ class BagRecording:
         self, output: Path, notes: Mapping[str, str], graph: ConsoleGraph, recorded: Sequence[topics.Topic]
     ) -> None:
         self.output = output
-        self._notes, self._graph, self._topics = notes, graph, recorded
-        self._waiting: queue.SimpleQueue[tuple[str, int, bytes] | None] = queue.SimpleQueue()
-        self._tapping: asyncio.Task[None] | None = None
+        self._notes = notes
+        self._inboxes = [Inbox(graph.node, topic, QUEUE_DEPTH) for topic in recorded]
+        self._ending = threading.Event()
         self._writing: asyncio.Task[None] | None = None
-
-    @property
-    def running(self) -> bool:
-        """Whether it has begun and is not asked to end."""
-        return self._tapping is not None
 
     @property
     def ended(self) -> bool:
@@ -176,8 +171,7 @@ class BagRecording:
         self._writing = asyncio.create_task(writing)
         await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
         if self._writing.done():
-            self._writing.result()
-        self._tapping = asyncio.create_task(record_topics(self._graph.node, self._topics, self._put))
+            await self.end()
 
     async def end(self) -> None:
         """End, once all messages are written.
@@ -185,29 +179,29 @@ class BagRecording:
         Raises:
             BagError: the disk is full or fails; what was recorded before is there.
         """
-        tapping, self._tapping = self._tapping, None
-        assert tapping is not None
-        assert self._writing is not None
-        tapping.cancel()
-        with suppress(asyncio.CancelledError):
-            await tapping
-        self._waiting.put(None)
-        await self._writing
-
-    def _put(self, topic: str, arrival: int, data: bytes) -> None:
-        if not self.ended:
-            self._waiting.put((topic, arrival, data))
+        self._ending.set()
+        try:
+            if self._writing is not None:
+                await self._writing
+        finally:
+            for inbox in self._inboxes:
+                inbox.close()
+            self._inboxes = []
 
     def _write(self, begun: Callable[[], object]) -> None:
         with (
             whole_folder(self.output, is_recording=True) as folder,
             BagWriter(folder, self._notes, name=self.output.name) as bag,
         ):
-            for topic in self._topics:
-                bag.add_topic(topic.channel.recorded, topic.channel.type_name)
+            for inbox in self._inboxes:
+                bag.add_topic(inbox.topic.channel.recorded, inbox.topic.channel.type_name)
             begun()
-            while (message := self._waiting.get()) is not None:
-                bag.write(*message)
+            ending = False
+            while not ending:
+                ending = self._ending.wait(RECORDING_PERIOD)
+                for inbox in self._inboxes:
+                    for data, arrived in inbox.take():
+                        bag.write(inbox.topic.channel.recorded, arrived, data)
 
 
 def new_name(folder: Path, name: str) -> Path:
@@ -295,15 +289,14 @@ class RecordingHost(GraphHost):
     async def _end_recording(self) -> str:
         """End the recording, if there is one; return the problem if it is not complete."""
         recording = self._recording
-        if recording is None or not recording.running:
+        if recording is None:
             return ""
+        self._recording = None
         try:
             await recording.end()
         except MagnetosutureError as error:
             self.log(f"the recording has ended: {error}")
             return str(error)
-        finally:
-            self._recording = None
         self.log(f"recorded: {recording.output}")
         return ""
 

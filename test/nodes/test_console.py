@@ -21,14 +21,15 @@ from magnetosuture_msgs.msg import CoilCurrents
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.console import Place, SimulatedHost
+from magnetosuture_thread.jobs.console import BagRecording, Place, SimulatedHost
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
-from magnetosuture_thread.nodes.console.graph import ConsoleGraph, Latest, record_topics
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph, Latest
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
@@ -277,26 +278,29 @@ def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: 
         assert host.busy == ""
 
 
-def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):
+def test_a_recording_gets_what_was_published_before_and_from_then_on(graph, console, tmp_path: Path):
     graph.listen_later(topics.SCENE)
     graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post")))
-    taken: list[tuple[str, int, bytes]] = []
+    heard = graph.listen_later(topics.CURRENTS)
 
     async def record() -> None:
-        told = topics.SCENE, topics.CURRENTS
-        recording = asyncio.create_task(record_topics(node, told, lambda *message: taken.append(message)))
-        deadline = time.monotonic() + 30.0
-        while {topic for topic, _, _ in taken} != {"/scene", "/coils/currents"}:
-            assert time.monotonic() < deadline
+        recording = BagRecording(tmp_path / "bag", {"setup": "mine"}, console, [topics.SCENE, topics.CURRENTS])
+        await recording.begin()
+        for _ in range(3):
             await asyncio.to_thread(graph.publish, topics.CURRENTS, CoilCurrents(current=[1.0, 2.0]))
+        deadline = time.monotonic() + 30.0
+        while len(heard) < 3:
+            assert time.monotonic() < deadline
             await asyncio.sleep(0.02)
-        recording.cancel()
+        assert not recording.ended
+        await recording.end()
 
     asyncio.run(record())
-    said = {topic: (arrival, data) for topic, arrival, data in taken}
-    arrival, data = said["/coils/currents"]
-    assert abs(arrival * 1e-9 - time.time()) < 60.0
-    assert list(topics.CURRENTS.decode(data).current) == [1.0, 2.0]
+    bag = Bag(tmp_path / "bag")
+    assert bag.counts["/scene"] == 1
+    (*_, last) = bag.records({"/coils/currents"})
+    assert abs(last.time * 1e-9 - time.time()) < 60.0
+    assert last.decode().current.tolist() == [1.0, 2.0]
 
 
 def program(domain: int, *parameters: str) -> subprocess.Popen[str]:

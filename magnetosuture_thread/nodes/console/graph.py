@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -50,7 +50,6 @@ TIMEOUT = 10.0  # s for a service to be found and to answer
 PLAN_TIMEOUT = 60.0  # s; a long way takes some seconds, and is planned once
 RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
 POLL_PERIOD = 0.005  # s between two checks for an answer
-QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
 
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
@@ -206,31 +205,6 @@ class Latest:
 
 def _never(data: bytes) -> None:
     """Unused callback: there is no executor."""
-
-
-async def record_topics(node: Node, taken: Iterable[topics.Topic], receive: Callable[[str, int, bytes], None]) -> None:
-    """Pass on every message of some topics until cancelled; latched ones come first.
-
-    Args:
-        node: that subscribes.
-        taken: topics to subscribe.
-        receive: called with topic, time of arrival [ns] and CDR bytes of every message.
-    """
-    inboxes = [Inbox(node, topic, QUEUE_DEPTH) for topic in taken]
-
-    def poll() -> None:
-        for inbox in inboxes:
-            for data, arrived in inbox.take():
-                receive(inbox.topic.channel.recorded, arrived, data)
-
-    try:
-        while True:
-            poll()
-            await asyncio.sleep(RECORDING_PERIOD)
-    finally:
-        poll()
-        for inbox in inboxes:
-            inbox.close()
 
 
 class ConsoleServices:
