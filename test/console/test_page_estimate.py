@@ -37,13 +37,6 @@ def test_estimate_prediction_and_measurement_have_their_own_colours(operator: Op
     expect(operator.page.locator("#margins")).not_to_contain_text("99 % bound")
 
 
-def test_an_estimate_that_is_not_measured_any_more_says_so(operator: Operator) -> None:
-    operator.served.graph.shown = estimated_state(hidden=True)
-    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "prediction")
-    expect(operator.page.locator("#margins")).to_contain_text("Prediction only for 3.2 s")
-    expect(operator.page.locator("#margins")).not_to_contain_text("Measured")
-
-
 def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operator) -> None:
     graph = operator.served.graph
     operator.page.emulate_media(color_scheme="light")

@@ -33,18 +33,6 @@ def test_the_forecast_thread_is_drawn_as_a_ghost_beside_the_thread(operator: Ope
     expect(operator.page.locator("#forecast")).to_be_hidden()  # nothing happens
 
 
-def test_what_happens_ahead_is_said_and_disappears_with_the_forecast(operator: Operator) -> None:
-    graph, text = operator.served.graph, operator.page.locator("#forecast")
-    graph.shown = forecast_state("touches the ring in 0.8 s", "friction in 1.4 s")
-    expect(text).to_have_text("Touches the ring in 0.8 s, friction in 1.4 s")
-    expect(text).to_be_visible()
-    graph.shown = forecast_state("friction in 0.3 s")
-    expect(text).to_have_text("Friction in 0.3 s")
-    graph.shown["forecast"]["age"] = 3.0  # the model has stopped
-    expect(text).to_be_hidden()
-    expect(operator.page.locator("#dish")).to_have_attribute("data-ghosts", "0")
-
-
 def test_a_shape_with_a_hostile_name_is_shown_as_text(operator: Operator) -> None:
     operator.served.graph.shown = forecast_state("touches the <b>ring</b> in 0.8 s")
     expect(operator.page.locator("#forecast")).to_have_text("Touches the <b>ring</b> in 0.8 s")

@@ -69,14 +69,6 @@ def test_a_procedure_is_neither_begun_disarmed_nor_resumed_where_it_goes_on_by_i
     )
 
 
-def test_a_page_without_control_may_pause_and_give_up(operator: Operator):
-    graph = operator.served.graph
-    graph.shown = procedure_state("running")
-    enabled(operator, "pause", "abort")
-    operator.page.click("#pause-procedure")
-    operator.until(lambda: graph.procedures == [("pause", "hernia", False)])
-
-
 @pytest.mark.parametrize("end", ["release", "blur", "stop"])
 def test_the_page_is_held_while_the_button_is_and_no_longer(operator: Operator, end: str):
     graph, page = operator.served.graph, operator.page

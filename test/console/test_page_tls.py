@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import ssl
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,15 +43,3 @@ def test_a_person_takes_control_and_stops_over_tls(browser: Browser, over_tls: S
         assert time.monotonic() < deadline
         time.sleep(0.01)
     page.context.close()
-
-
-@pytest.mark.parametrize("last_header", ["Connection: close", "Connection: keep-alive"])
-def test_stopping_closes_a_connection_that_the_browser_does_not_close(over_tls: ServedConsole, last_header: str):
-    port = int(over_tls.url.split(":")[2].split("/")[0])
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    with socket.create_connection(("127.0.0.1", port)) as plain, context.wrap_socket(plain) as encrypted:
-        encrypted.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{last_header}\r\n\r\n".encode())
-        assert encrypted.recv(15) == b"HTTP/1.1 200 OK"
-        over_tls.run(over_tls.server.stop())
-        over_tls.run(over_tls.all_closed())

@@ -14,8 +14,7 @@ from magnetosuture_thread.console.client_messages import ClientMessage, parse_cl
 from magnetosuture_thread.console.server import HEADERS, ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
-from test.console.scene import picture
-from test.console.visitor import EAST, NORTH, REST, TOKEN, WAIT_TIMEOUT, Console, Page, run, until
+from test.console.visitor import NORTH, REST, TOKEN, WAIT_TIMEOUT, Console, Page, run, until
 
 
 def test_the_page_is_served_whole_and_lets_nothing_else_in():
@@ -97,20 +96,6 @@ def test_without_the_token_one_watches_and_nothing_else(token: str):
     run(test)
 
 
-def test_a_refusal_is_told():
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        here.graph.refusal = "arm: got emergency stop, expected a reset before"
-        await page.send(type="bridge_action", action="arm")
-        await page.send(type="select_setup", setup="nowhere")
-        await until(lambda: len(page.of("result")) == 3)
-        refusals = {entry["request"]: entry["refusal"] for entry in page.of("result")}
-        assert refusals == {"acquire_control": "", "arm": here.graph.refusal, "select_setup": "no setup nowhere"}
-
-    run(test)
-
-
 def test_requests_of_the_page_with_control_reach_the_host_and_the_graph():
     async def test(here: Console) -> None:
         page = await here.page()
@@ -148,18 +133,6 @@ def test_hostile_message_is_rejected_and_interrupts_the_jog(hostile: str | bytes
     run(test, hold_timeout=1.0)
 
 
-def test_a_huge_message_ends_the_connection_and_the_movement():
-    async def test(here: Console) -> None:
-        page = await here.jogging_page()
-        with contextlib.suppress(ConnectionError):
-            await page.socket.send_str("x" * 10_000_000)
-        await until(lambda: here.graph.last == REST)
-        await until(lambda: page.socket.closed)
-        assert page.socket.close_code == 1009
-
-    run(test, hold_timeout=1.0)
-
-
 def test_an_emergency_stop_comes_through_a_flood_which_ends_the_connection():
     async def test(here: Console) -> None:
         page = await here.page()
@@ -174,24 +147,6 @@ def test_an_emergency_stop_comes_through_a_flood_which_ends_the_connection():
                     break
                 await page.send(type="end_jog")
         await until(lambda: page.socket.closed and not here.server._clients)
-
-    run(test)
-
-
-def test_a_page_that_stops_reading_does_not_delay_the_others():
-    async def test(here: Console) -> None:
-        stuck = await here.page()
-        stuck.socket._conn.transport.pause_reading()
-        quick = await here.page()
-        await quick.acquire_control()
-        for number in range(1, 200):
-            here.graph.picture = (number, picture() * 20)
-            await asyncio.sleep(0)
-        await quick.jog(1, 0)
-        await until(lambda: here.graph.last == EAST)
-        states = len(quick.of("state"))
-        await until(lambda: len(quick.of("state")) > states + 10)
-        stuck.tear()
 
     run(test)
 
@@ -257,21 +212,6 @@ def test_rubbish_of_a_page_without_the_token_costs_the_page_with_control_nothing
     run(test, hold_timeout=1.0)
 
 
-def test_who_asks_for_too_many_files_waits_for_the_next_second(monkeypatch: pytest.MonkeyPatch):
-    async def test(here: Console) -> None:
-        began = asyncio.get_running_loop().time()
-        for _ in range(20):
-            async with here.session.get(here.url) as answer:
-                assert answer.status == 200
-        assert asyncio.get_running_loop().time() - began > 2.0  # five in each second at the most
-        operator = await here.session.ws_connect(here.url + f"socket?token={TOKEN}")
-        assert not operator.closed
-        await operator.close()
-
-    monkeypatch.setattr("magnetosuture_thread.console.server.MAX_REQUESTS", 5)
-    run(test)
-
-
 MALFORMED = [
     "\x00\x01\x02\r\n\r\n",
     "GET / HTTP/9\r\n\r\n",
@@ -316,18 +256,6 @@ def test_the_host_gets_whether_an_operator_or_a_script_jogs(is_browser: bool, au
     run(test)
 
 
-def test_a_first_message_other_than_hello_closes_the_connection_with_the_reason(caplog: pytest.LogCaptureFixture):
-    async def test(here: Console) -> None:
-        socket = await here.connect()
-        await socket.send_str('{"type": "acquire_control"}')
-        ended = await socket.receive(timeout=WAIT_TIMEOUT)
-        assert (ended.data, ended.extra) == (aiohttp.WSCloseCode.POLICY_VIOLATION, "expected hello first")
-        await until(lambda: not here.server._clients)
-
-    run(test)
-    assert not caplog.records
-
-
 def test_a_ping_is_answered_and_a_flood_of_them_ends_the_connection(monkeypatch: pytest.MonkeyPatch):
     async def test(here: Console) -> None:
         socket = await here.connect(autoping=False)
@@ -347,19 +275,6 @@ def test_a_ping_is_answered_and_a_flood_of_them_ends_the_connection(monkeypatch:
         assert len(await answers_until(aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR)) < 300
 
     monkeypatch.setattr("magnetosuture_thread.console.client.MAX_MESSAGE_RATE", 20)
-    run(test)
-
-
-def test_a_frame_is_sent_once_and_nothing_is_compressed():
-    async def test(here: Console) -> None:
-        page = await here.page(compress=15)
-        assert page.socket.compress == 0
-        here.graph.picture = 1, picture()
-        await page.pictures(1)
-        states = len(page.of("state"))
-        await until(lambda: len(page.of("state")) > states + 5)
-        assert len(page.frames) == 1
-
     run(test)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
 
 import pytest
 
@@ -149,28 +148,6 @@ def test_emergency_stop_of_any_page_requires_a_release():
     run(test, hold_timeout=1.0)
 
 
-@pytest.mark.parametrize("between", [{"type": "nonsense"}, {"type": "jog", "direction": [1, 0], "speed": 1, "sent": 1}])
-def test_invalid_message_does_not_clear_a_stop(between: dict[str, Any]):
-    """A word that is refused or late is no key that was let go."""
-
-    async def test(here: Console) -> None:
-        page = await here.jogging_page()
-        await page.send(type="bridge_action", action="stop")
-        await until(lambda: here.graph.actions == ["stop"])
-        count = len(here.graph.commands)
-        await page.send(**between)
-        await page.jog(1, 0)
-        await until(lambda: page.of("error"))
-        await page.send(type="bridge_action", action="reset")
-        await until(lambda: here.graph.actions == ["stop", "reset"])
-        assert len(here.graph.commands) == count
-        await page.send(type="end_jog")
-        await page.jog(1, 0)
-        await until(lambda: here.graph.last == EAST)
-
-    run(test, hold_timeout=1.0)
-
-
 def test_disarming_elsewhere_requires_a_release():
     async def test(here: Console) -> None:
         page = await here.jogging_page()
@@ -249,52 +226,6 @@ def test_a_page_without_control_ends_what_moves_and_requests_nothing_else(messag
         ends = message.values.get("action") in ("stop", "disarm", "pause", "abort")
         with contextlib.nullcontext() if ends else pytest.raises(InvalidInputError, match="take control first"):
             start(requests, 7, message)
-        await requests.close()
-
-    asyncio.run(test())
-
-
-@pytest.mark.parametrize(
-    ("message", "ends"),
-    [
-        (RECORD, False),
-        (ARM, False),
-        *((bridge_action(action), True) for action in ("stop", "disarm", "reset")),
-        *((other, True) for other in (PAUSE, SELECT, procedure("plan"))),
-    ],
-)
-def test_a_jog_goes_on_while_a_recording_begins_and_ends_with_all_that_changes_what_runs(
-    message: ClientMessage, ends: bool
-):
-    async def test() -> None:
-        requests, jog, graph = requests_and_jog()
-        jog.acquire_control(1)
-        jog.jog(1, EAST)
-        start(requests, 1, message)
-        assert graph.velocities == ([EAST, REST] if ends else [EAST])
-        assert jog.must_release is ends
-        await requests.close()
-
-    asyncio.run(test())
-
-
-def test_a_page_has_four_requests_pending_at_most_and_stops_all_the_same():
-    async def test() -> None:
-        requests, jog, graph = requests_and_jog()
-        jog.acquire_control(1)
-        for _ in range(4):
-            start(requests, 1, PAUSE)
-        with pytest.raises(InvalidInputError, match="4 pending requests"):
-            start(requests, 1, PAUSE)
-        start(requests, 1, STOP)
-        jog.release_control(1)
-        jog.acquire_control(2)
-        start(requests, 2, PAUSE)  # those of another page count apart
-        await until(lambda: not requests._pending)
-        assert graph.actions == ["stop"]
-        jog.release_control(2)
-        jog.acquire_control(1)
-        start(requests, 1, PAUSE)
         await requests.close()
 
     asyncio.run(test())

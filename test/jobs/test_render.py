@@ -47,13 +47,6 @@ def test_a_setup_that_differs_by_rounding_alone_is_taken(tmp_path: Path, straigh
     assert render_bag(other, read_setup("petri_35mm_polyamide_post"), tmp_path / "bag", duration=0.1) == 3
 
 
-def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: ReferenceTrajectory):
-    setup = read_setup("petri_35mm_polyamide")
-    assert render_bag(straight_pull, setup, tmp_path / "three", start=0.9, duration=0.1) == 3
-    with pytest.raises(BagError, match="hold no frame"):
-        render_bag(straight_pull, setup, tmp_path / "none", duration=1e-3)
-
-
 @pytest.mark.parametrize(
     ("metadata", "discs", "words"),
     [

@@ -18,7 +18,6 @@ from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.cli.commands.calibrate import calibrate_camera
-from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.jobs.track import track
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.look import State
@@ -125,11 +124,6 @@ def test_paths_without_frames_are_refused_in_one_line(
     assert words in error_of(capsys)
 
 
-def test_a_bag_among_pictures_is_refused(short_bag: Path):
-    with pytest.raises(BagError, match="expected it alone"):
-        track([SAMPLES / "frame_00.png", short_bag], VisionTrackerSettings(), Scene())
-
-
 def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = tmp_path / "camera.yaml"
     assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
@@ -166,18 +160,6 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
     assert "camera_info.width" in error_of(capsys)
 
 
-def test_frames_that_show_no_dish_or_no_markers_calibrate_nothing(tmp_path: Path):
-    cv2.imwrite(str(tmp_path / "plain.png"), np.full((480, 640, 3), 90, np.uint8))
-    with pytest.raises(InvalidInputError, match="with a dish"):
-        calibrate_camera([tmp_path / "plain.png"], 0.035, tmp_path / "camera.yaml")
-    with pytest.raises(InvalidInputError, match="no marker 0, 1, 2, 3"):
-        calibrate_camera([tmp_path / "plain.png"], 0.035, tmp_path / "camera.yaml", (0.05, 0.005))
-    (tmp_path / "broken.png").write_bytes(b"")
-    with pytest.raises(BagError, match="no frame that can be read"):
-        calibrate_camera([tmp_path / "broken.png"], 0.035, tmp_path / "camera.yaml")
-    assert not (tmp_path / "camera.yaml").exists()
-
-
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_said(
     plugin: StoragePlugin, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -200,18 +182,6 @@ def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_sai
     output = str(tmp_path / "camera.yaml")
     assert cli.main(["calibrate-camera", *given, "--dish-diameter", "0.035", "--output", output]) == 0
     assert "has no checksums" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_damaged_bag_is_said(tmp_path: Path):
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
-        for index in range(3):
-            bag.write("/camera/image_raw/compressed", index * 10**10, b"")
-    file = tmp_path / "bag" / "bag_0.mcap"
-    file.write_bytes(file.read_bytes()[:-40])
-    said: list[str] = []
-    track([file], VisionTrackerSettings(), Scene(), log=said.append)
-    assert any("is damaged" in line for line in said)
 
 
 def test_an_orientation_is_ignored_and_said(tmp_path: Path):

@@ -24,12 +24,11 @@ from rclpy.node import Node
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.console import BagRecording, Place, SimulatedHost
-from magnetosuture_thread.messages import reading
+from magnetosuture_thread.jobs.console import BagRecording
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
-from magnetosuture_thread.nodes.console.graph import ConsoleGraph, Latest
+from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
@@ -110,27 +109,6 @@ def test_a_stop_that_is_not_kept_over_a_restart_says_so_on_page_and_terminal(gra
         assert "warning: stop_file: got No space left" in process.stdout.read()
 
 
-def test_blocked_graph_accepts_only_a_stop(graph, console):
-    graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
-    wishes = graph.listen(topics.OPERATOR_COMMAND)
-
-    def heard(speed: float) -> bool:
-        console.publish_velocity((speed, 0.0))
-        return bool(wishes) and wishes[-1].twist.linear.x == speed
-
-    graph.wait(lambda: heard(0.001), "a wish")
-    console.blocked = "starting petri"
-    assert act(console, "arm") == "starting petri"
-    console.publish_velocity((0.003, 0.0))
-    assert console.state()["filter"]["reason"] == "starting petri"
-    console.blocked = ""
-    graph.wait(lambda: heard(0.002), "another wish")
-    assert {wish.twist.linear.x for wish in wishes} == {0.001, 0.002}
-    console.blocked = "starting petri"
-    assert act(console, "stop") == ""
-    graph.wait(lambda: bridge(console).get("emergency_stopped", False), "the emergency stop")
-
-
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
     stamp = graph.now()
     assert console.state()["needle"] is None
@@ -195,18 +173,6 @@ def test_in_a_namespace_nodes_of_other_rigs_are_not_shown(graph):
         assert GraphHost(console).state()["simulated"]
 
 
-def test_a_node_that_says_no_more_is_silent(graph, console, monkeypatch):
-    node = graph.add(CoilBridgeNode)
-    graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")
-    graph.wait(lambda: console.nodes()["coil_bridge"]["level"] == "ok", "a bridge in order")
-    assert console.nodes()["coil_bridge"]["values"]["driver"] == "recording"
-    assert console.is_active("coil_bridge")
-    monkeypatch.setattr(console_graph, "NODE_TIMEOUT", 0.3)
-    graph.remove(node)
-    graph.wait(lambda: console.nodes()["coil_bridge"]["level"] == "silent", "silence")
-    assert not console.is_active("coil_bridge")
-
-
 @pytest.mark.parametrize("transport", ["compressed", "raw"])
 def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     console = ConsoleGraph(node, ConsoleSettings(image_transport=transport))
@@ -229,22 +195,6 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     assert np.abs(shown.astype(int) - pixels).max() < 12
 
 
-def test_with_a_simulated_clock_wishes_are_stamped_by_it(graph):
-    rig = graph.add(RigSimulatorNode, use_sim_time=True, **SMALL)
-    wishes = graph.listen_later(topics.OPERATOR_COMMAND)
-    with joined(domain=graph.domain, simulated_clock=True) as node:
-        assert not list(node.services)  # which nobody would answer
-        console = ConsoleGraph(node, ConsoleSettings())
-        graph.wait(lambda: console.state()["time"] > 1.0, "/clock")
-
-        def heard() -> bool:
-            console.publish_velocity((0.001, 0.0))
-            return bool(wishes)
-
-        graph.wait(heard, "a wish")
-        assert reading.nanoseconds(wishes[0].header.stamp) <= rig.time.stamp(rig.time.elapsed()) < 1000e9
-
-
 def test_a_rig_is_paused_where_there_is_one(graph, console):
     host = GraphHost(console)
     assert not host.state()["can_pause"]
@@ -259,23 +209,6 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
     assert not rig.time.paused
     assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
     assert "--graph" in asyncio.run(host.set_recording(True, "an operator"))
-
-
-def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: Path):
-    unusable = {
-        "no_scene": ("/**/thread_model: {ros__parameters: {segments: 25}}", "expected a scene file"),
-        "lost_scene": ("/**: {ros__parameters: {scene: nowhere.yaml}}", "nowhere.yaml"),
-        "wrong_key": ("/**/thread_model: {ros__parameters: {segmants: 25}}", "segmants"),
-    }
-    for name, (text, _) in unusable.items():
-        (tmp_path / f"{name}.yaml").write_text(text)
-    paths = {name: str(tmp_path / f"{name}.yaml") for name in unusable}
-    host = SimulatedHost(console, "hernia_ring", list(paths.values()), Place(0, {}, tmp_path), tmp_path, print)
-    host._block("")  # as once all its nodes are there
-    for name, (_, words) in unusable.items():
-        assert words in asyncio.run(host.select_setup(paths[name]))
-        assert host.state()["setup"] == "hernia_ring"
-        assert host.busy == ""
 
 
 def test_a_recording_gets_what_was_published_before_and_from_then_on(graph, console, tmp_path: Path):
@@ -342,28 +275,6 @@ def test_the_node_refuses_parameters_in_one_line(graph, parameter: str, words: s
     assert process.returncode == 1
     assert words in errors
     assert errors.count("\n") == 1
-
-
-@pytest.mark.parametrize("failure", [MemoryError(), OverflowError("too large"), InvalidInputError("a", "b", "c")])
-def test_a_message_that_cannot_be_read_ends_no_page(graph, node: Node, failure: Exception):
-    """Whatever goes wrong in it, the page keeps the one before."""
-    asked: list[float] = []
-
-    def read(message: CoilCurrents) -> float:
-        asked.append(message.current[0])
-        if message.current[0] < 0.0:
-            raise failure
-        return float(message.current[0])
-
-    latest = Latest(node, topics.RIG_CURRENTS, read)
-
-    def polled() -> int:
-        latest.poll()
-        return len(asked)
-
-    tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[1.0]), polled, "the first")
-    tell(graph, topics.RIG_CURRENTS, CoilCurrents(current=[-1.0]), lambda: polled() and asked[-1] < 0.0, "the bad one")
-    assert latest.value == 1.0
 
 
 def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shapely
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import (
@@ -25,8 +24,6 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes.console import messages
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import read_scene
-from test.nodes.margins import no_margins
-from test.scene.scenes import every_shape
 
 STAMP = Time(sec=12)
 
@@ -124,27 +121,6 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
 def test_margins_of_a_node_that_no_thread_has_are_refused(node: int):
     with pytest.raises(InvalidInputError, match="less than 2001"):
         messages.margins(SafetyMargins(valid=True, node=[node], barrier=[0], clearance=[0.0]))
-
-
-def test_margins_that_are_not_valid_have_no_number():
-    told = plain(messages.margins(no_margins(STAMP, "no pose")))
-    assert (told["valid"], told["reason"], told["clearance"], told["least"]) == (False, "no pose", [], {})
-    assert told["friction"]["state"] == "unknown"
-
-
-def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():
-    scene = every_shape()
-    told = plain(messages.scene(MESSAGES.scene_message(STAMP, scene)))
-    assert (told["version"], told["dish_diameter"], told["dish_depth"]) == (scene.version, 0.05, 0.004)
-    assert [(shape["name"], shape["kind"]) for shape in told["shapes"]] == [(s.name, s.kind) for s in scene.shapes]
-    post, *others = told["shapes"]
-    assert (post["disc"], post["label"]) == ([0.0077, 0.0039, 0.0015], [0.0077, 0.0039])
-    for shape, known in zip(others, scene.shapes[1:], strict=True):
-        drawn = shapely.Polygon(shape["outline"], shape["holes"])
-        assert drawn.symmetric_difference(known.solid).area < 1e-5 * known.solid.length  # 10 um, a fifth of a pixel
-        assert len(shape["outline"]) <= 100
-        assert known.solid.contains(shapely.Point(shape["label"]))
-    assert len(others[0]["holes"]) == 1
 
 
 def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
