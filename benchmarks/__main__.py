@@ -11,8 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import contact, golden, keep_out, lies, page
-from benchmarks.attack import command as attack
+from benchmarks import attack, contact, golden, keep_out, lies, page
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
 from benchmarks.forecast import command as forecast

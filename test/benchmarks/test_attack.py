@@ -32,6 +32,7 @@ def test_a_reader_that_does_not_end_is_ended_and_counted(tmp_path: Path, monkeyp
     assert seconds < 60.0
 
 
+@pytest.mark.slow
 @pytest.mark.whole_graph
 def test_no_node_ends_by_a_few_attacks(tmp_path: Path):
     figures = tmp_path / "figures.json"
