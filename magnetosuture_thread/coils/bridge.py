@@ -18,7 +18,8 @@ from magnetosuture_thread.coils.pose_extrapolator import CONSISTENT_POSES, TOPIC
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor, StampAges
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.safety.filter import SPEED, STUCK, FilteredCommand, NeedleSafetyFilter, rest_reason
+from magnetosuture_thread.safety.filter import SPEED, FilteredCommand, NeedleSafetyFilter, rest_reason
+from magnetosuture_thread.safety.motion import STUCK
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.texts import shortened
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.follow_monitor import MotionStep
 from magnetosuture_thread.safety import NeedleKinematics
-from magnetosuture_thread.safety.limits import limit_norm
+from magnetosuture_thread.safety.motion import limit_pair
 
 Vector = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ class MotionObserver:
             if trusted or not applied[:2].any() or math.hypot(*(middle - seen[1])) > VISIBLE:
                 unexplained = (middle - seen[1]) / interval - applied[:2]
                 learnt = self._velocity + min(1.0, GAIN * interval) * (unexplained - self._velocity)
-                self._velocity = limit_norm(learnt, self._max_speed)
+                self._velocity = np.array(limit_pair(float(learnt[0]), float(learnt[1]), self._max_speed))
                 self._seen = stamp, middle
         if last is None or not 0.0 < stamp - last[0] <= MAX_INTERVAL:
             return None

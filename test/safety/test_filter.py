@@ -13,7 +13,8 @@ from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import BAND, MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
+from magnetosuture_thread.safety.barriers import BAND
+from magnetosuture_thread.safety.filter import MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
 from magnetosuture_thread.safety.motion import filter_velocity, moved_needle, needle_margin, pose_needle
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
