@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import yaml
 
 from benchmarks.bridge.report import BridgeReport, ZeroDelays
-from magnetosuture_thread.coils.watchdog import SILENCE_TIMEOUT
+from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.rig.power.watch import DriveWatch
