@@ -19,7 +19,7 @@ from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.frames import WorstFrame
-from magnetosuture_thread.evaluation.report.pictures import ReportPicture, draw_worst_frame
+from magnetosuture_thread.evaluation.plots import ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.tables import TIMES, Row
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
 from magnetosuture_thread.interface import (

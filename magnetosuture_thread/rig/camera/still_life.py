@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera.coverage import Box, Light, box_around, covered
 from magnetosuture_thread.rig.camera.scene import SILICONE, CameraScene, Lighting, Look
@@ -171,13 +171,7 @@ def circle(corners: int) -> Points:
 
 
 def still_outlines(obstacle: Obstacle) -> list[Points]:
-    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m].
-
-    Raises:
-        ValueError: a mesh has no outline in the plane.
-    """
+    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m]."""
     if isinstance(obstacle, Disc):
         return [np.asarray(obstacle.centre) + obstacle.radius * circle(256)]
-    if isinstance(obstacle, Mesh):
-        raise ValueError("the camera sees discs and polygons; a mesh is of space")
     return obstacle.rings
