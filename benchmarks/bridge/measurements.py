@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 import yaml
 
+from benchmarks.bridge.drive_watch import DriveWatch
 from benchmarks.bridge.report import BridgeReport, ZeroDelays
 from magnetosuture_thread.coils.watchdog import SILENCE_TIMEOUT
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
-from magnetosuture_thread.rig.power.watch import DriveWatch
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:

@@ -25,9 +25,8 @@ from magnetosuture_thread.coils.drivers.roboclaw import protocol
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board
 from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.rig.power import packets
-from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.packets import checksum
+from magnetosuture_thread.rig.power import board as packets
+from magnetosuture_thread.rig.power.board import RoboClawBoard, checksum
 
 SUPPLY = packets.answer(128, packets.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
