@@ -42,7 +42,7 @@ from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
 
