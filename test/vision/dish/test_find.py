@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.vision.dish.find import RIM_RAYS, find_cut_dish, find_dish, rim_shift
 from magnetosuture_thread.vision.dish.watch import AGREEING, LONG_SEARCH, DishWatch, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
