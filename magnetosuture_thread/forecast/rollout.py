@@ -25,8 +25,8 @@ from magnetosuture_thread.model.formulations.rod_step import (
 from magnetosuture_thread.model.formulations.step_buffers import ContactBuffers, StepBuffers
 from magnetosuture_thread.model.program import Indices, Mask, Table, Vector
 from magnetosuture_thread.model.solvers.banded import SolverBuffers
+from magnetosuture_thread.safety.certificate import FilterData
 from magnetosuture_thread.safety.motion import (
-    FilterData,
     filter_velocity,
     moved_needle,
     needle_margin,

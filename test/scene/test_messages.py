@@ -62,20 +62,6 @@ def test_a_scene_goes_there_and_back(way: Callable[[Scene], Any], name: str):
     assert again.version == SCENES[name].version
 
 
-def test_the_fields_are_plain_and_those_of_the_message():
-    fields = messages.scene_fields(every_shape())
-    assert ["header", *fields] == list(SceneMessage.get_fields_and_field_types())
-    assert fields["shapes"][0] == {
-        "name": "post",
-        "kind": "instrument",
-        "disc": [{"x": 0.0077, "y": 0.0039, "radius": 0.0015}],
-        "polygon": [],
-        "friction": 0.0,
-    }
-    block = fields["shapes"][5]
-    assert (block["name"], block["disc"], len(block["polygon"][0]["holes"])) == ("block", [], 1)
-
-
 def harm_a_corner(message: Any) -> None:
     message.shapes[1].polygon[0].outline.corners[3].x += 1e-12
 
