@@ -23,7 +23,7 @@ from magnetosuture_thread.rig.power.watch import DriveWatch
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
     from magnetosuture_thread.nodes.processes import NodeProcesses
 
 SETUP = "petri_35mm_polyamide"
@@ -211,7 +211,7 @@ def measure_bridge(
         progress: called with the share of a stage done, 0 to 1.
     """
     # Only here, where it is needed: without ROS the other commands still work.
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
     from magnetosuture_thread.nodes.processes import (
         NodeProcesses,
         environment_of,

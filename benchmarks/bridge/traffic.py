@@ -15,8 +15,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from magnetosuture_thread.messages.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import run
 
 KINDS = ("commander", "tracker", "fuzzer")
@@ -64,10 +64,10 @@ class TrafficNode(Node):
             self._began, self._direction = now, self._direction + 1.0
         velocity = SPEED * np.array([math.cos(self._direction), math.sin(self._direction)])
         self._last = time.monotonic()
-        self._send(self._commands, MESSAGES.twist_message(self._stamp(), velocity))
+        self._send(self._commands, packed_twist(self._stamp(), velocity))
 
     def _track(self) -> None:
-        self._send(self._poses, MESSAGES.pose_message(self._stamp(), TAIL, HEADING))
+        self._send(self._poses, packed_pose(self._stamp(), TAIL, HEADING))
 
     def _fuzz(self) -> None:
         """Publish a command or a pose with something wrong in it, or nothing."""

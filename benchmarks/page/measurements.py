@@ -207,7 +207,6 @@ def _heard(domain: int) -> Iterator[Times]:
     """
     from magnetosuture_thread.messages.cdr import header_stamp
     from magnetosuture_thread.nodes import topics
-    from magnetosuture_thread.nodes.messages import serialised_velocity
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
     from magnetosuture_thread.nodes.recorder import Recorder
 
@@ -234,7 +233,8 @@ def _heard(domain: int) -> Iterator[Times]:
         recorder.close()
         for topic, data in came:
             stamp = header_stamp(data)
-            if stamp is not None and serialised_velocity(data).any():
+            linear = topics.NEEDLE_COMMAND.decode(data).twist.linear
+            if stamp is not None and (linear.x or linear.y):
                 times[OPERATOR_COMMAND.recorded if topic == NEEDLE_COMMAND.recorded else topic].append(stamp * 1e-9)
         for found in times.values():
             found.sort()

@@ -33,7 +33,7 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.jobs.simulate_procedure import ProcedureRun
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.diagnostics import COMPILING
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.recorder import Recorder

@@ -9,7 +9,7 @@ from typing import Any
 
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.jobs.replay_inputs import Progress
-from magnetosuture_thread.nodes.procedure_client import DONE, ProcedureClient, ProcedureReport
+from magnetosuture_thread.nodes.clients import DONE, ProcedureClient, ProcedureReport
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file

@@ -26,16 +26,16 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.jobs.console_hosts import SimulatedHost
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.inbox import ConsoleTap, Latest
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
+from test.nodes import wire
 from test.nodes.margins import no_margins
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -173,9 +173,9 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     stamp = graph.now()
     assert console.state()["needle"] is None
     assert console.state()["scene"] is None
-    scene = MESSAGES.scene_message(stamp, read_scene("dish_35mm_post"))
-    pose = MESSAGES.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
-    path = MESSAGES.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
+    scene = wire.scene_message(stamp, read_scene("dish_35mm_post"))
+    pose = wire.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
+    path = wire.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
     margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
@@ -198,10 +198,10 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
 def test_until_a_scene_is_heard_that_of_the_settings_is_shown(graph, node):
     console = ConsoleGraph(node, ConsoleSettings(scene="dish_150mm"))
     assert console.state()["scene"]["dish_diameter"] == 0.15
-    damaged = MESSAGES.scene_message(graph.now(), read_scene("hernia_ring"))
+    damaged = wire.scene_message(graph.now(), read_scene("hernia_ring"))
     damaged.dish_depth *= 1.5
     graph.publish(topics.SCENE, damaged)
-    good = MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post"))
+    good = wire.scene_message(graph.now(), read_scene("dish_35mm_post"))
     tell(graph, topics.SCENE, good, lambda: console.state()["scene"]["dish_diameter"] == 0.035, "the scene")
     with pytest.raises(ConfigurationError, match="scene: got 'nowhere'"):
         console.begin(ConsoleSettings(scene="nowhere"))
@@ -240,8 +240,8 @@ def test_texts_and_lists_of_states_are_cut(graph, console):
     long = CoilBridgeState(reasons=["x" * 500] * 80, driver="y" * 2000, current=[1.0] * 100)
     tell(graph, topics.BRIDGE_STATE, long, lambda: bridge(console), "the state")
     assert len(json.dumps(bridge(console))) < 10_000
-    path = MESSAGES.path_message(graph.now(), np.zeros((100, 2)))
-    endless = MESSAGES.path_message(graph.now(), np.zeros((6000, 2)))
+    path = wire.path_message(graph.now(), np.zeros((100, 2)))
+    endless = wire.path_message(graph.now(), np.zeros((6000, 2)))
     graph.publish(topics.MEASURED_THREAD, endless)
     tell(graph, topics.MEASURED_THREAD, path, lambda: len(console.state()["measured"]) == 100, "the path")
 
@@ -283,9 +283,9 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     done, jpeg = cv2.imencode(".jpg", pixels)
     assert done
     if transport == "raw":
-        topic, message = topics.IMAGE, MESSAGES.image(graph.now(), pixels)
+        topic, message = topics.IMAGE, wire.image(graph.now(), pixels)
     else:
-        topic, message = topics.COMPRESSED_IMAGE, MESSAGES.compressed_image(graph.now(), jpeg.ravel())
+        topic, message = topics.COMPRESSED_IMAGE, wire.compressed_image(graph.now(), jpeg.ravel())
     tell(graph, topic, message, console.frame, "a frame")
     first = console.frame()
     assert first is not None
@@ -348,7 +348,7 @@ def test_scenario_that_cannot_be_used_leaves_the_nodes_alone(console, tmp_path: 
 
 def test_a_recording_gets_what_was_said_once_and_for_all_and_what_is_said_from_then_on(graph, node):
     graph.listen_later(topics.SCENE)
-    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post")))
+    graph.publish(topics.SCENE, wire.scene_message(graph.now(), read_scene("dish_35mm_post")))
     taken: list[tuple[str, int, bytes]] = []
     tap = ConsoleTap(node, [topics.SCENE, topics.CURRENTS], None, lambda *message: taken.append(message))
 
@@ -443,12 +443,12 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     """With the real needle planner, and somebody who shows a needle."""
     assert console.state()["procedure"] is None
     assert console.state()["procedures"] == []  # the scene has no shape that one needs
-    told = MESSAGES.scene_message(1, read_scene("five_posts"))
+    told = wire.scene_message(1, read_scene("five_posts"))
     tell(graph, topics.SCENE, told, lambda: console.state()["procedures"] == ["slalom"], "what the scene allows")
     graph.add(NeedlePlannerNode, scene="dish_35mm", needle_length=0.0025, settle=0.0, pose_timeout=5.0)
     commands, holds = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.PROCEDURE_HOLD)
     later = int(1e9 * (time.time() + 3600.0))  # ns; late poses are refused, however slowly the test runs
-    pose = MESSAGES.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
+    pose = wire.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
     near = "goals: [{go_to: {position: [0.008, 0.0]}}]"
     refusal = asyncio.run(console.execute_procedure("resume", "", False))
     assert "no procedure" in refusal

@@ -26,8 +26,8 @@ from magnetosuture_msgs.msg import (
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes.console import messages
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import read_scene
+from test.nodes import wire
 from test.nodes.margins import no_margins
 from test.scene.scenes import every_shape
 
@@ -40,7 +40,7 @@ def plain(told: Any) -> Any:
 
 
 def test_the_needle():
-    message = MESSAGES.pose_message(STAMP, np.array([0.003, -0.004]), np.array([0.6, 0.8]))
+    message = wire.pose_message(STAMP, np.array([0.003, -0.004]), np.array([0.6, 0.8]))
     told = plain(messages.needle(message))
     assert told["tail"] == [0.003, -0.004]
     assert told["heading"] == pytest.approx(np.arctan2(0.8, 0.6))
@@ -65,7 +65,7 @@ def test_the_tracker_with_and_without_the_dish():
 
 
 def test_the_threads():
-    path = MESSAGES.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
+    path = wire.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
     assert plain(messages.measured_thread(path)) == [[0.0, 0.001], [0.002, 0.003]]
     message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
     assert plain(messages.predicted(message)) == {
@@ -183,7 +183,7 @@ def test_margins_that_are_not_valid_have_no_number():
 
 def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():
     scene = every_shape()
-    told = plain(messages.scene(MESSAGES.scene_message(STAMP, scene)))
+    told = plain(messages.scene(wire.scene_message(STAMP, scene)))
     assert (told["version"], told["dish_diameter"], told["dish_depth"]) == (scene.version, 0.05, 0.004)
     assert [(shape["name"], shape["kind"]) for shape in told["shapes"]] == [(s.name, s.kind) for s in scene.shapes]
     post, *others = told["shapes"]
@@ -197,7 +197,7 @@ def test_scene_outlines_are_simplified_to_the_resolution_of_the_screen():
 
 
 def test_a_damaged_scene_is_not_shown():
-    message = MESSAGES.scene_message(STAMP, every_shape())
+    message = wire.scene_message(STAMP, every_shape())
     message.shapes[0].disc[0].x += 1e-9
     with pytest.raises(InvalidInputError, match=r"scene\.version"):
         messages.scene(message)
@@ -205,7 +205,7 @@ def test_a_damaged_scene_is_not_shown():
 
 def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
     scene = read_scene("hernia_ring")
-    heard = messages.scene(MESSAGES.scene_message(STAMP, scene))
+    heard = messages.scene(wire.scene_message(STAMP, scene))
     assert messages.shown_scene(scene) == heard
     assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
 
