@@ -37,7 +37,7 @@ from magnetosuture_thread.messages.packing import (
     packed_prediction,
 )
 from magnetosuture_thread.model.session import PredictionResult
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 

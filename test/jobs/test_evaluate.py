@@ -53,7 +53,7 @@ def broken(path: Path) -> Path:
 
 def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     (row,) = evaluate_bags([short_bag], tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["pull.html", "table.csv", "table.json"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"pull.html", "table.csv", "table.json"}
     assert row["bag"] == "pull"
     assert row["setup"] == "petri_35mm_polyamide"
     assert "straight_pull" in str(row["simulated"])

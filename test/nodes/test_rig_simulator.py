@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.replay.clock import Timeline
+from magnetosuture_thread.nodes.player import Timeline
 from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.rig import Rig, RigFrame

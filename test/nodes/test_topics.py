@@ -11,7 +11,7 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 
-from magnetosuture_thread.coils.watchdog import PublisherCounter
+from magnetosuture_thread.coils.inputs import PublisherCounter
 from magnetosuture_thread.interface import CAMERA
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode

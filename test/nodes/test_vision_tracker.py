@@ -17,7 +17,7 @@ from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics, vision_tracker
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.lens import Lens

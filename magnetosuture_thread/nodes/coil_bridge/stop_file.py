@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rclpy.node import Node
 
-from magnetosuture_thread.coils.stop_record import StopRecord
+from magnetosuture_thread.coils.latch import StopRecord
 
 PARAMETER = "stop_file"
 

@@ -20,8 +20,8 @@ from magnetosuture_thread.messages.packing import packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
+from magnetosuture_thread.nodes.player import Timeline
+from magnetosuture_thread.rig.camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
 
