@@ -10,7 +10,6 @@ import pytest
 from magnetosuture_thread import Disc
 from magnetosuture_thread.model.estimator.correction import (
     CORRECTED,
-    NO_ROOM,
     CorrectionBuffers,
     MeasuredPoints,
     correct,
@@ -145,7 +144,7 @@ STRAIGHT = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
 
 
 def correct_straight(
-    points: MeasuredPoints, density: float, discs: tuple[Disc, ...] = (), contacts: int = 2 * NODES
+    points: MeasuredPoints, density: float, discs: tuple[Disc, ...] = ()
 ) -> tuple[int, float, float, CorrectionBuffers, np.ndarray]:
     """Correct a straight thread; return how it ended, how far off the constraints are, residual, memory, weights."""
     segments = NODES - 1
@@ -221,7 +220,6 @@ def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
     assert (code, off <= 1.0) == (CORRECTED, True)
     away = np.linalg.norm(unit * (STRAIGHT + memory.moved) - np.array(disc.centre), axis=1)
     assert -2e-7 < away.min() - radius - 0.5 * thread.diameter < 2e-6
-    assert correct_straight(points, 1e-2, (disc,), contacts=1)[0] == NO_ROOM
 
 
 def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:
