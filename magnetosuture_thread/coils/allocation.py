@@ -291,7 +291,7 @@ class CoilAllocation:
     def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
         """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
         # Most solutions are inside the bounds, where the unconstrained one is optimal.
-        found = np.linalg.lstsq(system, target, rcond=None)[0]
+        found: Vector = np.linalg.lstsq(system, target, rcond=None)[0].astype(np.float64, copy=False)
         if ((found >= lower) & (found <= upper)).all():
             return found
         # The solver rejects equal bounds; the small gap has no effect.
