@@ -17,7 +17,7 @@ PACKAGE = Path(magnetosuture_thread.__file__).parent
 LAYERS = (
     {"scene", "model", "forecast", "safety", "vision", "coils", "planning", "guidance", "rig"},  # the core
     {"messages", "bags", "setups", "console", "workers"},
-    {"evaluation", "calibration", "offline", "campaign", "catalog"},
+    {"evaluation", "calibration", "offline", "campaign"},
     {"nodes"},
     {"jobs", "reproduce"},
     {"cli"},
@@ -37,7 +37,7 @@ OWNERS = {
     "osqp": {"model"},
     "dask": {"workers"},
     "distributed": {"workers"},
-    "duckdb": {"catalog"},
+    "pyarrow": {"jobs"},
     "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},

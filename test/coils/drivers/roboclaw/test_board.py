@@ -21,7 +21,7 @@ import pytest
 from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
 from magnetosuture_thread.coils.drivers.roboclaw.board import Board, DeviceError, ExchangePort
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.rig.power import packets
+from magnetosuture_thread.rig.power import board as packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 from magnetosuture_thread.rig.power.packets import checksum
 

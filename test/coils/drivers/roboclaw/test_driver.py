@@ -22,7 +22,7 @@ from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
-from magnetosuture_thread.rig.power import packets
+from magnetosuture_thread.rig.power import board as packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
 
 CURRENTS = (3.0, -6.0, 1.5, 0.0)
