@@ -23,7 +23,6 @@ from magnetosuture_thread.coils.drivers.roboclaw.board import Board, DeviceError
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig.power import board as packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.packets import checksum
 
 SUPPLY = packets.answer(128, packets.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
@@ -51,7 +50,7 @@ class Peer:
                     packet += os.read(self.host, 1000)
                 except BlockingIOError:
                     continue
-                if in_pieces or len(packet) == 2 or checksum(packet[:-2]) == int.from_bytes(packet[-2:], "big"):
+                if in_pieces or len(packet) == 2 or packets.checksum(packet[:-2]) == int.from_bytes(packet[-2:], "big"):
                     self.heard.append(packet)
                     os.write(self.host, reply(packet))
                     packet = b""
