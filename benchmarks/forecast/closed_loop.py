@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread import ForecastStart, NeedlePose, ThreadForecaster
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.run import run_procedure
-from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.campaign.run import run_procedure, vary
 from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
