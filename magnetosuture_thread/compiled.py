@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -14,13 +16,15 @@ from numba.core import event
 
 PACKAGE = Path(__file__).parent
 COMPILED_MARK = b"magnetosuture_thread.compiled"
+_IMPORT = re.compile(rb"^\s*(?:from|import) magnetosuture_thread\.([\w.]+)", re.MULTILINE)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 # Said of every function, as numba takes it over from whatever calls one first where it is not said.
-_COUNTED: dict[str, Any] = {"_nrt": True}
-_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+# Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
+_COUNTED: dict[str, Any] = {"_nrt": True, "no_cfunc_wrapper": True}
+_UNCOUNTED: dict[str, Any] = {"_nrt": False, "no_cfunc_wrapper": True}
 _EVENTS = cast(Any, event)  # without types
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
@@ -53,6 +57,14 @@ def compiled_uncounted(function: _Function) -> _Function:
     return cast(_Function, numba.njit(cache=True, error_model="numpy", **_UNCOUNTED)(function))
 
 
+def compiled_inner(function: _Function) -> _Function:
+    """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash.
+
+    Without an entry for Python, which takes apart each array of a tuple, a kernel compiles several times as fast.
+    """
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", no_cpython_wrapper=True, **_UNCOUNTED)(function))
+
+
 def compiled_without_gil(function: _Function) -> _Function:
     """Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.
 
@@ -61,35 +73,67 @@ def compiled_without_gil(function: _Function) -> _Function:
     return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
 
 
+def compiled_uncounted_without_gil(function: _Function) -> _Function:
+    """Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_UNCOUNTED)(function))
+
+
 def compilations() -> int:
     """Return a number that grows with each function that is compiled, and not with those that the cache has."""
     return len(_COMPILATIONS.buffer)
 
 
-def delete_stale_cache(package: Path = PACKAGE) -> bool:
-    """Delete the cache where a file with compiled functions has changed since; return whether it had to.
+def _dependencies(package: Path) -> dict[Path, set[Path]]:
+    """Return each source file that has compiled functions, with all files of the package that it imports and itself."""
+    imports: dict[Path, set[Path]] = {}
+    kernels: set[Path] = set()
+    for path in package.rglob("*.py"):
+        text = path.read_bytes()
+        if COMPILED_MARK in text:
+            kernels.add(path)
+        found = {package.joinpath(*module.decode().split(".")).with_suffix(".py") for module in _IMPORT.findall(text)}
+        imports[path] = {file if file.exists() else file.with_suffix("") / "__init__.py" for file in found}
+    closure: dict[Path, set[Path]] = {}
+    for path in kernels:
+        reached, waiting = {path}, [path]
+        while waiting:
+            new = imports.get(waiting.pop(), set()) - reached
+            reached |= new
+            waiting += new
+        closure[path] = {file for file in reached if file in imports}
+    return closure
 
-    numba checks the file of a function only. But a compiled function contains the code of all functions that it calls,
-    from other files too, and would keep their old code.
+
+def delete_stale_cache(package: Path = PACKAGE) -> bool:
+    """Delete cached functions of files of which any import has changed since; return whether there were such files.
+
+    numba checks the file of a function only. But a compiled function contains the code of all functions and constants
+    that it uses, from other files too, and would keep their old values.
     """
-    state = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        if COMPILED_MARK in path.read_bytes():
-            status = path.stat()
-            state.update(f"{path.relative_to(package)} {status.st_mtime_ns} {status.st_size}\n".encode())
-    stamp = package / "__pycache__" / "kernels.stamp"
-    with contextlib.suppress(OSError):
-        if stamp.read_text() == state.hexdigest():
-            return False
+
+    def state_of(files: Iterable[Path]) -> str:
+        told = ((file.relative_to(package), file.stat()) for file in sorted(files))
+        return hashlib.sha256("".join(f"{n} {s.st_mtime_ns} {s.st_size}\n" for n, s in told).encode()).hexdigest()
+
+    stamp = package / "__pycache__" / "kernels.json"
+    before: dict[str, str] = {}
+    with contextlib.suppress(OSError, ValueError):
+        before = dict(json.loads(stamp.read_text()))
+    states = {"package": state_of(package.rglob("*.py"))}
+    if before.get("package") == states["package"]:
+        return False
+    states |= {str(path.relative_to(package)): state_of(files) for path, files in _dependencies(package).items()}
+    stale = [package / name for name in states if name != "package" and before.get(name) != states[name]]
     # Where nothing can be written, there is no such cache either: numba's is then in the user's home.
     with contextlib.suppress(OSError):
-        for kernel in [*package.rglob("__pycache__/*.nbi"), *package.rglob("__pycache__/*.nbc")]:
-            kernel.unlink(missing_ok=True)
+        for path in stale:
+            for kernel in path.parent.glob(f"__pycache__/{path.stem}.*.nb[ci]"):
+                kernel.unlink(missing_ok=True)
         stamp.parent.mkdir(exist_ok=True)
         written = stamp.with_suffix(f".{os.getpid()}")
-        written.write_text(state.hexdigest())
+        written.write_text(json.dumps(states))
         written.replace(stamp)
-    return True
+    return bool(stale)
 
 
 delete_stale_cache()

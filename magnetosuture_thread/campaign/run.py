@@ -27,8 +27,7 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
 from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.safety.barriers import measure
-from magnetosuture_thread.safety.packed_scene import pack_scene
+from magnetosuture_thread.safety.packed_scene import measure, pack_scene
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 

@@ -26,8 +26,7 @@ from rich.table import Table
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, SolverError
-from magnetosuture_thread.evaluation.plots import FAINT, INK, tidy
-from magnetosuture_thread.evaluation.scene_plot import shape_patch
+from magnetosuture_thread.evaluation.plots import FAINT, INK, shape_patch, tidy
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import OPERATOR_COMMAND

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 
 Image = NDArray[np.uint8]
@@ -435,8 +435,6 @@ def still_outlines(obstacle: Obstacle) -> list[Points]:
     """
     if isinstance(obstacle, Disc):
         return [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
-    if isinstance(obstacle, Mesh):
-        raise ValueError("the camera sees discs and polygons; a mesh is of space")
     return obstacle.rings
 
 
