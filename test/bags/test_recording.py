@@ -183,15 +183,6 @@ def test_a_marker_that_is_no_line_is_refused_and_counted(tmp_path: Path):
     assert recording.refused == {"/thread/measured: a marker that is no line strip being added": 2}
 
 
-def test_a_command_without_a_stamp_is_stamped_when_it_was_recorded(tmp_path: Path):
-    linear = make("geometry_msgs/msg/Vector3", 1.0, 2.0, 0.0)
-    twist = make("geometry_msgs/msg/Twist", linear, make("geometry_msgs/msg/Vector3", 0.0, 0.0, 3.0))
-    bag = bag_of(tmp_path, ("/cmd_vel", twist), remap={"/cmd_vel": NEEDLE_COMMAND.recorded})
-    found = only(Recording(bag), NEEDLE_COMMAND)
-    assert (found.header.stamp.sec, found.header.frame_id) == (1, "dish")
-    assert (found.twist.linear.y, found.twist.angular.z) == (2.0, 3.0)
-
-
 def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
     bag = bag_of(
         tmp_path, (GROUND_TRUTH_NEEDLE.recorded, pose_stamped()), (GROUND_TRUTH_NEEDLE.recorded, pose_stamped(2))
