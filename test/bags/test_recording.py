@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from magnetosuture_thread.bags import message_types
 from magnetosuture_thread.bags.conversion import TransformTree
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
@@ -125,28 +126,9 @@ POINTS = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (2.0, 0.0, 0.25)]
 
 
 def marker(kind: int = 4, action: int = 0) -> Any:
-    fields = {
-        "header": stamped(1),
-        "ns": "",
-        "id": 0,
-        "type": kind,
-        "action": action,
-        "pose": pose(0.0, 0.0, 0.0),
-        "scale": make("geometry_msgs/msg/Vector3", 1.0, 1.0, 1.0),
-        "color": make("std_msgs/msg/ColorRGBA", 1.0, 1.0, 1.0, 1.0),
-        "lifetime": make("builtin_interfaces/msg/Duration", 0, 0),
-        "frame_locked": False,
-        "points": [make(POINT, *xyz) for xyz in POINTS],
-        "colors": [],
-        "texture_resource": "",
-        "texture": make(COMPRESSED_IMAGE.type_name, stamped(1), "", np.zeros(0, dtype=np.uint8)),
-        "uv_coordinates": [],
-        "text": "",
-        "mesh_resource": "",
-        "mesh_file": make("visualization_msgs/msg/MeshFile", "", np.zeros(0, dtype=np.uint8)),
-        "mesh_use_embedded_materials": False,
-    }
-    return typestore().types["visualization_msgs/msg/Marker"](**fields)
+    points = [make(POINT, *xyz) for xyz in POINTS]
+    fields = {"header": stamped(1), "type": kind, "action": action, "pose": pose(0.0, 0.0, 0.0), "points": points}
+    return message_types.make("visualization_msgs/msg/Marker", **fields)
 
 
 @pytest.mark.parametrize("channel", [MEASURED_THREAD, GROUND_TRUTH_THREAD])
