@@ -34,7 +34,7 @@ from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
     from magnetosuture_thread.nodes.processes import NodeProcesses
 
 SETUP = "petri_35mm_polyamide"
@@ -252,7 +252,7 @@ def measure_bridge(
         the `greatest_current` meanwhile and its limit `max_current` [A]; `restarts` as of `BridgeBench`.
     """
     # Only here, where it is needed: without ROS the other commands still work.
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
     from magnetosuture_thread.nodes.processes import (
         NodeProcesses,
         environment_of,

@@ -14,8 +14,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
+from magnetosuture_thread.messages.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import run
 
 RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
@@ -60,10 +60,10 @@ class TrafficNode(Node):
             self._began, self._direction = now, self._direction + 1.0
         velocity = SPEED * np.array([math.cos(self._direction), math.sin(self._direction)])
         self._last = time.monotonic()
-        self._commands.publish(MESSAGES.twist_message(self._stamp(), velocity))
+        self._commands.publish(packed_twist(self._stamp(), velocity))
 
     def _track(self) -> None:
-        self._poses.publish(MESSAGES.pose_message(self._stamp(), TAIL, HEADING))
+        self._poses.publish(packed_pose(self._stamp(), TAIL, HEADING))
 
     def _fuzz(self) -> None:
         """Publish a command or a pose with something wrong in it, or nothing."""

@@ -282,7 +282,7 @@ def _parameters(values: Mapping[str, str]) -> list[str]:
 
 def _press(*switches: str) -> None:
     """Press switches of the bridge, at the rig."""
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
 
     with CoilClient() as client:
         for switch in switches:

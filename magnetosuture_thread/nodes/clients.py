@@ -1,9 +1,11 @@
-"""Client of a running coil bridge: its state, services and lifecycle."""
+"""Clients of a running graph: of its coil bridge, and of its needle planner."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
@@ -11,23 +13,29 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from magnetosuture_msgs.msg import CoilBridgeState
+from magnetosuture_msgs.action import ExecuteProcedure
+from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
+from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
+from typing_extensions import Self
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
+from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, EXECUTE_PROCEDURE, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.report import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS, SCHEDULING
 from magnetosuture_thread.nodes.diagnostics import read_status
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
 from magnetosuture_thread.texts import shortened
 
 TIMEOUT = 10.0  # s for the bridge to be found and to answer
-DISCOVERY_TIME = 0.5  # s after the first message of the bridge, for it to have discovered this client
-RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
+DISCOVERY_TIME = 1.0  # s after a node is found, for it to have discovered this client
+CALL_PERIOD = 0.5  # s without an answer, after which a service is called again
 SETTLE_TIME = 0.15  # s after an answer, for the bridge to publish its new state
+GOAL_PERIOD = 2.0  # s after which a procedure that could not begin is sent again
+MAX_CALLBACKS = 20  # of one poll
 
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
@@ -35,38 +43,42 @@ TRANSITIONS = {
     "deactivate": Transition.TRANSITION_DEACTIVATE,
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
-_STATE_NAMES = {
+_BRIDGE_STATES = {
     CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
     CoilBridgeState.STATE_INACTIVE: "inactive",
     CoilBridgeState.STATE_ACTIVE: "active",
     CoilBridgeState.STATE_FAULT: "fault",
 }
+DONE = "done"
+_PROCEDURE_STATES = {
+    ProcedureState.STATE_READY: "planned",
+    ProcedureState.STATE_RUNNING: "running",
+    ProcedureState.STATE_PAUSED: "paused",
+    ProcedureState.STATE_DONE: DONE,
+    ProcedureState.STATE_FAILED: "failed",
+}
 
 
-class CoilClient:
-    """Client of the coil bridge on the ROS domain of the environment.
+class _Client:
+    """A node in a context of its own, on the ROS domain of the environment, whose callbacks run when it says.
 
     Args:
-        namespace: of the bridge, where it is in one.
+        name: of the node.
+        namespace: of the node.
     """
 
-    def __init__(self, namespace: str = "") -> None:
-        self._namespace = namespace
+    def __init__(self, name: str, namespace: str = "") -> None:
+        self._name, self._namespace = name, namespace
         self._context = Context()
-        self._state: CoilBridgeState | None = None
-        self._values: dict[str, str] = {}
 
-    def __enter__(self) -> CoilClient:
+    def __enter__(self) -> Self:
         """Join the graph."""
         rclpy.init(context=self._context, args=[])
-        self._node = GuardedNode(
-            "coil_client", context=self._context, namespace=self._namespace, start_parameter_services=False
-        )
-        self._bridge = f"{self._node.get_namespace()}/coil_bridge".lstrip("/")
+        options = {"context": self._context, "namespace": self._namespace, "start_parameter_services": False}
+        self._node = GuardedNode(self._name, **options)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
-        topics.DIAGNOSTICS.subscribe(self._node, self._on_diagnostics)
+        self._join()
         return self
 
     def __exit__(
@@ -74,8 +86,33 @@ class CoilClient:
     ) -> None:
         """Leave the graph."""
         self._executor.shutdown()
+        self._leave()
         self._node.destroy_node()
         self._context.try_shutdown()
+
+    def _join(self) -> None:
+        """Make what is needed to talk to the graph."""
+
+    def _leave(self) -> None:
+        """Destroy what the node does not."""
+
+
+class CoilClient(_Client):
+    """Client of the coil bridge on the ROS domain of the environment.
+
+    Args:
+        namespace: of the bridge, where it is in one.
+    """
+
+    def __init__(self, namespace: str = "") -> None:
+        super().__init__("coil_client", namespace)
+        self._state: CoilBridgeState | None = None
+        self._values: dict[str, str] = {}
+
+    def _join(self) -> None:
+        self._bridge = f"{self._node.get_namespace()}/coil_bridge".lstrip("/")
+        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
+        topics.DIAGNOSTICS.subscribe(self._node, self._on_diagnostics)
 
     def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
@@ -112,7 +149,7 @@ class CoilClient:
         if state is None:
             raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
         return {
-            "state": _STATE_NAMES[state.state] + (", armed" if state.armed else ""),
+            "state": _BRIDGE_STATES[state.state] + (", armed" if state.armed else ""),
             "currents are zero because": _listed(state.reasons) or "they are not: a command is followed",
             "velocity commanded [mm/s]": _millimetres(state.commanded),
             "velocity filtered [mm/s]": _millimetres(state.filtered),
@@ -155,7 +192,7 @@ class CoilClient:
         while time.monotonic() < deadline:
             # The services may be called repeatedly: a lost answer blocks nothing.
             future = client.call_async(request)
-            self._spin(future.done, TIMEOUT if is_transition else RETRY_PERIOD)
+            self._spin(future.done, TIMEOUT if is_transition else CALL_PERIOD)
             if future.done():
                 return future.result()
         raise GraphError(f"coil_bridge did not answer within {TIMEOUT:g} s (service {name})")
@@ -184,3 +221,81 @@ def _numbers(values: Any) -> str:
 
 def _listed(texts: Any) -> str:
     return shortened("; ".join(texts), MAX_REASON_CHARS)
+
+
+@dataclass(frozen=True)
+class ProcedureReport:
+    """What the planner reports of a procedure.
+
+    Attributes:
+        state: planned, running, paused, done or failed.
+        reason: why it is paused or has failed; empty else.
+        goals_met: how many goals are met.
+        progress: completed share of the present goal's path, 0 to 1.
+        clearance: minimum distance of the needle's axis from wall and shapes so far [m]; NaN if unknown.
+    """
+
+    state: str
+    reason: str
+    goals_met: int
+    progress: float = 0.0
+    clearance: float = math.nan
+
+
+class ProcedureClient(_Client):
+    """Client of the needle planner on the ROS domain of the environment; nothing happens but in `poll`.
+
+    Args:
+        procedure: name, path or YAML text.
+
+    Attributes:
+        status: of the procedure; None before it has begun.
+        result: of the procedure; None before its end.
+        refusal: why it could not begin the last time, as the needle may not be tracked yet.
+    """
+
+    def __init__(self, procedure: str) -> None:
+        super().__init__("procedure_client")
+        self._request = ExecuteProcedure.Goal(procedure=procedure)
+        self._send_at: float | None = None  # None until the planner is found
+        self._sent: Future | None = None
+        self._ended: Future | None = None
+        self.status: ProcedureReport | None = None
+        self.result: ProcedureReport | None = None
+        self.refusal = ""
+
+    def _join(self) -> None:
+        self._client = ActionClient(self._node, ExecuteProcedure, EXECUTE_PROCEDURE)
+
+    def _leave(self) -> None:
+        self._client.destroy()
+
+    def poll(self) -> None:
+        """Send the goal once the planner is there, and take what has come."""
+        for _ in range(MAX_CALLBACKS):
+            self._executor.spin_once(timeout_sec=0.0)
+        now = time.monotonic()
+        if self._send_at is None:
+            if self._client.server_is_ready():
+                self._send_at = now + DISCOVERY_TIME
+        elif self._sent is None:
+            if now >= self._send_at:
+                self._sent = self._client.send_goal_async(self._request, self._on_feedback)
+        elif self._ended is None:
+            if self._sent.done():
+                self._ended = self._sent.result().get_result_async()
+        elif self._ended.done() and self.result is None:
+            self._end(self._ended.result().result, now)
+
+    def _on_feedback(self, message: Any) -> None:
+        status = message.feedback.status
+        state = _PROCEDURE_STATES.get(status.state, "unknown")
+        self.status = ProcedureReport(state, status.reason, status.goals_met, status.progress, status.clearance)
+
+    def _end(self, result: ExecuteProcedure.Result, now: float) -> None:
+        if self.status is not None or result.state == ProcedureState.STATE_DONE:
+            self.result = ProcedureReport(
+                _PROCEDURE_STATES.get(result.state, "unknown"), result.reason, result.goals_met
+            )
+            return
+        self.refusal, self._sent, self._ended, self._send_at = result.reason, None, None, now + GOAL_PERIOD

@@ -2,30 +2,53 @@
 
 from __future__ import annotations
 
+import math
+import os
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 from rclpy.timer import Timer
+from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import InvalidInputError, Scene
-from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, CoilBridge
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
+from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
-from magnetosuture_thread.coils.drivers import make_driver
+from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.coils.stop_record import StopRecord
+from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import (
+    packed_bridge_state,
+    packed_currents,
+    packed_filter_state,
+    packed_rig_currents,
+    packed_twist,
+)
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.report import BridgeServices, CoilReport
-from magnetosuture_thread.nodes.coil_bridge.stop_file import stop_record
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
+from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.run import raise_priority, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
+FAULT_PREFIX = "fault: "
+SCHEDULING = "scheduling"
+JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
+# Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
+AGE_KEY = "minimum age of {topic} [ms]"
+AGED_TOPICS = (*INPUTS.values(), topics.NEEDLE_POSE.name)
+STATE_PERIOD = 0.1  # s between two messages of an unchanged state
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
@@ -51,7 +74,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
-        BridgeServices(self, self.arm, self.stop, self.reset)
+        self.create_service(SetBool, ARM, lambda asked, answer: _respond(answer, lambda: self.arm(asked.data)))
+        self.create_service(Trigger, EMERGENCY_STOP, lambda _, answer: _respond(answer, self.stop))
+        self.create_service(Trigger, RESET, lambda _, answer: _respond(answer, self.reset))
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
@@ -193,6 +218,148 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         return self.get_clock().now().nanoseconds * 1e-9, time.monotonic()
 
 
+def _respond(response: Any, act: Callable[[], str | None]) -> Any:
+    """Answer by a text about what is wrong although it was done, or by why it was not."""
+    try:
+        response.message = act() or ""
+    except MagnetosutureError as error:
+        response.success, response.message = False, str(error)
+    else:
+        response.success = True
+    return response
+
+
+class CoilReport:
+    """Publishes currents, state and diagnostics of the coil bridge.
+
+    Args:
+        node: the coil bridge.
+        system: bridge, driver and latch.
+        steady: a clock that does not depend on /clock.
+    """
+
+    def __init__(self, node: PackageNode, system: CoilSystem, steady: Clock) -> None:
+        self._node = node
+        self._system = system
+        self._health = node.health
+        self._refused = 0
+        self._last_state: object = None
+        self._last_log = ""
+        self._setpoints = topics.NEEDLE_SETPOINT.publisher(node)
+        self._currents = topics.CURRENTS.publisher(node)
+        self._states = topics.BRIDGE_STATE.publisher(node)
+        self._filter = topics.FILTER_STATE.publisher(node)
+        self._rig = topics.RIG_CURRENTS.publisher(node)
+        node.create_timer(STATE_PERIOD, lambda: self.publish_state(force=True), clock=steady)
+        # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
+        self._log(system.closed, system.driver_state)
+
+    def send_to_rig(self, currents: np.ndarray) -> None:
+        """Send currents to the simulated rig."""
+        self._rig.publish(packed_rig_currents(self._node.get_clock().now().to_msg(), currents))
+
+    def count_rigs(self) -> int:
+        """Return the number of simulated rigs that subscribe; none after ROS has shut down."""
+        return int(self._rig.get_subscription_count()) if self._node.context.ok() else 0
+
+    def report_scheduling(self, scheduling: str) -> None:
+        """Log how the process is scheduled."""
+        self._health.note(**{SCHEDULING: scheduling})
+        self._node.get_logger().info(f"{SCHEDULING}: {scheduling}")
+
+    def report_unless(self, act: Callable[[], object]) -> str:
+        """Do what may fail but must not hold up what comes after; log and return the problem, empty if none."""
+        try:
+            act()
+        except MagnetosutureError as error:
+            self._node.get_logger().error(str(error))
+            return str(error)
+        return ""
+
+    def report_refused(self, problem: Exception) -> None:
+        """Count and report a refused message."""
+        self._refused += 1
+        self._health.refuse(problem)
+
+    def publish_output(self, command: Time | None, output: BridgeOutput) -> None:
+        """Publish the output of a step; `command` is the stamp of the command that it follows, if any."""
+        stamp = self._node.get_clock().now().to_msg()
+        self._currents.publish(packed_currents(stamp, command, output))
+        self._setpoints.publish(packed_twist(stamp, output.applied))
+        self._filter.publish(packed_filter_state(command or stamp, output))
+
+    def publish_state(self, *, force: bool) -> None:
+        """Publish the state if it has changed, or if forced."""
+        system = self._system
+        latch, output, driver = system.latch, system.output, system.driver_state
+        reasons = () if output is None else output.reasons
+        scene = "" if system.bridge is None else system.bridge.scene_version
+        now = (
+            latch.state,
+            latch.stop_reason,
+            "" if output else system.closed,
+            reasons,
+            driver.ready,
+            driver.problem,
+            driver.warnings,
+            scene,
+        )
+        changed = now != self._last_state
+        if not changed and not force:
+            return
+        stamp = self._node.get_clock().now().to_msg()
+        self._states.publish(packed_bridge_state(stamp, system, driver, self._refused))
+        if output is not None and not output.publish:
+            self._filter.publish(packed_filter_state(stamp, output))
+        jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)
+        self._health.note(**{key: round(value, 3) for key, value in jitter})
+        ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
+        self._health.note(**{AGE_KEY.format(topic=t): round(1e3 * ages.get(t, math.nan), 1) for t in AGED_TOPICS})
+        self._health.note(
+            driver=system.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
+        )
+        self._last_state = now
+        self._log(latch.state.value if output else system.closed, driver)
+        if latch.latched_reason:
+            self._health.error(f"{FAULT_PREFIX}{latch.latched_reason}")
+        elif output is None:
+            self._health.ok(system.closed)
+        elif not driver.ready:
+            self._health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
+        elif latch.stop_reason:
+            self._health.ok(latch.stop_reason)
+        elif reasons:
+            self._health.warn(f"stopped: {'; '.join(reasons)}")
+        elif driver.warnings:
+            self._health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
+        else:
+            self._health.ok("following commands")
+
+    def _log(self, state: str, driver: DriverState) -> None:
+        """Log changes of state and driver, as a record of incidents."""
+        latch = self._system.latch
+        text = f"{state}{', armed' if latch.armed else ''}{f': {latch.latched_reason}' if latch.latched_reason else ''}"
+        text += f"; driver {self._system.driver_name}: {'ready' if driver.ready else driver.problem}"
+        if text != self._last_log:
+            self._last_log = text
+            self._node.get_logger().info(text)
+
+
+def stop_record(node: Node) -> StopRecord:
+    """Return the record of a bridge: by its parameter, or else by the names of node and graph, one for each robot."""
+    given = str(node.get_parameter_or("stop_file").value or "")
+    if given:
+        return StopRecord(Path(os.path.expanduser(given)))
+    home = os.environ.get("XDG_STATE_HOME", "")
+    state = Path(home if os.path.isabs(home) else os.path.expanduser("~/.local/state"))
+    name = node.get_fully_qualified_name().strip("/").replace("/", ".")
+    return StopRecord(state / "magnetosuture" / f"{name}.domain_{node.context.get_domain_id()}.stop")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program."""
     return run(CoilBridgeNode, arguments, CoilBridgeNode.raise_priority)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
