@@ -19,8 +19,6 @@ setup(
             "py.typed",
             "campaign/report/page.html",
             "campaign/report/page.css",
-            "catalog/page.html",
-            "catalog/page.js",
             "evaluation/report/page.html",
             "evaluation/report/page.css",
             "evaluation/report/page.js",

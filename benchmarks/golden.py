@@ -72,10 +72,11 @@ def _save_bag(folder: Path, target: Path) -> None:
 
 
 def _record_bags(into: Path, _: argparse.Namespace) -> None:
-    for bag in sorted(p.parent for p in Path("examples").rglob("metadata.yaml")):
-        _run("replay", bag, "--offline", "--output", into / bag.name)
-        _save_bag(into / bag.name / "bag", into / f"{bag.name}.npz")
-    _run("evaluate", "examples", "--output", into / "evaluation")
+    bag = Path("examples/post_wrap")
+    _run("replay", bag, "--offline", "--output", into / "replay")
+    _save_bag(into / "replay/bag", into / "replay.npz")
+    _run("evaluate", bag, "--output", into / "evaluation")
+    _run("reproduce", "hernia", "examples/hernia_steering", "--output", into / "hernia")
 
 
 def _record_reference(into: Path, given: argparse.Namespace) -> None:
@@ -102,11 +103,11 @@ def _record_forecast(into: Path, _: argparse.Namespace) -> None:
         tail = 0.0056 * np.array([np.cos(angle), np.sin(angle)])
         pose = NeedlePose(step / 30.0, tail, np.array([np.sin(angle), -np.cos(angle)]))
         prediction = predictor.step(pose)
-        vertices.append(prediction.vertices)
+        vertices.append(prediction.positions)
         margins.append(prediction.margins["obstacle"].minimum)
         if step % 30 == 0:
             for command in ((0.005, 0.0), (0.0, -0.006)):
-                start = ForecastStart(pose, prediction.vertices)
+                start = ForecastStart(pose, prediction.positions)
                 forecasts.append(forecaster.forecast(start, np.array(command), 2.0).vertices)
     np.savez_compressed(into / "post.npz", vertices=vertices, margins=margins, forecasts=np.array(forecasts))
 

@@ -26,7 +26,6 @@ from magnetosuture_thread import (
     MagnetosutureError,
     Material,
     Medium,
-    Mesh,
     NeedlePose,
     NeedleSafetyFilter,
     Polygon,
@@ -195,7 +194,6 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
     ),
     "Material": (MATERIAL, "diameter elastic_modulus stiffness_weight"),
     "Medium": (MEDIUM, " ".join(Medium.__dataclass_fields__)),
-    "Mesh": (made(Mesh, vertices=np.eye(3), faces=[[0, 1, 2]]), "vertices faces"),
     "NeedlePose": (of_step, "stamp tail heading deviation"),
     "NeedleSafetyFilter": (
         FILTER,

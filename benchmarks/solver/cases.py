@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.obstacles import Mesh, Obstacle, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 
@@ -31,7 +31,6 @@ CLIMBING, CLIMB_WAVE = 0.4, 47e-3  # rad, m
 GRID = 5e-6  # m; of arc length, for the integral of the heading
 RADIUS, LOBES, BUMP = 2.5e-3, 5, 0.05  # of an obstacle: mean [m], number and height of the bumps
 CLEARANCE = 0.15e-3  # m; between the track and an obstacle's highest bump
-MERIDIANS, PARALLELS = 10, 10  # of a mesh: 2 * 10 * 10 faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +113,7 @@ def _obstacles(dimension: int) -> tuple[Obstacle, ...]:
     turning = heading(bends + GRID, dimension) - heading(bends - GRID, dimension)
     inward = turning / np.linalg.norm(turning, axis=1, keepdims=True)
     centres = apexes + (RADIUS * (1.0 + BUMP) + CLEARANCE) * inward
-    return tuple(_star(centre) if dimension == 2 else _ball(centre) for centre in centres)
+    return tuple(_star(centre) if dimension == 2 else Disc(tuple(centre.tolist()), RADIUS) for centre in centres)
 
 
 def _star(centre: NDArray[np.float64]) -> Polygon:
@@ -123,21 +122,3 @@ def _star(centre: NDArray[np.float64]) -> Polygon:
     radius = RADIUS * (1.0 + BUMP * np.cos(LOBES * angle))
     x, y = centre[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)])
     return Polygon(tuple(zip(x.tolist(), y.tolist(), strict=True)))
-
-
-def _ball(centre: NDArray[np.float64]) -> Mesh:
-    """Return a bumpy ball of 10 meridians and 10 parallels between two poles, of 200 faces."""
-    polar = math.pi * np.arange(1, PARALLELS + 1) / (PARALLELS + 1)
-    around = 2.0 * math.pi * np.arange(MERIDIANS) / MERIDIANS
-    p, a = (grid.ravel() for grid in np.meshgrid(polar, around, indexing="ij"))
-    radius = RADIUS * (1.0 + BUMP * np.sin(p) ** 2 * np.cos(LOBES * a))
-    ring = radius[:, None] * np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], axis=1)
-    vertices = np.vstack([ring, [[0.0, 0.0, RADIUS], [0.0, 0.0, -RADIUS]]]) + centre
-    north, south = len(ring), len(ring) + 1
-    faces = []
-    for j in range(MERIDIANS):
-        k = (j + 1) % MERIDIANS
-        faces += [(north, j, k), (south, north - MERIDIANS + k, north - MERIDIANS + j)]
-        for i in range(0, north - MERIDIANS, MERIDIANS):
-            faces += [(i + j, i + MERIDIANS + j, i + MERIDIANS + k), (i + j, i + MERIDIANS + k, i + k)]
-    return Mesh(vertices, np.array(faces))

@@ -24,8 +24,7 @@ from benchmarks.vision.frames import (
     tilted,
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import STEEL_BGR, Cover
-from magnetosuture_thread.rig.camera.scene import Lighting
+from magnetosuture_thread.rig.camera import STEEL_BGR, Cover, Lighting
 
 Random = np.random.Generator
 MakeCase = Callable[[Random], Case]

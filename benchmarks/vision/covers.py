@@ -27,7 +27,7 @@ from benchmarks.vision.cases import (
 )
 from benchmarks.vision.frames import Case
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera import Cover
 
 OFF_NEEDLE = 1.2e-3  # m; of a cover from the needle and the thread's beginning
 TURNS = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)

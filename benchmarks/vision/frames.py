@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import (
+from magnetosuture_thread.rig.camera import (
     GLEAM_BGR,
     MENISCUS,
     STEEL_BGR,
+    CameraScene,
     Cover,
     DishCamera,
+    Lighting,
     encode_jpeg,
 )
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.lens import Lens
 
 Image = NDArray[np.uint8]

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.vision.cases import winding_line
 from benchmarks.vision.photographs import DIAMETER, RIGHT, Photograph, Plane, ellipse_error, photograph, straightened
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.rig.camera.dish_camera import STEEL_BGR
+from magnetosuture_thread.rig.camera import STEEL_BGR
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.look import FoundDish, Track

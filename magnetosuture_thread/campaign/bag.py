@@ -38,7 +38,7 @@ from magnetosuture_thread.messages.outputs import (
 from magnetosuture_thread.messages.packing import packed_currents, packed_filter_state, packed_twist
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.model.session import PredictionResult
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 

@@ -12,7 +12,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations.rod_step import MotionBuffers, RodProperties
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
 from magnetosuture_thread.model.solvers.banded import SolverBuffers
-from magnetosuture_thread.safety.motion import FilterData
+from magnetosuture_thread.safety.certificate import FilterData
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins that are recorded."""

@@ -25,8 +25,7 @@ from magnetosuture_thread.messages.packing import (
     packed_twist,
 )
 from magnetosuture_thread.messages.scene import packed_scene
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 from magnetosuture_thread.setups import Setup
 
 SIZE = (640, 480)

@@ -18,7 +18,7 @@ from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.frames import WorstFrame
-from magnetosuture_thread.evaluation.report.pictures import ReportPicture, draw_worst_frame
+from magnetosuture_thread.evaluation.plots import ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.tables import TIMES, Row
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
 from magnetosuture_thread.interface import (
@@ -53,7 +53,7 @@ def broken(path: Path) -> Path:
 
 def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     (row,) = evaluate_bags([short_bag], tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["pull.html", "table.csv", "table.json"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"pull.html", "table.csv", "table.json"}
     assert row["bag"] == "pull"
     assert row["setup"] == "petri_35mm_polyamide"
     assert "straight_pull" in str(row["simulated"])

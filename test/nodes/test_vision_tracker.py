@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.vision.lens import Lens
 
 TAIL = np.array([0.002, 0.001])

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera import Cover
 from magnetosuture_thread.vision.dish import find as dish
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

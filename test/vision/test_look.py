@@ -13,8 +13,7 @@ import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece

@@ -10,9 +10,8 @@ import shapely
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.camera import scene as drawn
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Look
+from magnetosuture_thread.rig import camera as drawn
+from magnetosuture_thread.rig.camera import DishCamera, Look
 from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.look import Track, mask_of

@@ -10,7 +10,7 @@ import shapely
 from scipy.interpolate import CubicSpline
 
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.tracker import VisionTracker

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera import Cover
 from magnetosuture_thread.vision import look
 from magnetosuture_thread.vision import tracker as tracker_module
 from magnetosuture_thread.vision.look import State, Track

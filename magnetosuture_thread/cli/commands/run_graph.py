@@ -226,18 +226,16 @@ def run_console(options: argparse.Namespace) -> int:
 
     from magnetosuture_thread.jobs.console import console
 
+    token = options.token or os.environ.pop(TOKEN, None) or None  # no node gets it
+    served = {"address": options.address, "port": options.port, "token": token, "origin": options.origin}
+    served |= {"certificate": options.certificate, "private_key": options.key}
     console(
         options.setup,
+        recordings=options.record,
         running=options.graph,
         namespace=options.namespace,
         bag=options.replay,
-        recordings=options.record,
-        address=options.address,
-        port=options.port,
-        token=options.token or os.environ.pop(TOKEN, None) or None,  # no node gets it
-        certificate=options.certificate,
-        private_key=options.key,
-        origin=options.origin,
+        served={name: value for name, value in served.items() if value is not None},
         log=make_log(make_console()),
     )
     return DONE

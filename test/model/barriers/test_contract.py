@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.barrier import NO_OBSTACLE, Barrier
-from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Obstacle, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.model.barriers import (
     Compression,
     Connectivity,
@@ -24,10 +24,7 @@ def barriers(dimension: int) -> list[Barrier]:
     near, far = Disc((0.5,) * dimension, 0.4), Disc((-2.0,) * dimension, 0.7)
     shape: Obstacle = Polygon(((-1.0, -1.5), (0.3, -1.4), (0.1, -0.6), (-0.2, -0.9)))
     if dimension == 3:
-        shape = Mesh(
-            np.array([(-1.0, -1.5, 0.0), (0.3, -1.4, 0.1), (0.1, -0.6, -0.2), (-0.2, -0.9, 1.1)]),
-            np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]),
-        )
+        shape = Disc((-0.2, -1.1, 0.2), 0.5)
     workspace = Workspace([near, far, shape], 50.0, dimension, 2.5)
     return [
         Connectivity(1.0),

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.vision.dish.find import CONTRAST, MIN_CONTRAST, RIM_RAYS, find_cut_dish, find_dish, rim_shift
 from magnetosuture_thread.vision.dish.robust_fits import fit_circle, fit_rim
 from magnetosuture_thread.vision.dish.tilt import Tilt

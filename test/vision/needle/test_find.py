@@ -13,8 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.vision.images import Layer, prepare
 from magnetosuture_thread.vision.needle import measure
 from magnetosuture_thread.vision.needle.arc import Arc

@@ -1,12 +1,13 @@
-"""Plays recorded messages into the running graph and records its outputs."""
+"""Plays recorded messages into the running graph, and passes on its outputs."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import rclpy
 import rclpy.time
@@ -18,13 +19,21 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import CAMERA_INFO, CURRENTS, DIAGNOSTICS, PAUSE_REPLAY, SCENE
+from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
+    CURRENTS,
+    DIAGNOSTICS,
+    MARGINS,
+    NEEDLE_POSE,
+    PAUSE_REPLAY,
+    PREDICTED_THREAD,
+    SCENE,
+)
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode
-from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.nodes.replay.losses import Losses
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
 STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
@@ -36,24 +45,130 @@ QUIET = 0.5  # s without any answer, once all has been taken and answered: the g
 STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
-_AT_ONCE = 100  # outputs taken between two inputs at the most
-_ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
+MAX_TAKEN = 100  # outputs taken between two inputs at the most
+ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
+Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data` (CDR bytes)
+FRAMES = frozenset(channel.name for channel in CAMERA.values())
 
 
-class Recorded(Protocol):
-    """A recorded message: see `bags.reader.Record`."""
+class Timeline:
+    """Maps simulated to real time; before it begins, and while it is paused, simulated time stands still.
+
+    Args:
+        start: the simulated time to begin with [ns].
+        rate: how much faster than real time it runs.
+    """
+
+    def __init__(self, start: int, rate: float) -> None:
+        self.start = start
+        self._rate = rate
+        self._began: float | None = None
+        self._paused: float | None = None
+        self._stood = 0.0
+
+    def begin(self) -> None:
+        """Begin, or begin anew, at the start."""
+        self._began, self._stood = time.perf_counter(), 0.0
+        self._paused = self._began if self._paused is not None else None
 
     @property
-    def topic(self) -> str:
-        """With its leading slash."""
+    def paused(self) -> bool:
+        """Whether it is paused."""
+        return self._paused is not None
+
+    def pause(self, still: bool) -> None:
+        """Pause the time, or resume it."""
+        now = time.perf_counter()
+        if still and self._paused is None:
+            self._paused = now
+        elif not still and self._paused is not None:
+            if self._began is not None:
+                self._stood += now - self._paused
+            self._paused = None
+
+    def running(self) -> float:
+        """Return for how long it has been running, by real time, since it began [s]."""
+        if self._began is None:
+            return 0.0
+        now = time.perf_counter() if self._paused is None else self._paused
+        return now - self._began - self._stood
+
+    def now(self) -> int:
+        """Return the simulated time [ns]."""
+        return self.start + round(self.running() * self._rate * 1e9)
+
+    def left(self, simulated: int) -> float:
+        """Return how long it takes until a simulated time [ns], in real time [s]; for ever while it is paused."""
+        if self._paused is not None:
+            return math.inf
+        return (simulated - self.start) * 1e-9 / self._rate - self.running()
+
+
+class Losses:
+    """Keeps count of a replay.
+
+    Attributes:
+        played: messages published, by topic.
+        frames_taken: camera frames that the tracker says it has taken.
+    """
+
+    def __init__(self) -> None:
+        self.played: Counter[str] = Counter()
+        self.frames_taken = 0
+        self._refused: dict[str, int] = {}
+        self._poses: set[int] = set()
+        self._answered: set[int] = set()
+        self._numbers: dict[str, int] = {}
+        self._taken: Counter[str] = Counter()
 
     @property
-    def time(self) -> int:
-        """When it was recorded [ns]."""
+    def frames_played(self) -> int:
+        """Return the camera frames published."""
+        return sum(count for topic, count in self.played.items() if topic in FRAMES)
 
     @property
-    def data(self) -> bytes:
-        """CDR bytes."""
+    def frames_waiting(self) -> bool:
+        """Whether the tracker has not taken all frames yet."""
+        return self.frames_taken < self.frames_played
+
+    @property
+    def poses_waiting(self) -> bool:
+        """Whether a pose has not been answered yet; one that the model refuses never is."""
+        return bool(self._poses - self._answered)
+
+    def heard(self, topic: str, stamp: int | None, number: int | None) -> None:
+        """Count an output of the graph.
+
+        Args:
+            topic: its name.
+            stamp: of the frame that it is about [ns].
+            number: that its publisher gave it, if the middleware tells.
+        """
+        if number is not None and number != topics.UNNUMBERED:
+            self._numbers[topic] = max(self._numbers.get(topic, 0), number)
+            self._taken[topic] += 1
+        if stamp is not None and topic == NEEDLE_POSE.name:
+            self._poses.add(stamp)
+        if stamp is not None and topic in (PREDICTED_THREAD.name, MARGINS.name):
+            self._answered.add(stamp)
+
+    def count_diagnostics(self, data: bytes) -> None:
+        """Count a node's status on /diagnostics."""
+        for status in topics.DIAGNOSTICS.decode(data).status:
+            values = {value.key: value.value for value in status.values}
+            node = status.name.split(":")[0]
+            if node == "vision_tracker":
+                self.frames_taken = max(self.frames_taken, int(values.get("frames", "0")))
+            self._refused[node] = int(values.get("refused", "0"))
+
+    def dropped(self) -> dict[str, int]:
+        """Return how many messages got lost, by the way on which."""
+        unanswered = len(self._poses - self._answered) - self._refused.get("thread_model", 0)
+        unheard = sum(max(0, number - self._taken[topic]) for topic, number in self._numbers.items())
+        counts = {"poses without an answer": max(0, unanswered), "outputs lost by the recording": unheard}
+        if self.frames_played:
+            counts = {"frames not taken by vision_tracker": self.frames_played - self.frames_taken, **counts}
+        return counts
 
 
 class LiveReplay:
@@ -92,7 +207,7 @@ class LiveReplay:
         self._nodes = nodes
         self._receive = receive
         self._watch = watch
-        self._say = log
+        self._log = log
         self._last_answer = time.perf_counter()
         self._still, self._last_clock = timeline.start, 0.0
         self._taken = 0
@@ -224,7 +339,7 @@ class LiveReplay:
     def _take_waiting(self) -> None:
         """Take outputs that have come already, however late we are."""
         self._watch()
-        for _ in range(_AT_ONCE):
+        for _ in range(MAX_TAKEN):
             before = self._taken
             self._executor.spin_once(timeout_sec=0.0)
             if self._taken == before:
@@ -254,7 +369,7 @@ class LiveReplay:
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
                 self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)
-            if topic in _ANSWERS:
+            if topic in ANSWERS:
                 self._last_answer = time.perf_counter()
                 self.losses.heard(name, stamp, info["publication_sequence_number"])
             if topic.channel is DIAGNOSTICS:
@@ -268,7 +383,7 @@ class LiveReplay:
         answer.success = True
         at = (self._time.now() - self._time.start) * 1e-9
         answer.message = f"{'paused' if asked.data else 'goes on'} at {at:.2f} s"
-        self._say(answer.message)
+        self._log(answer.message)
         return answer
 
     def _publish_clock(self, simulated: int) -> None:
