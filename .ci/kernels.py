@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from magnetosuture_thread.compiled import PACKAGE
-from magnetosuture_thread.forecast.making import make_forecaster
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import read_setup

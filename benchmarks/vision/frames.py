@@ -246,13 +246,3 @@ def lens_with(strength: float, size: tuple[int, int]) -> Lens:
 def dark_field(image: Image, view: DishView) -> Image:
     """Return the picture with light from the side: needle, thread and rim are bright on a dark floor."""
     return np.asarray(cv2.convertScaleAbs(255 - image, alpha=1.1, beta=4.0), dtype=np.uint8)
-
-
-def drawn_path(line: Points, bgr: tuple[int, int, int], thickness: int) -> Finish:
-    """Return what draws a line over the picture, as programs do that show where the needle shall go."""
-
-    def finish(image: Image, view: DishView) -> Image:
-        at = np.round(view.to_pixels(line) * 16.0).astype(np.int32)
-        return np.asarray(cv2.polylines(image, [at], False, bgr, thickness, cv2.LINE_AA, 4), dtype=np.uint8)
-
-    return finish

@@ -176,7 +176,7 @@ class ThreadForecasts:
             return self._made[2]
         self._made, self._last, forecaster = (settings, scene, None), None, None
         if scene is not None:
-            forecaster = make_forecaster(settings, scene, workers=1)
+            forecaster = make_forecaster(settings, scene)
             forecaster.warm_up()
             prepare_paths()
         self._made = settings, scene, forecaster

@@ -60,7 +60,7 @@ class Case:
         return int(self.start.shape[1])
 
 
-def case(segments: int, dimension: int, obstacles: bool, steps: int, straight: bool = False) -> Case:
+def case(segments: int, dimension: int, obstacles: bool, steps: int) -> Case:
     """Return a motion: the needle goes along the track, 0.15 mm a step.
 
     Args:
@@ -68,18 +68,17 @@ def case(segments: int, dimension: int, obstacles: bool, steps: int, straight: b
         dimension: d, 2 or 3.
         obstacles: whether there are three obstacles of 200 triangles, or none.
         steps: k.
-        straight: whether the thread begins straight behind the needle instead of along the track.
     """
     travel = SPEED / RATE
     arc = np.arange(1.0, steps + 1.0) * travel
     behind = -SEGMENT * np.arange(segments + 1.0)
-    positions, first = _track(np.concatenate([behind, arc]), dimension), heading(np.zeros(1), dimension)
+    positions = _track(np.concatenate([behind, arc]), dimension)
     return Case(
         thread=Thread.of(
             MATERIALS["silk_6_0"], length=segments * SEGMENT, segments=segments, attachment=Attachment.PINNED
         ),
         shapes=_obstacles(dimension) if obstacles else (),
-        start=behind[:, None] * first if straight else positions[: segments + 1].copy(),
+        start=positions[: segments + 1].copy(),
         tails=positions[segments + 1 :].copy(),
         headings=heading(arc, dimension),
         interval=1.0 / RATE,
