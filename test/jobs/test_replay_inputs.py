@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.bags.message_types import make
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
