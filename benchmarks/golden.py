@@ -95,7 +95,7 @@ def _record_forecast(into: Path, _: argparse.Namespace) -> None:
     scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)})
     predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=40, scene=scene)
     safety = NeedleSafetyFilter(scene, needle_length=0.004, needle_curvature=60.0, max_speed=0.008, hold_time=0.15)
-    forecaster = ThreadForecaster(predictor.thread, scene, safety, workers=1)
+    forecaster = ThreadForecaster(predictor.thread, scene, safety)
     predictor.start(NeedlePose(0.0, np.array([-0.001, 0.0054]), np.array([1.0, 0.0])))
     vertices, margins, forecasts = [], [], []
     for step in range(1, 150):

@@ -243,7 +243,6 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
     """
     from magnetosuture_thread.messages.cdr import header_stamp
     from magnetosuture_thread.nodes import topics
-    from magnetosuture_thread.nodes.messages import serialised_velocity
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
     from magnetosuture_thread.nodes.recorder import Recorder
 
@@ -252,7 +251,8 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
 
     def receive(topic: str, arrival: int, data: bytes) -> None:
         stamp = header_stamp(data)
-        if stamp is not None and serialised_velocity(data).any():
+        linear = topics.NEEDLE_COMMAND.decode(data).twist.linear
+        if stamp is not None and (linear.x or linear.y):
             times[OPERATOR_COMMAND.recorded if topic == NEEDLE_COMMAND.recorded else topic].append(stamp * 1e-9)
 
     with environment_of(graph_environment(domain)):

@@ -1,4 +1,4 @@
-"""Damages bags at random, and checks what reading, repairing and salvaging make of them."""
+"""Damages bags at random, and checks what reading and repairing make of them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread.bags.bag_folder import METADATA_FILE
+from magnetosuture_thread.bags.check import write_repaired_bag
 from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.repair import write_repaired_bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import MagnetosutureError
 
@@ -189,7 +189,7 @@ def check_bag(bag: Path, original: Counter[Message]) -> tuple[Counter[str], floa
 
 
 def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
-    """Return what reading, repairing and salvaging make of a bag."""
+    """Return what reading and repairing make of a bag."""
     found: Counter[str] = Counter()
     try:
         opened = Bag(bag)
@@ -201,25 +201,20 @@ def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
     except MagnetosutureError:
         return {"refused": 1}
     altered, missing = (read - original).total(), (original - read).total()
-    is_noticed = opened.damage is not None or bool(refused) or bool(opened.unverified)
+    is_noticed = opened.damage is not None or bool(refused)
     is_doubted = is_noticed or bool(opened.unchecked)
     found["damage_noticed" if is_noticed else "altered_and_unchecked" if altered or missing else "whole"] = 1
     # Of a message that was altered unnoticed the original is missing, and the altered one is there in its place.
     found["silently_lost"] += missing > altered and not is_noticed
-    found["altered_as_sound"] += altered > 0 and (not is_doubted or (is_noticed and not opened.unverified))
-    for unverified in (False, True):
-        output = bag.with_name(f"repaired_{unverified}")
-        shutil.rmtree(output, ignore_errors=True)
-        try:
-            write_repaired_bag(opened, output, "repaired", unverified=unverified)
-            new = Bag(output)
-        except MagnetosutureError:
-            continue
-        finally:
-            repaired = output.is_dir() and any(output.glob("*.mcap"))
-        if not repaired:
-            continue
-        made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
-        is_marked = bool(new.unverified) or (bool(new.unchecked) and not is_noticed)
-        found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
+    found["altered_as_sound"] += altered > 0 and (not is_doubted or is_noticed)
+    output = bag.with_name("repaired")
+    shutil.rmtree(output, ignore_errors=True)
+    try:
+        write_repaired_bag(opened, output, "repaired")
+        new = Bag(output)
+    except MagnetosutureError:
+        return dict(found)
+    made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
+    is_marked = bool(new.unchecked) and not is_noticed
+    found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
     return dict(found)

@@ -7,7 +7,6 @@ is reversed. 20 frames of each class take ten minutes.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -15,11 +14,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.vision.classes import CLASSES
+from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
-from benchmarks.vision.rod_video import FRAMES, measure_rod_videos
-from benchmarks.vision.ropes import ROPES, rope_row
 from magnetosuture_thread.cli.arguments import count_argument, whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.errors import ConfigurationError
@@ -40,9 +37,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--photographs", action="store_true", help="only the dish, in drawn photographs of dishes as people take them"
     )
     parser.add_argument(
-        "--rod-videos", action="store_true", help="only drawn videos of a blunt rod in a dish without a dark rim"
-    )
-    parser.add_argument(
         "--save", nargs=3, metavar=("CLASS", "INDEX", "FILE"), help="only write one frame of a class as a PNG file"
     )
 
@@ -51,29 +45,19 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     """Measure; return the figures and whether no pose was reversed."""
     if options.photographs:
         return _photographs(options, console)
-    if options.rod_videos:
-        return _rod_videos(options, console)
     if options.save:
         name, index, file = options.save
         return _save(name, index, file, options.seed), True
     names = [name for name in CLASSES if name.startswith(tuple(options.classes))]
-    ropes = [name for name in ROPES if name.startswith(tuple(options.classes))]
-    if not names and not ropes:
-        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}, ropes")
+    if not names:
+        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
-    if rows:
-        console.print(table(rows))
-        console.print(table_of_pieces(rows))
-    rope_rows = [rope_row(name, options.count, options.seed) for name in ropes]
-    for row in rope_rows:
-        make_log(console)(
-            f"{row.name}: 90 % of the rope followed in {row.covered_90:.0%} of the pictures, "
-            f"{row.covered:.1%} in the mean; {row.wrong:.1%} of what was followed is not on it; {row.median_ms:.1f} ms"
-        )
+    console.print(table(rows))
+    console.print(table_of_pieces(rows))
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
-    return {**figures, "ropes": [asdict(row) for row in rope_rows], "total": total}, total["reversed"] == 0
+    return {**figures, "total": total}, total["reversed"] == 0
 
 
 def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
@@ -91,16 +75,6 @@ def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[st
     right, count = sum(row.right for row in rows), sum(row.count for row in rows)
     make_log(console)(f"{right} of {count} found within {RIGHT:.0%} of the radius")
     return figures, right >= 0.9 * count
-
-
-def _rod_videos(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
-    """Track a rod in videos; return the figures, and whether nine tenths of the frames are right and none is wrong."""
-    figures = measure_rod_videos(options.count, options.seed)
-    make_log(console)(
-        f"{options.count} videos of {FRAMES} frames: dish right in {figures.dish}, rod in {figures.needle}, "
-        f"both in {figures.both} of {figures.frames}; a rod elsewhere in {figures.wrong}; {figures.median_ms:.1f} ms"
-    )
-    return asdict(figures), figures.both >= 0.9 * figures.frames and not figures.wrong
 
 
 def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:

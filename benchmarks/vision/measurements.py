@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.vision.classes import CLASSES
+from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS, Case, Image, dense, render
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene

@@ -13,8 +13,7 @@ from magnetosuture_thread.campaign.loop import LoopFrame
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.planner import NeedlePlanner
 from magnetosuture_thread.planning.procedure import ProcedureLimits, Wrap
-from magnetosuture_thread.safety.barriers import measure
-from magnetosuture_thread.safety.packed_scene import pack_scene
+from magnetosuture_thread.safety.packed_scene import measure, pack_scene
 from magnetosuture_thread.scene import Scene
 
 REST_WAY = 5e-5  # m; of the tip, that a needle covers if it does not rest

@@ -14,7 +14,6 @@ from magnetosuture_thread.campaign.limits import RunFigures
 from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.campaign.variation import Variation
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.planning.executor import (
     ProcedureExecutor,
@@ -24,13 +23,11 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.pending import PendingPath, plan_now
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
-from magnetosuture_thread.planning.predictive import FORECAST_STEP, PredictiveController
 from magnetosuture_thread.planning.procedure import Procedure, Wrap
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s; of a run
-TRACKING, PREDICTIVE = LOCAL_CONTROLLERS = ("tracking", "predictive")
 PLANNING_TIME = 0.2  # s; in which a path is planned: 0.01 in the open, 0.5 through a gap and around a shape
 
 
@@ -96,7 +93,6 @@ def run_procedure(
     *,
     camera: bool = False,
     follower: bool = False,
-    local: str = TRACKING,
     recorder: LoopRecorder | None = None,
 ) -> RunResult:
     """Run a procedure, or the path follower of the setup for comparison, until it ends; return what came of it.
@@ -107,7 +103,6 @@ def run_procedure(
         variation: the truth.
         camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
         follower: whether the setup's path follower commands in place of the procedure.
-        local: how the paths of the procedure are followed, one of `LOCAL_CONTROLLERS`.
         recorder: gets what the nodes would publish; None for nobody.
 
     Raises:
@@ -115,8 +110,7 @@ def run_procedure(
     """
     planner = _planner(setup)
     planner.check(procedure)
-    predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
-    pilot, leader = _Pilot(procedure, planner, predictive), _Follower(setup) if follower else None
+    pilot, leader = _Pilot(procedure, planner), _Follower(setup) if follower else None
     executor = pilot.executor
     rig = Rig(variation.setup.rig, setup.scene)
     loop = ClosedLoop(
@@ -213,8 +207,8 @@ class _PlannedPath:
 class _Pilot:
     """Executes a procedure as the needle planner does: paths are ready `PLANNING_TIME` after they are asked for."""
 
-    def __init__(self, procedure: Procedure, planner: NeedlePlanner, local: PredictiveController | None) -> None:
-        self.executor = ProcedureExecutor(procedure, planner, self._submit, local=local)
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
+        self.executor = ProcedureExecutor(procedure, planner, self._submit)
         self._now = 0.0
 
     def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
@@ -242,13 +236,3 @@ class _Follower:
         command = self._follower.compute_command(stamp, tail, heading)
         self.progress = command.progress
         return command.velocity
-
-
-def _predictive(setup: Setup, planner: NeedlePlanner, seed: int) -> PredictiveController:
-    """Return the predictive controller of what the nodes believe."""
-    safety = setup.coils.safety_filter(setup.scene)
-    # A single worker: runs are what processes are for.
-    options = {"step": FORECAST_STEP, "max_step": FORECAST_STEP, "workers": 1}
-    forecaster = make_forecaster(setup.model, setup.scene, safety, **options)
-    slowed = setup.coils.friction_feedback == "all"
-    return PredictiveController(planner, forecaster, seed=seed, slowed=slowed)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
@@ -43,6 +42,7 @@ from magnetosuture_thread.jobs.replay_inputs import (
     replay_summary,
     write_results,
 )
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay, Timeline
 from magnetosuture_thread.offline.changes import CHANGING
@@ -118,8 +118,7 @@ class GraphInput:
         """Give the messages to play, by time."""
         given = self.given
         # The scene comes first: the one that is in force in the bag, or else the setup's.
-        message = MESSAGES.scene_message(given.begin, given.setup.scene)
-        data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
+        data = packed_scene(given.begin, given.setup.scene)
         yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what came before about the thread is in force
             earlier = [channel for channel in CHANGING if channel != SCENE]

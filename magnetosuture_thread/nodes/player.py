@@ -31,8 +31,8 @@ from magnetosuture_thread.interface import (
     SCENE,
 )
 from magnetosuture_thread.messages.cdr import header_stamp
+from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import command_stamp
 from magnetosuture_thread.nodes.node import GuardedNode
 
 CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
@@ -364,7 +364,8 @@ class LiveReplay:
                 self._receive(topic.channel.recorded, self._time.now(), bytes(data))
 
         def count(data: bytes, info: dict[str, Any]) -> None:
-            stamp = command_stamp(data) if topic.channel is CURRENTS else header_stamp(data)
+            is_currents = topic.channel is CURRENTS  # which count by the command that they follow, if any
+            stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
             if stamp is not None:
                 # When it reached this process: how long it waited here for its turn is not the graph's delay.
                 self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)

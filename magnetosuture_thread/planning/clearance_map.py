@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.barriers import measure
-from magnetosuture_thread.safety.packed_scene import pack_scene
+from magnetosuture_thread.safety.packed_scene import measure, pack_scene
 from magnetosuture_thread.scene import Scene
 
 CELLS = 400  # of the grid across the dish

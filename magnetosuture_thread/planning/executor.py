@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,6 @@ from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, 
 from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
 from magnetosuture_thread.planning.rest import RestDetector
 from magnetosuture_thread.planning.tracking import PathTracker
-
-if TYPE_CHECKING:
-    from magnetosuture_thread.planning.predictive import PredictiveController
 
 Vector = NDArray[np.float64]
 
@@ -104,7 +100,6 @@ class ProcedureExecutor:
         planner: of paths in the scene.
         submit: begins to plan a path; by default that is done at once, while the caller waits.
         max_wait: for a thread that is not known; then the procedure is given up [s].
-        local: tracks the paths by forecasts of the thread; None for the path tracker alone.
     """
 
     def __init__(
@@ -113,10 +108,9 @@ class ProcedureExecutor:
         planner: NeedlePlanner,
         submit: PathSubmitter = plan_now,
         max_wait: float = MAX_WAIT,
-        local: PredictiveController | None = None,
     ) -> None:
         self.procedure, self.planner, self._submit = procedure, planner, submit
-        self._max_wait, self._local = max_wait, local
+        self._max_wait = max_wait
         self.state, self.reason, self.goal = ProcedureState.READY, "", 0
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
@@ -250,10 +244,7 @@ class ProcedureExecutor:
         if (left := self.path.length - self._tracker.travel) < self._left - PROGRESS:
             self._detours, self._left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
-        if self._local is None:
-            command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
-        else:
-            command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
+        command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
         if command.done:
             self._at_end(goal, middle)
             return None

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.safety.barriers import AddedRows
-from magnetosuture_thread.safety.certificate import PosedNeedle
+from magnetosuture_thread.safety.certificate import FilterData, PosedNeedle
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 
 Vector = NDArray[np.float64]
@@ -28,9 +27,7 @@ class AddedNeedleBarriers:
     Args:
         barriers: in their order.
         kinematics: of the needle.
-        points: that stand for it, from tail to tip, with the tail at the origin and its heading along x, (m, 2) [m].
-        hold_time: for which a velocity may go on [s].
-        rate: share of a margin by which it may decrease [1/s].
+        data: of the filter.
         first: index of the first barrier among the names of constraints.
 
     Attributes:
@@ -39,20 +36,12 @@ class AddedNeedleBarriers:
         first_time: of the needle's first pose by that clock [s].
     """
 
-    def __init__(
-        self,
-        barriers: Sequence[Barrier],
-        kinematics: NeedleKinematics,
-        points: Points,
-        hold_time: float,
-        rate: float,
-        first: int,
-    ) -> None:
+    def __init__(self, barriers: Sequence[Barrier], kinematics: NeedleKinematics, data: FilterData, first: int) -> None:
         self.barriers = tuple(barriers)
         check_barriers(self.barriers)
         self.time: float | None = 0.0
         self.first_time = 0.0
-        self._kinematics, self._points, self._hold, self._rate, self._index = kinematics, points, hold_time, rate, first
+        self._kinematics, self._data, self._first = kinematics, data, first
 
     def __bool__(self) -> bool:
         """Return whether there are any."""
@@ -63,8 +52,8 @@ class AddedNeedleBarriers:
         along = np.array([needle.chord_x, needle.chord_y])
         left = np.array([-along[1], along[0]])
         found: list[AddedRows] = []
-        ahead = self._hold / CHECKS
-        for index, barrier in enumerate(self.barriers, start=self._index):
+        ahead = self._data.hold / CHECKS
+        for index, barrier in enumerate(self.barriers, start=self._first):
             self.set_time(ahead)
             later = np.asarray(barrier.value(needle.points), np.float64)
             self.set_time()
@@ -76,7 +65,7 @@ class AddedNeedleBarriers:
             gradient = rows.gradient / size[:, None, None]
             drive = np.einsum("rkd,d->r", gradient, along)
             turn = np.einsum("rkd,rkd->r", gradient, needle.turning[rows.nodes])
-            rate, which = np.full(len(size), min(barrier.gain, self._rate)), np.full(len(size), index, np.int64)
+            rate, which = np.full(len(size), min(barrier.gain, self._data.rate)), np.full(len(size), index, np.int64)
             on_tip = drive[:, None] * along + turn[:, None] * left
             found.append(AddedRows(on_tip, rows.value / size, rate, drift / size, which))
         return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
@@ -98,7 +87,7 @@ class AddedNeedleBarriers:
         heading = np.asarray(heading) / math.hypot(float(heading[0]), float(heading[1]))
         along, across = self._kinematics.body_velocity(heading, velocity)
         begin = self.points_at(np.asarray(tail), heading)
-        times = [check / CHECKS * self._hold for check in range(1, CHECKS + 1)]
+        times = [check / CHECKS * self._data.hold for check in range(1, CHECKS + 1)]
         points = [self.points_at(*self._kinematics.moved(tail, heading, along, across, time, drift)) for time in times]
         for time, where in zip(times, points, strict=True):
             self.set_time(time)
@@ -120,4 +109,4 @@ class AddedNeedleBarriers:
     def points_at(self, tail: Vector, heading: Vector) -> Vector:
         """Return the points that stand for the needle, from tail to tip, shape (m, 2) [m]."""
         c, s = float(heading[0]), float(heading[1])
-        return np.asarray(self._points @ np.array([[c, s], [-s, c]]) + tail)
+        return np.asarray(self._data.body.points @ np.array([[c, s], [-s, c]]) + tail)

@@ -18,7 +18,7 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
-from magnetosuture_thread.vision.needle.size import FRAMES, SET_TOLERANCE
+from magnetosuture_thread.vision.needle.measured_needle import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 

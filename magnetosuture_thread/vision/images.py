@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import cv2
@@ -65,13 +64,6 @@ class Picture:
     origin: tuple[int, int]
     mask: SceneMask | None
     image: np.ndarray
-
-    @cached_property
-    def luminance(self) -> Layer:
-        """How bright each pixel looks: of the three colours the mean by which a JPEG is coded, with the least noise."""
-        if self.image.ndim == 2:
-            return self.darkest
-        return _channel(cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY), self.factor, self.mask)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -59,15 +59,6 @@ def test_a_seed_gives_the_same_run_and_another_seed_another(hernia: Setup, short
     assert run_procedure(short, hernia, vary(hernia, 4)).figures != first.figures
 
 
-def test_predictive_control_reaches_it_too_by_the_same_seed_in_the_same_way(
-    hernia: Setup, short: Procedure, first: RunResult
-):
-    found = run_procedure(short, hernia, vary(hernia, 3), local=campaign.PREDICTIVE)
-    assert (found.success, found.reason) == (True, "")
-    assert found == run_procedure(short, hernia, vary(hernia, 3), local=campaign.PREDICTIVE)
-    assert found.figures.ideal_time_s == first.figures.ideal_time_s
-
-
 def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_vary(hernia: Setup):
     drawn = [vary(hernia, seed) for seed in range(40)]
     factors = np.array([each.setup.rig.viscosity / hernia.rig.viscosity for each in drawn])

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from magnetosuture_thread.bags.message_types import MESSAGES, make
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
@@ -15,7 +16,7 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import COMPRESSED_IMAGE, IMAGE, SCENE
 from magnetosuture_thread.jobs.replay import GraphInput
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, open_bag
-from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.messages.scene import packed_scene, parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 from magnetosuture_thread.vision.images import decode_image
 
@@ -37,7 +38,7 @@ def copied(short_bag: Path, tmp_path: Path):
             for time, topic, data in records:
                 while waiting and waiting[0][0] <= time:
                     at, scene = waiting.pop(0)
-                    message = MESSAGES.scene_message(at, scene)
+                    message: Any = typestore().deserialize_cdr(packed_scene(at, scene), SCENE.type_name)
                     message.version = version or message.version
                     writer.write_message(SCENE.recorded, at, message)
                 writer.write(topic, time, data)

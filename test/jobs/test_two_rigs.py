@@ -15,7 +15,7 @@ from magnetosuture_msgs.srv import EditShape
 
 from magnetosuture_thread.interface import ADD_SHAPE, ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from test.console.visitor import Page, opened
 from test.jobs.test_console import tail, wait

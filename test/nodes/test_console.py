@@ -26,15 +26,15 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.jobs.console import BagRecording
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
 from magnetosuture_thread.nodes.console.node import GraphHost, joined
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
+from test.nodes import wire
 from test.nodes.margins import no_margins
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -113,9 +113,9 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     stamp = graph.now()
     assert console.state()["needle"] is None
     assert console.state()["scene"] is None
-    scene = MESSAGES.scene_message(stamp, read_scene("dish_35mm_post"))
-    pose = MESSAGES.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
-    path = MESSAGES.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
+    scene = wire.scene_message(stamp, read_scene("dish_35mm_post"))
+    pose = wire.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
+    path = wire.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
     margins = no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
@@ -181,9 +181,9 @@ def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     done, jpeg = cv2.imencode(".jpg", pixels)
     assert done
     if transport == "raw":
-        topic, message = topics.IMAGE, MESSAGES.image(graph.now(), pixels)
+        topic, message = topics.IMAGE, wire.image(graph.now(), pixels)
     else:
-        topic, message = topics.COMPRESSED_IMAGE, MESSAGES.compressed_image(graph.now(), jpeg.ravel())
+        topic, message = topics.COMPRESSED_IMAGE, wire.compressed_image(graph.now(), jpeg.ravel())
     tell(graph, topic, message, console.frame, "a frame")
     first = console.frame()
     assert first is not None
@@ -213,7 +213,7 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
 
 def test_a_recording_gets_what_was_published_before_and_from_then_on(graph, console, tmp_path: Path):
     graph.listen_later(topics.SCENE)
-    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene("dish_35mm_post")))
+    graph.publish(topics.SCENE, wire.scene_message(graph.now(), read_scene("dish_35mm_post")))
     heard = graph.listen_later(topics.CURRENTS)
 
     async def record() -> None:
@@ -281,12 +281,12 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     """With the real needle planner, and somebody who shows a needle."""
     assert console.state()["procedure"] is None
     assert console.state()["procedures"] == []  # the scene has no shape that one needs
-    told = MESSAGES.scene_message(1, read_scene("five_posts"))
+    told = wire.scene_message(1, read_scene("five_posts"))
     tell(graph, topics.SCENE, told, lambda: console.state()["procedures"] == ["slalom"], "what the scene allows")
     graph.add(NeedlePlannerNode, scene="dish_35mm", needle_length=0.0025, settle=0.0, pose_timeout=5.0)
     commands, holds = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.PROCEDURE_HOLD)
     later = int(1e9 * (time.time() + 3600.0))  # ns; late poses are refused, however slowly the test runs
-    pose = MESSAGES.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
+    pose = wire.pose_message(later, np.zeros(2), np.array([1.0, 0.0]))
     near = "goals: [{go_to: {position: [0.008, 0.0]}}]"
     refusal = asyncio.run(console.execute_procedure("resume", "", False))
     assert "no procedure" in refusal

@@ -22,8 +22,8 @@ from magnetosuture_msgs.msg import (
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes.console import messages
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import read_scene
+from test.nodes import wire
 
 STAMP = Time(sec=12)
 
@@ -34,7 +34,7 @@ def plain(told: Any) -> Any:
 
 
 def test_the_threads():
-    path = MESSAGES.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
+    path = wire.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
     assert plain(messages.measured_thread(path)) == [[0.0, 0.001], [0.002, 0.003]]
     message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
     assert plain(messages.predicted(message)) == {
@@ -125,7 +125,7 @@ def test_margins_of_a_node_that_no_thread_has_are_refused(node: int):
 
 def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
     scene = read_scene("hernia_ring")
-    heard = messages.scene(MESSAGES.scene_message(STAMP, scene))
+    heard = messages.scene(wire.scene_message(STAMP, scene))
     assert messages.shown_scene(scene) == heard
     assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
 

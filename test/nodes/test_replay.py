@@ -17,8 +17,8 @@ from rclpy.serialization import serialize_message
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
 from magnetosuture_thread.nodes import player, topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.player import LiveReplay, Losses, Timeline
+from test.nodes import wire
 from test.nodes.margins import no_margins
 
 
@@ -97,7 +97,7 @@ class Recorded:
     def data(self) -> bytes:
         """Return its bytes."""
         stamp = Time(sec=self.time // 10**9, nanosec=self.time % 10**9)
-        return serialize_message(MESSAGES.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
+        return serialize_message(wire.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
 
 
 def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pytest.MonkeyPatch):

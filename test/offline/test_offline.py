@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread.bags.message_types import MESSAGES, make, typestore
+from magnetosuture_thread.bags.message_types import MESSAGES as BUILDER
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
@@ -36,8 +37,9 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
-from magnetosuture_thread.messages.packing import packed_margins, packed_prediction
+from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
 from magnetosuture_thread.messages.reading import margins_of, read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
@@ -284,7 +286,7 @@ def test_poses_may_wait_for_their_thread(pose_bag: Path):
 @pytest.mark.parametrize("count", [0, 1, 2, 64])
 def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     points = np.random.default_rng(count).normal(size=(count, 2))
-    message = MESSAGES.path_message(5 * 10**9 + 7, points)
+    message: Any = typestore().deserialize_cdr(packed_path(5 * 10**9 + 7, points), MEASURED_THREAD.type_name)
     for pose in message.poses:
         pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
     data = bytes(typestore().serialize_cdr(message, MEASURED_THREAD.type_name))
@@ -303,8 +305,7 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
 def test_poses_are_read_as_a_node_gets_them():
     heading = np.array([np.cos(2.5), np.sin(2.5)])
     covariance = np.diag([4e-10, 4e-10, 9e-6])
-    message = MESSAGES.pose_message(10**9, np.array([1e-3, -2e-3]), heading, covariance)
-    data = bytes(typestore().serialize_cdr(message, NEEDLE_POSE.type_name))
+    data = packed_pose(10**9, np.array([1e-3, -2e-3]), heading, covariance)
     given = RecordedMessage(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
     tail, along, deviation = read_pose(given)
     assert tail.tolist() == [1e-3, -2e-3]
@@ -321,7 +322,7 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
     assert margins is not None
     store = typestore()
     for material in ("polyamide_7_0", "", "x", "xyz"):
-        data = packed_prediction((12, 34), prediction, material)
+        data = packed_prediction(12_000_000_034, prediction, material)
         message: Any = store.deserialize_cdr(data, PREDICTED_THREAD.type_name)
         assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
         assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
@@ -330,7 +331,7 @@ def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
         assert np.array_equal(message.strain, prediction.strain)
     squeezed = Friction(FrictionState.SLIDING, (2, 5, 6), 0.729)
     for given in (margins, replace(margins, in_contact=(3, 4)), replace(margins, friction=squeezed), None):
-        data = packed_margins((0, 7), given, "" if given else "for a reason", "" if given else "0123456789abcdef")
+        data = packed_margins(7, given, "" if given else "for a reason", "" if given else "0123456789abcdef")
         message = store.deserialize_cdr(data, MARGINS.type_name)
         assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
         assert message.valid == (given is not None)
@@ -362,7 +363,7 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
         for render_bag in source.records(set(source.topics)):
             writer.write(render_bag.topic, render_bag.time, render_bag.data)
         stamp = round(1.39e9)
-        writer.write_message(SCENE.recorded, stamp, MESSAGES.scene_message(stamp, wider))
+        writer.write(SCENE.recorded, stamp, packed_scene(stamp, wider))
     for start, found in ((0.0, 12), (0.5, 0)):
         seen = read_observations(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
@@ -384,12 +385,12 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
             writer.write(render_bag.topic, render_bag.time, render_bag.data)
         for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
-            message = MESSAGES.scene_message(stamp, told)
+            message: Any = typestore().deserialize_cdr(packed_scene(stamp, told), SCENE.type_name)
             message.version = version or message.version
             writer.write_message(SCENE.recorded, stamp, message)
         silk = make(
             MATERIAL.type_name,
-            header=MESSAGES.header(stamp),
+            header=BUILDER.header(stamp, "dish"),
             name="silk_6_0",
             diameter=0.0,
             elastic_modulus=0.0,

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.interface import GROUND_TRUTH_PULL, NEEDLE_POSE
+from magnetosuture_thread.messages.packing import packed_pose, packed_wrench
 from magnetosuture_thread.offline.observations import ObservationReader
 from magnetosuture_thread.setups import read_setup
 
@@ -23,13 +23,13 @@ def test_the_true_pull_comes_with_the_pose_of_its_stamp(tmp_path: Path):
         for channel in (NEEDLE_POSE, GROUND_TRUTH_PULL):
             bag.add_topic(channel.recorded, channel.type_name)
         for k, stamp in enumerate(stamps):
-            pose = MESSAGES.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0]))
-            bag.write_message(NEEDLE_POSE.recorded, stamp, pose)
-            pull = MESSAGES.wrench_message(stamp, np.array([1e-6 * k, math.nan if k == 1 else -2e-6]), 3e-9)
+            pose = packed_pose(stamp, np.zeros(2), np.array([1.0, 0.0]))
+            bag.write(NEEDLE_POSE.recorded, stamp, pose)
+            pull = packed_wrench(stamp, np.array([1e-6 * k, math.nan if k == 1 else -2e-6]), 3e-9)
             if k == 2:
-                pull.header.frame_id = "elsewhere"
+                pull = pull.replace(b"dish", b"else")
             if k < 3:
-                bag.write_message(GROUND_TRUTH_PULL.recorded, stamp, pull)
+                bag.write(GROUND_TRUTH_PULL.recorded, stamp, pull)
     reader = ObservationReader(
         Recording(Bag(tmp_path / "bag")), read_setup("petri_35mm_polyamide"), "poses", 0.0, None, lambda share: None
     )

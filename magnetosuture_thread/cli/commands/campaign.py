@@ -22,8 +22,6 @@ def add(subparsers: Subparsers) -> None:
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     option("--follower", action="store_true", help="run the setup's path follower instead, for comparison")
-    follows = "follow paths by the path tracker, or by model predictive control (default: tracking)"
-    option("--local", choices=("tracking", "predictive"), default="tracking", help=follows)
     bags = "seeds whose runs are recorded as bags (default: none)"
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
     workers = count_argument("processes", 1, 256)
@@ -56,7 +54,6 @@ def run_campaign(options: argparse.Namespace) -> int:
             setup=options.setup,
             camera=options.camera,
             follower=options.follower,
-            local=options.local,
             bags=options.bags,
             workers=options.workers,
             scheduler=options.scheduler,

@@ -257,7 +257,7 @@ def run_coils(options: argparse.Namespace) -> int:
     The same by any ROS 2 tool: services coils/arm (std_srvs/SetBool), coils/emergency_stop and coils/reset
     (std_srvs/Trigger).
     """
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
 
     log = make_log(make_console())
     with CoilClient(options.namespace) as client:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.correction import (
     CORRECTED,
-    NO_ROOM,
     CorrectionBuffers,
     MeasuredPoints,
     correct,
@@ -84,11 +83,8 @@ class Corrector:
         self.work.known[[0, *predictor.fixed_nodes]] = True
         self._solver = BandedSolver()
         self._last: tuple[Points, MeasuredPoints, Vector, tuple[float, float], float]
-        self._use(StepBuffers.of(nodes, 2, 3 * thread.segments + 1, 2 * nodes))
-
-    def _use(self, buffers: StepBuffers) -> None:
-        self._buffers = buffers
-        self.solver_buffers: SolverBuffers = self._solver.buffers(self._segments + 1, 2, len(buffers.first))
+        self._buffers = StepBuffers.of(nodes, 2, 3 * thread.segments + 1)
+        self.solver_buffers: SolverBuffers = self._solver.buffers(nodes, 2, len(self._buffers.first))
 
     def solve(
         self,
@@ -113,29 +109,26 @@ class Corrector:
         """
         rod = self._formulation.rod
         stiffness = rod.bending_stiffness / (rod.drag_across * self._unit**4)
-        while True:
-            code, solves, off, residuals, scale = correct(
-                (0, 1),
-                rod,
-                self._buffers,
-                self._formulation.workspace.data,
-                self.solver_buffers,
-                self.work,
-                start,
-                np.ascontiguousarray(heading, dtype=np.float64),
-                density,
-                noise,
-                self._length,
-                stiffness,
-                points,
-                weights,
-                end,
-                RESIDUAL_TOLERANCE,
-            )
-            if code != NO_ROOM:
-                self._last = (start, points, weights, end, scale)
-                return CorrectionResult(solves, off, max(residuals), code == CORRECTED and off <= 1.0)
-            self._use(self._buffers.enlarged())
+        code, solves, off, residuals, scale = correct(
+            (0, 1),
+            rod,
+            self._buffers,
+            self._formulation.workspace.data,
+            self.solver_buffers,
+            self.work,
+            start,
+            np.ascontiguousarray(heading, dtype=np.float64),
+            density,
+            noise,
+            self._length,
+            stiffness,
+            points,
+            weights,
+            end,
+            RESIDUAL_TOLERANCE,
+        )
+        self._last = (start, points, weights, end, scale)
+        return CorrectionResult(solves, off, max(residuals), code == CORRECTED and off <= 1.0)
 
     def sensitivities(self, sensitivities: NDArray[np.float64]) -> CorrectedSensitivities:
         """Return what the last correction makes of derivatives of the nodes, shape (p, n + 1, 2) [D]."""

@@ -36,13 +36,13 @@ from magnetosuture_thread.interface import (
     RESUME_PROCEDURE,
 )
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_header, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console import messages
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
 
@@ -304,12 +304,12 @@ class ConsoleGraph:
     def publish_velocity(self, velocity: tuple[float, float]) -> None:
         """Publish an operator velocity command; nothing while commands are blocked."""
         if not self.blocked:
-            self._commands.publish(MESSAGES.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
+            self._commands.publish(packed_twist(self.now().to_msg(), np.asarray(velocity, dtype=float)))
 
     def publish_hold(self) -> None:
         """Publish that the page is held; nothing while commands are blocked."""
         if not self.blocked:
-            self._holds.publish(MESSAGES.header(self.now().to_msg()))
+            self._holds.publish(packed_header(self.now().to_msg()))
 
     async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
         """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""

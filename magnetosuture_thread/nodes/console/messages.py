@@ -24,7 +24,7 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
-from magnetosuture_thread.messages.forecasts import forecast_events
+from magnetosuture_thread.messages.markers import forecast_events
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text

@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from magnetosuture_thread.evaluation.plots import FAINT, INK, tidy
-from magnetosuture_thread.evaluation.scene_plot import shape_patch
+from magnetosuture_thread.evaluation.plots import FAINT, INK, shape_patch, tidy
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.margins import Friction, FrictionState, friction_colour
 from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, SteeredInstant

@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.dish.robust_fits import fit_circle
-from magnetosuture_thread.vision.sampling import middle, rim_along_rays
+from magnetosuture_thread.vision.sampling import middle, within
 
-RAYS = 180
+RAYS, RIM_RAYS = 180, 72  # along which the rim is looked for, and of the quick check
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
-SHARE_OF_CUT_RAYS, MIN_INSIDE = 0.75, 0.4  # of the rays in the frame, where the dish is cut off; that these are of all
-GUESS_REACH = 0.12  # of the radius, in which the rim is looked for by a first guess
+GUESS_REACH, REACH = 0.12, 0.04  # of the radius, in which the rim is looked for by a first guess, and once it is known
 AGREEMENT_PX = 2.0
-GUESS_SIDES = (60, 120)  # the first guess is made in images of about this many rows; the second only if the first fails
 EDGE_LEVEL = 60  # of the circle transform, as of Canny's upper threshold; the lower one is half of it
-MAX_EDGE_SHARE = 0.3  # of the pixels; where more are edges all is texture, in which circles agree by chance
-MIN_CONTRAST = 12.0  # grey levels
-CONTRAST = 0.15  # of the floor's brightness, at least, between floor and rim
-SATURATED, SATURATED_SHARE = 253, 0.15  # grey level, and share of a ring on the floor
-INNER_SIDE = 0.7  # of the diameter: of a square within the dish
-BAND = 0.02  # of the radius: beyond the inner edge, the rim is darkest within
-REACH = 0.04  # of the radius, in which the rim is looked for once it is known
-RIM_RAYS = 72  # of the quick check
-RIM_REACH_PX = 7.0  # how far the quick check looks in and out
-STILL_PX = 1.0  # a rim seen this near to where it was stands still
-RIM_SHARE = 0.4  # of the quick check's rays must see the rim
-
+MIN_CONTRAST, CONTRAST = 12.0, 0.15  # grey levels, and share of the floor's brightness, of the rim at least
+STILL_PX = 1.0  # a rim this near to where it was stands still
+RIM_SHARE = 0.4  # of the quick check's rays must meet the rim
 
 Guess = tuple[float, float, float]  # u, v and radius of a circle [px]
 
@@ -49,7 +40,7 @@ def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None
         The view, or None if no dish is seen: too few rays agree on a circle.
     """
     guesses = {} if guesses is None else guesses
-    for side in GUESS_SIDES:
+    for side in (60, 120):  # rows of the small image; the second only if the first fails
         if side not in guesses:
             guesses[side] = _first_guess(gray, side)
         guess = guesses[side]
@@ -99,7 +90,7 @@ def find_cut_dish(gray: np.ndarray, guess: Guess | None, diameter: float) -> Dis
     rim = np.array([u, v]) + radius * np.column_stack([np.cos(turns), np.sin(turns)])
     inside = ((rim > 0.0) & (rim < np.array(gray.shape[::-1]) - 1.0)).all(axis=1).sum()
     ring = _fit_circle(darkest, 0.5 * AGREEMENT_PX)
-    if ring is None or ring[3] < SHARE_OF_CUT_RAYS * inside or inside < MIN_INSIDE * RAYS:
+    if ring is None or ring[3] < 0.75 * inside or inside < 0.4 * RAYS:
         return None
     # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
     radius = middle(np.hypot(*(edges - ring[:2]).T))
@@ -118,7 +109,7 @@ def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> t
         How far the rim's darkest ring has moved since, a median over the rays that see it, turned into a
         shift of its centre [px], and how many of the `RIM_RAYS` rays see it.
     """
-    edges, darkest = _edge_points(gray, *centre, radius, RIM_REACH_PX, 1.0, RIM_RAYS)
+    edges, darkest = _edge_points(gray, *centre, radius, 7.0, 1.0, RIM_RAYS)
     seen = darkest if len(darkest) >= len(edges) // 2 else edges
     if len(seen) < 8:
         return 0.0, len(seen)
@@ -141,8 +132,8 @@ def _first_guess(gray: np.ndarray, rows: int) -> Guess | None:
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
     size = (gray.shape[1] // factor, gray.shape[0] // factor)
     small = cv2.resize(half, size, interpolation=cv2.INTER_AREA)
-    if np.count_nonzero(cv2.Canny(small, EDGE_LEVEL // 2, EDGE_LEVEL)) > MAX_EDGE_SHARE * small.size:
-        return None
+    if np.count_nonzero(cv2.Canny(small, EDGE_LEVEL // 2, EDGE_LEVEL)) > 0.3 * small.size:
+        return None  # All is texture, in which circles agree by chance.
     minimum = min(small.shape)
     circles = cv2.HoughCircles(
         small,
@@ -166,8 +157,8 @@ def _edge_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return where rays from the centre meet the rim's inner edge, and its darkest ring, both of shape (m, 2)."""
     edges, darkest = np.empty((rays, 2)), np.empty((rays, 2))
-    band = max(4.0, BAND * radius)
-    counts = rim_along_rays(gray, (u, v, radius), reach, step, band, MIN_CONTRAST, CONTRAST, edges, darkest)
+    band = max(4.0, 0.02 * radius)
+    counts = rim_along_rays(gray, (u, v, radius), reach, step, band, edges, darkest)
     return edges[: counts[0]], darkest[: counts[1]]
 
 
@@ -185,7 +176,7 @@ def rim_points(gray: np.ndarray, centre: tuple[float, float], radius: float) -> 
 
 def floor_level(gray: np.ndarray, view: DishView, diameter: float) -> float:
     """Return how bright a dish's floor is, as the median of a square within it."""
-    half = 0.5 * INNER_SIDE * diameter / view.metres_per_pixel
+    half = 0.35 * diameter / view.metres_per_pixel
     left, top = (max(0, round(centre - half)) for centre in view.centre_px)
     right, bottom = (max(4, round(centre + half)) for centre in view.centre_px)
     return middle(gray[top:bottom:4, left:right:4])
@@ -196,7 +187,7 @@ def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
     angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
     at = np.column_stack([u + 0.93 * radius * np.cos(angles), v + 0.93 * radius * np.sin(angles)])
     columns, rows = np.clip(at.round().astype(int), 0, np.array(gray.shape[::-1]) - 1).T
-    return float(np.mean(gray[rows, columns] >= SATURATED)) > SATURATED_SHARE
+    return float(np.mean(gray[rows, columns] >= 253)) > 0.15
 
 
 def _fit_circle(points: np.ndarray, agreement: float) -> tuple[float, float, float, int] | None:
@@ -204,3 +195,126 @@ def _fit_circle(points: np.ndarray, agreement: float) -> tuple[float, float, flo
     circle = np.empty(3)
     agreeing = fit_circle(points, agreement, circle)
     return (float(circle[0]), float(circle[1]), float(circle[2]), agreeing) if agreeing else None
+
+
+@compiled
+def fit_circle(points, agreement, circle):
+    """Fit a circle by least squares, leaving out what is far from it.
+
+        minimise  sum (x^2 + y^2 - 2 u x - 2 v y - c)^2,    r^2 = c + u^2 + v^2
+
+    three times, over the points within 8, 3 and 1 times an agreement of the last circle.
+
+    Args:
+        points: shape (m, 2) [px].
+        agreement: how far a point may be from the circle [px].
+        circle: filled with u, v and r, shape (3,) [px].
+
+    Returns:
+        How many points agree; 0 if too few do.
+    """
+    kept = np.ones(len(points), np.bool_)
+    system, right = np.empty((3, 3)), np.empty(3)
+    count = len(points)
+    for tolerance in (8.0 * agreement, 3.0 * agreement, agreement):
+        if count < 20:
+            return 0
+        # Around the mean, where the normal equations are well conditioned.
+        mean_u = mean_v = 0.0
+        for index in range(len(points)):
+            if kept[index]:
+                mean_u += points[index, 0] / count
+                mean_v += points[index, 1] / count
+        system[:], right[:] = 0.0, 0.0
+        for index in range(len(points)):
+            if not kept[index]:
+                continue
+            x, y = points[index, 0] - mean_u, points[index, 1] - mean_v
+            z = x * x + y * y
+            system[0, 0] += 4.0 * x * x
+            system[0, 1] += 4.0 * x * y
+            system[1, 1] += 4.0 * y * y
+            right[0] += 2.0 * x * z
+            right[1] += 2.0 * y * z
+            right[2] += z
+        system[1, 0], system[2, 2] = system[0, 1], count  # the sums of x and y are 0
+        u, v, rest = np.linalg.solve(system, right)
+        radius = np.sqrt(max(rest + u * u + v * v, 0.0))
+        u, v = u + mean_u, v + mean_v
+        count = 0
+        for index in range(len(points)):
+            away = np.hypot(points[index, 0] - u, points[index, 1] - v)
+            kept[index] = abs(away - radius) < tolerance
+            count += kept[index]
+    circle[0], circle[1], circle[2] = u, v, radius
+    return count
+
+
+@compiled
+def _small_median(values, count, ordered):
+    """Return the median of the first few of some values, put in order into `ordered`, shape (count,)."""
+    for index in range(count):
+        place = index
+        while place > 0 and ordered[place - 1] > values[index]:
+            ordered[place] = ordered[place - 1]
+            place -= 1
+        ordered[place] = values[index]
+    return 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
+
+
+@compiled
+def rim_along_rays(gray, circle, reach, step, band, edges, darkest):
+    """Find a dish's rim along rays from its centre.
+
+    Args:
+        gray: shape (rows, columns), uint8.
+        circle: u, v and radius, about [px].
+        reach: how far inside and outside of the radius to look [px].
+        step: between samples [px].
+        band: how far beyond its inner edge the rim is darkest [px].
+        edges: filled with where the light falls half-way to the rim's dark, shape (rays, 2).
+        darkest: filled with the rim's darkest points, shape (rays, 2).
+
+    Returns:
+        How many edges were found, and how many darkest points.
+    """
+    u, v, radius = circle
+    rays, count = len(edges), int(2.0 * reach / step)
+    profile = np.empty(count)
+    ahead = int(band / step) + 1
+    edge_count, dark_count = 0, 0
+    inner = max(3, count // 8)
+    ordered = np.empty(inner)
+    for ray in range(rays):
+        angle = 2.0 * math.pi * ray / rays
+        x, y = math.cos(angle), math.sin(angle)
+        for index in range(count):
+            r = radius - reach + index * step
+            profile[index] = within(gray, u + r * x, v + r * y)
+        inside = _small_median(profile, inner, ordered)
+        dark = profile.min()
+        if inside - dark < max(MIN_CONTRAST, CONTRAST * inside):
+            continue
+        half, index = 0.5 * (inside + dark), 0
+        while profile[index] >= half:
+            index += 1
+        if index == 0:
+            continue
+        part = (profile[index - 1] - half) / (profile[index - 1] - profile[index])
+        r = radius - reach + (index - 1 + part) * step
+        edges[edge_count, 0], edges[edge_count, 1] = u + r * x, v + r * y
+        edge_count += 1
+        end = min(index + ahead, count - 1)
+        lowest = index
+        for other in range(index, end + 1):
+            if profile[other] < profile[lowest]:
+                lowest = other
+        if 0 < lowest < end:
+            left, low, right = profile[lowest - 1], profile[lowest], profile[lowest + 1]
+            bend = left - 2.0 * low + right
+            # Beyond its darkest ring a rim is brighter again; a plain edge has no such ring.
+            if bend > 0.0 and profile[lowest : end + 1].max() > low + 0.5 * MIN_CONTRAST:
+                r = radius - reach + (lowest + 0.5 * (left - right) / bend) * step
+                darkest[dark_count, 0], darkest[dark_count, 1] = u + r * x, v + r * y
+                dark_count += 1
+    return edge_count, dark_count

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import Ellipse
 from magnetosuture_thread.vision.dish.find import RAYS, rim_points
-from magnetosuture_thread.vision.dish.rings import perspective_by_rings, second_ring
-from magnetosuture_thread.vision.dish.robust_fits import fit_rim
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
 ANGLE_ERROR = math.radians(2.0)  # by which light and noise change a tilt that is told
-SURE = 4.0  # standard deviations that an ellipse is off a circle at least
 NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 
 
@@ -28,18 +26,11 @@ class Tilt:
         angle: between its axis and the dish's normal [rad].
         direction: in the image, along which the dish looks shortened [rad], from u towards v.
         rotation: of the dish's x axis in the image [rad]; see `DishView`.
-        nearness: ratio of the dish's radius to its distance from the camera, positive if the side in the direction is
-            nearer; 0 where nothing tells.
-        nearness_error: standard deviation of it.
-        radius_px: of the dish in the image [px].
     """
 
     angle: float
     direction: float
     rotation: float = 0.0
-    nearness: float = 0.0
-    nearness_error: float = NEAR
-    radius_px: float = 1.0
 
     @property
     def direction_in_dish(self) -> np.ndarray:
@@ -50,7 +41,7 @@ class Tilt:
     def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
         """Return what perspective leaves unknown, shape (3, 3) [m, m, rad].
 
-        An ellipse alone does not tell which side is nearer; see `perspective_by_rings`.
+        An ellipse does not tell which side is nearer.
 
         Args:
             tail: in the dish frame, shape (2,) [m].
@@ -59,7 +50,7 @@ class Tilt:
         """
         along = self.direction_in_dish
         change = perspective(tail, heading, radius)
-        either = change @ (self.nearness_error / NEAR * math.tan(self.angle) * along)
+        either = change @ (math.tan(self.angle) * along)
         return np.outer(either, either) + unseen_tilt_covariance(tail, heading, ANGLE_ERROR, radius)
 
     @property
@@ -68,14 +59,10 @@ class Tilt:
         return f"the camera is tilted by {math.degrees(self.angle):.0f} degrees"
 
     def corrected(self, image: np.ndarray, view: DishView) -> np.ndarray:
-        """Return a frame as a straight camera would see it: the dish is a circle about its centre.
-
-        A point p of it, from the centre, is seen at A p / (1 - k sin t e . p / R), where A shortens along e by cos t.
-        """
+        """Return a frame in which the dish is a circle about its centre: stretched along the direction by 1 / cos."""
         along = np.array([math.cos(self.direction), math.sin(self.direction)])
         tilted = np.eye(3)
         tilted[:2, :2] += (math.cos(self.angle) - 1.0) * np.outer(along, along)
-        tilted[2, :2] = -self.nearness * math.sin(self.angle) / self.radius_px * along
         to_centre = np.array([[1.0, 0.0, view.centre_px[0]], [0.0, 1.0, view.centre_px[1]], [0.0, 0.0, 1.0]])
         inverse = to_centre @ tilted @ np.linalg.inv(to_centre)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -143,27 +130,63 @@ def find_tilt(gray: np.ndarray, view: DishView, diameter: float) -> tuple[Tilt |
     half = float(np.hypot(*shape))
     deviation = spread * math.sqrt(2.0 / count)
     angle = math.acos(min(1.0, (fitted[0] - half) / (fitted[0] + half)))
-    if angle < MIN_ANGLE or half < SURE * deviation:
+    if angle < MIN_ANGLE or half < 4.0 * deviation:
         return None, view
     # The greatest radius lies along the axis of the tilt, the least along the direction that is shortened.
     direction = 0.5 * math.atan2(float(shape[1]), float(shape[0])) + 0.5 * math.pi
     middle = (view.centre_px[0] + float(fitted[1]), view.centre_px[1] + float(fitted[2]))
     scale = view.metres_per_pixel * float(fitted[0]) / (float(fitted[0]) + half)
-    tilt, view = Tilt(angle, direction, view.rotation), DishView(middle, scale, view.rotation)
-    return _with_perspective(gray, fitted, tilt, view)
+    return Tilt(angle, direction, view.rotation), DishView(middle, scale, view.rotation)
 
 
-def _with_perspective(gray: np.ndarray, rim: np.ndarray, tilt: Tilt, view: DishView) -> tuple[Tilt, DishView]:
-    """Return a tilt that knows its nearer side, and the view about the dish's centre, where a second ring shows it."""
-    middle = np.array(view.centre_px)
-    ring = second_ring(gray, rim, middle, RAYS)
-    if ring is None:
-        return tilt, view
-    ratio, offset = ring
-    radius, along = float(rim[0]), np.array([math.cos(tilt.direction), math.sin(tilt.direction)])
-    found = perspective_by_rings(ratio, float(offset @ along), radius, tilt.angle, NEAR)
-    if found is None:
-        return tilt, view
-    u, v = middle - radius * found[0] * math.sin(tilt.angle) * math.cos(tilt.angle) * along
-    tilt = replace(tilt, nearness=found[0], nearness_error=found[1], radius_px=radius)
-    return tilt, replace(view, centre_px=(float(u), float(v)))
+@compiled
+def fit_rim(points, centre, min_points, rim):
+    """Fit harmonics to a rim about a centre, leaving out what is far from it.
+
+        r(t) = c_0 + c_1 cos t + c_2 sin t + c_3 cos 2t + c_4 sin 2t
+
+    by least squares, over the points within three standard deviations of the last fit.
+
+    Args:
+        points: on the rim, shape (m, 2) [px].
+        centre: u and v [px].
+        min_points: that have to agree.
+        rim: filled with c, shape (5,) [px].
+
+    Returns:
+        How many points agree, 0 if too few do, and the root mean square of their residuals [px].
+    """
+    total = len(points)
+    basis, away, residual = np.empty((total, 5)), np.empty(total), np.empty(total)
+    for index in range(total):
+        x, y = points[index, 0] - centre[0], points[index, 1] - centre[1]
+        away[index] = np.hypot(x, y)
+        cosine, sine = x / max(away[index], 1e-9), y / max(away[index], 1e-9)
+        basis[index, 0], basis[index, 1], basis[index, 2] = 1.0, cosine, sine
+        basis[index, 3], basis[index, 4] = cosine * cosine - sine * sine, 2.0 * sine * cosine
+    kept, count = np.ones(total, np.bool_), total
+    system, right = np.empty((5, 5)), np.empty(5)
+    for _ in range(4):
+        if count < min_points:
+            return 0, 0.0
+        system[:], right[:] = 0.0, 0.0
+        for index in range(total):
+            if kept[index]:
+                for i in range(5):
+                    right[i] += basis[index, i] * away[index]
+                    for j in range(5):
+                        system[i, j] += basis[index, i] * basis[index, j]
+        rim[:] = np.linalg.solve(system, right)
+        for index in range(total):
+            fitted = 0.0
+            for i in range(5):
+                fitted += basis[index, i] * rim[i]
+            residual[index] = abs(away[index] - fitted)
+        bound = max(0.3, 3.0 * 1.4826 * np.median(residual))
+        square, count = 0.0, 0
+        for index in range(total):
+            kept[index] = residual[index] < bound
+            if kept[index]:
+                square += residual[index] ** 2
+                count += 1
+    return count, np.sqrt(square / max(count, 1))

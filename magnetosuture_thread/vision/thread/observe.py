@@ -6,48 +6,49 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.images import Picture, Wall
-from magnetosuture_thread.vision.needle.erase import smooth_without_needle
 from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import (
     FAINTEST,
-    MIN_SHARE,
-    Appearance,
-    appearance_of,
-    deviations,
-    respaced,
-    strengths,
-    tangents_of,
-)
-from magnetosuture_thread.vision.thread.hiding import Hiding, find_hiding
-from magnetosuture_thread.vision.thread.order import Order, Piece, find_order
-from magnetosuture_thread.vision.thread.piece_ends import is_bare_beyond, why_it_ends
-from magnetosuture_thread.vision.thread.pieces import MIN_LENGTH_PX, find_pieces, fresh_parts
-from magnetosuture_thread.vision.thread.strands import (
     GAP_PX,
+    MIN_SHARE,
     OBJECT_GAP_PX,
     SPACING_PX,
+    Appearance,
+    Gray,
     Strand,
+    appearance_of,
     below_needle,
-    cut_where_met,
+    deviations,
     first_clear_of,
     gaps_of,
     parts_without,
+    respaced,
+    runs,
     strand_along,
-    without_hidden_end,
+    strengths,
+    tangents_of,
+)
+from magnetosuture_thread.vision.thread.centreline import smooth_without_needle
+from magnetosuture_thread.vision.thread.hiding import Hiding, find_hiding
+from magnetosuture_thread.vision.thread.order import Order, Piece, find_order
+from magnetosuture_thread.vision.thread.pieces import (
+    MIN_LENGTH_PX,
+    find_pieces,
+    fresh_parts,
+    is_bare_beyond,
+    why_it_ends,
 )
 
 LENGTH_TOLERANCE = 0.03  # of the thread's length, that a whole thread may be seen shorter or longer by
 LENGTH_ERROR = 0.01  # of an arc length: by noise along the walk
 END_ERROR_PX = 4.0  # of an arc length, by the places where pieces begin and end
 SCALE_ERROR = 0.001  # see `look`
-MAX_UNKNOWN = 24  # pieces of unknown place that are published
-WIDE, UNSURE = 0.6, 0.3  # confidence of a piece whose order is open, and of one whose direction is, too
+MEETS_PX = 6.0  # from another piece's end, where the way through a crossing isn't known
 
 
 def observe(
@@ -106,7 +107,9 @@ def observe(
     parts = parts_without(
         line, gaps_of(line.visible, GAP_PX, begin) | gaps_of(line.visible | below, OBJECT_GAP_PX, begin)
     )
-    begun = without_hidden_end(parts[0])
+    begun, shown = parts[0], np.flatnonzero(parts[0].visible)
+    if len(shown):
+        begun = begun.part(0, max(2, int(shown[-1]) + 1))
     known = [begun.points]
     for part in parts[1:]:  # beyond what the walk only guessed, where it may have gone around twice
         if part.visible.sum() > 1:
@@ -115,9 +118,26 @@ def observe(
             known += [each for each in fresh if len(each) > MIN_LENGTH_PX]
     remaining = length * (1.0 + LENGTH_TOLERANCE) - sum(float(arc_lengths(each)[-1]) for each in known)
     others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
-    strands = cut_where_met(begun, others)
+    strands = _cut_where_met(begun, others)
     strands += [strand_along(gray, thread, respaced(other, SPACING_PX)) for other in others]
     return _joined(picture, gray, thread, needle, hiding, strands, in_dish, length)
+
+
+def _cut_where_met(strand: Strand, others: list[Points]) -> list[Strand]:
+    """Cut the piece that leaves the needle where another piece begins on it: there the thread may go on along it."""
+    ends = np.array([end for other in others for end in (other[0], other[-1])]).reshape(-1, 2)
+    if not len(ends):
+        return [strand]
+    apart = np.hypot(*(strand.points[:, None] - ends[None]).transpose(2, 0, 1))
+    inside = arc_lengths(strand.points)
+    met = (apart.min(axis=1) < MEETS_PX) & (inside > MEETS_PX) & (inside < inside[-1] - 2.0 * MEETS_PX)
+    found = runs(met)
+    if not found:
+        return [strand]
+    parts = [strand.part(0, found[0][0])]
+    for (_, first), last in zip(found, [begin for begin, _ in found[1:]] + [len(met)], strict=True):
+        parts.append(strand.part(first, last))
+    return [parts[0], *(part for part in parts[1:] if len(part.points) * SPACING_PX > GAP_PX)]
 
 
 @dataclass(frozen=True)
@@ -141,7 +161,7 @@ class _Dish:
         """Return a piece; `arc_length` in pixels."""
         scale = self.view.metres_per_pixel
         points = self.view.to_dish(strand.points)
-        deviation = scale * deviations(self.thread, strand.strength, strand.visible, strand.points)
+        deviation = scale * deviations(self.thread, strand)
         if not self.scale_known:  # A wrong scale shifts what is far from the dish's centre.
             along = tangents_of(points)
             deviation = np.hypot(deviation, SCALE_ERROR * (points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
@@ -151,7 +171,7 @@ class _Dish:
 
 def _joined(
     picture: Picture,
-    gray: NDArray[np.uint8],
+    gray: Gray,
     thread: Appearance,
     needle: MeasuredNeedle,
     hiding: Hiding,
@@ -180,13 +200,13 @@ def _joined(
         if placed.index:
             low = max(0.0, low - LENGTH_ERROR * low - END_ERROR_PX)
             high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - pieces[placed.index].length))
-        confidence = 1.0 if not placed.index else order.share if placed in order.placed else WIDE
+        confidence = 1.0 if not placed.index else order.share if placed in order.placed else 0.6
         result.append(in_dish.piece(strand, first, last, (low, high), confidence))
     told = {placed.index for placed in (*order.placed, *order.wide)}
     nowhere = (math.nan, math.nan)
-    for number in sorted(set(range(len(strands))) - told)[:MAX_UNKNOWN]:
+    for number in sorted(set(range(len(strands))) - told)[:24]:
         first, last = ends[number]
-        result.append(in_dish.piece(strands[number], first, last, nowhere, UNSURE, direction_known=False))
+        result.append(in_dish.piece(strands[number], first, last, nowhere, 0.3, direction_known=False))
     alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(strands[0], length)
     outlines = [in_dish.view.to_dish(outline) for outline in hiding.outlines()]
     return ThreadObservation(tuple(result), alone, tuple(outlines))

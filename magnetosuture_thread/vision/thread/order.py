@@ -24,17 +24,14 @@ import numpy as np
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.thread.hiding import Hiding
+from magnetosuture_thread.vision.thread.pieces import end_direction
 
-DIRECTION_PX = 8.0  # of an end, over which its direction is measured
-DIRECTION_ERROR = 0.12  # rad; of that direction
+DIRECTION_ERROR = 0.12  # rad; of an end's direction
 TURNING = 60.0  # rad^2 / m; variance of a thread's tangent for each length
 MAX_PRICE = 12.0  # of one gap
 SURE = 4.0  # by which the price of every other order must be higher
 LEFT_OUT = 12.0  # price of a piece that is in no order
-LENGTH_DEVIATION = 0.15  # of a gap's length, that a thread hidden there may be longer or shorter by
-MAX_BARE_PX = 10.0  # of a gap's curve, that may lie on bare floor
 MAX_ORDERED = 6  # pieces; only the longest are tried in all orders
-BULGE = 0.5 * math.pi  # length over chord of a half circle, the longest way below what hides it
 
 
 @dataclass(frozen=True)
@@ -104,20 +101,6 @@ class _Gap:
 
 
 Step = tuple[int, bool]  # index of a piece, and whether it is turned
-
-
-def end_direction(points: Points) -> Points:
-    """Return the unit direction in which a polyline leaves at its last point, shape (2,)."""
-    at = arc_lengths(points)
-    first = int(np.searchsorted(at, at[-1] - DIRECTION_PX))
-    near = points[min(first, len(points) - 2) :]
-    if len(near) > 3:  # A parabola's tangent at its end: a bent thread turns on the way.
-        s = arc_lengths(near)
-        powers = np.vander(s - s[-1], 3)
-        direction = np.linalg.solve(powers.T @ powers, powers.T @ near)[1]
-    else:
-        direction = near[-1] - near[0]
-    return np.asarray(direction / max(float(np.hypot(*direction)), 1e-9))
 
 
 def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float], metres_per_pixel: float) -> Order:
@@ -215,7 +198,7 @@ def _price(
     if used and not oriented[chain[-1]].areas[1]:  # The thread ends in sight: it is known how much is hidden.
         hidden = sum(gap.length for gap in used)
         off = max(length[0] - seen - hidden, seen + hidden - length[1], 0.0)
-        price += min(0.5 * (off / (LENGTH_DEVIATION * hidden + 1.0)) ** 2, MAX_PRICE)
+        price += min(0.5 * (off / (0.15 * hidden + 1.0)) ** 2, MAX_PRICE)
     return price
 
 
@@ -234,7 +217,7 @@ def _gap(before: Piece, after: Piece, hiding: Hiding, turning: float) -> _Gap | 
         return None
     curve = _curve(start, end, leaving * chord, arriving * chord)
     bare = sum(hiding.area_at(point) == 0 for point in curve[1:-1]) * arc_lengths(curve)[-1] / len(curve)
-    if bare > MAX_BARE_PX:
+    if bare > 10.0:  # px of it may lie on bare floor
         return None
     return _Gap(price, chord, float(arc_lengths(curve)[-1]), curve)
 
@@ -265,6 +248,7 @@ def _placed(
         length, gap = lengths[chain[position - 1][0]], used[position - 1]
         later = sum(lengths[step[0]] for step in chain[position:]) + sum(each.chord for each in used[position:])
         low += length + gap.chord
-        high = max(low, min(high + length + BULGE * gap.length, longest - later))
+        # A half circle is the longest way below what hides it.
+        high = max(low, min(high + length + 0.5 * math.pi * gap.length, longest - later))
         result.append(Placed(index, turned, (low, high)))
     return tuple(result)

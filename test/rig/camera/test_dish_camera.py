@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 
 THREAD = np.array([[0.0, 0.0], [-0.005, 0.001], [-0.01, 0.0]])
 

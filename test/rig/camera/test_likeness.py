@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 
 SAMPLES = Path(__file__).parents[2] / "vision" / "samples"

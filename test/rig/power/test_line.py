@@ -12,10 +12,8 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.line import Line
-from magnetosuture_thread.rig.power.packets import checksum
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power.board import RoboClawBoard, checksum
+from magnetosuture_thread.rig.power.stage import Line, PowerStage
 
 QUESTION = bytes((128, 24))
 ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")

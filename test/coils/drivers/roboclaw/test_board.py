@@ -20,14 +20,10 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.drivers.roboclaw import board as board_module
-from magnetosuture_thread.coils.drivers.roboclaw import port as port_module
-from magnetosuture_thread.coils.drivers.roboclaw import protocol
-from magnetosuture_thread.coils.drivers.roboclaw.board import Board
-from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
+from magnetosuture_thread.coils.drivers.roboclaw.board import Board, DeviceError, ExchangePort
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.rig.power import packets
+from magnetosuture_thread.rig.power import board as packets
 from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.packets import checksum
 
 SUPPLY = packets.answer(128, packets.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
@@ -107,7 +103,7 @@ class Clock:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self._now = 100.0
-        patch.setattr(port_module, "time", SimpleNamespace(monotonic=lambda: self._now))
+        patch.setattr(board_module, "time", SimpleNamespace(monotonic=lambda: self._now))
 
     def hold_up(self) -> None:
         """Let more time go by than a board has for an answer."""
@@ -140,7 +136,7 @@ def give(made: Board, *currents: float) -> None:
 
 def whole_round(made: Board) -> None:
     """Ask everything once, and the first again."""
-    for _ in range(len(protocol.POLL_SEQUENCE) + 1):
+    for _ in range(len(board_module.POLL_SEQUENCE) + 1):
         made.poll()
 
 
@@ -148,15 +144,6 @@ def simulated(made: RoboClawBoard, step: float | None = None) -> Callable[[bytes
     """Return what answers as a board does; with a step, each packet comes so much later than the last [s]."""
     steps = itertools.count(1)
     return lambda packet: made.receive(packet, time.monotonic() if step is None else step * next(steps))
-
-
-def test_a_packet_goes_out_in_one_piece(port, monkeypatch):
-    written: list[bytes] = []
-    monkeypatch.setattr(ExchangePort, "_send", lambda _, data: written.append(data))
-    with pytest.raises(DeviceError):
-        board(port, hurries=True).write_zero()
-    packet = bytes((128, 34, 0, 0, 0, 0))
-    assert written == [packet + checksum(packet).to_bytes(2, "big")]
 
 
 def test_an_acknowledgement_that_came_too_late_is_not_one_for_the_next_command(peer, port):
@@ -208,14 +195,6 @@ def test_one_packet_may_get_lost(peer, port):
     assert len(peer.heard) == 3
 
 
-def test_nothing_is_tried_twice_in_a_hurry(peer, port):
-    wait_for(port, 0.5)
-    peer.answer(lambda _: b"")
-    with pytest.raises(DeviceError):
-        board(port, hurries=True).write_zero()
-    assert len(peer.heard) == 1
-
-
 def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
     peer.trickle(0.02)
     with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
@@ -250,8 +229,8 @@ def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_late
         stopped(size)
         return os.write(file, data)
 
-    monkeypatch.setattr(port_module, "select", SimpleNamespace(select=late_select))
-    monkeypatch.setattr(port_module, "_write", late_write)
+    monkeypatch.setattr(board_module, "select", SimpleNamespace(select=late_select))
+    monkeypatch.setattr(board_module, "_write", late_write)
     made.write(lambda: next(commanded))
     assert not there.timeline
     assert there.heard > expires
@@ -269,35 +248,8 @@ def test_an_answer_in_time_counts_though_the_interpreter_was_held_up(peer, port,
             clock.hold_up()
         return written
 
-    monkeypatch.setattr(port_module, "_write", held_up)
+    monkeypatch.setattr(board_module, "_write", held_up)
     board(port, hurries=True).write_zero()
-
-
-def test_of_an_answer_in_pieces_no_piece_is_lost_to_a_thread_that_was_held_up(peer, port, clock):
-    port.begin()
-    port.write(b"?")
-    os.write(peer.host, b"1234")
-    answer = port.read(1)
-    clock.hold_up()
-    assert answer + port.read(2) + port.read(3) + port.read(1) == b"1234"
-    assert os.read(peer.host, 100) == b"?"
-
-
-def test_a_packet_that_was_held_up_is_made_anew(peer, port, clock):
-    os.set_blocking(peer.host, False)
-    held_up = iter([True, False])
-
-    def send(_: int, value: int) -> bool:
-        if next(held_up):
-            clock.hold_up()
-        port.write(bytes((value,)))
-        return bool(port.read(1))
-
-    values, made = iter([(1,), (2,)]), board(port)
-    vars(made)["_drain"] = lambda: True
-    with pytest.raises(DeviceError):
-        made._exchange(send, lambda: next(values), bool)
-    assert os.read(peer.host, 100) == b"\x02"
 
 
 def test_a_line_without_room_for_a_packet_keeps_nobody(peer, port):
@@ -347,34 +299,6 @@ def test_a_lost_write_is_written_again_before_it_is_a_fault(peer, patient, port)
         whole_round(made)
 
 
-def test_a_current_is_counted_the_way_that_its_duty_goes(peer, patient, port):
-    there = RoboClawBoard()
-    peer.answer(simulated(there))
-    made = board(port)
-    made.configure()
-    deadline = time.monotonic() + 10.0
-    while abs(made.currents[1] + 6.0) > 0.05:
-        assert time.monotonic() < deadline
-        give(made, 3.0, -6.0)
-        made.poll()
-    assert made.currents == pytest.approx((3.0, -6.0), abs=0.05)
-
-
-def test_a_second_attempt_takes_what_is_newest(peer, port):
-    wait_for(port, 0.5)
-    replies = iter([b"", SUPPLY, b"\xff"])
-    peer.answer(lambda _: next(replies))
-    made = board(port)
-    made.voltage = 24.0
-    newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
-    made.write(lambda: next(newest))
-    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.SET_DUTIES] == [
-        struct.pack(">hh", 4095, -8191),
-        bytes(4),
-    ]
-    assert made.warnings == ()
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
@@ -400,7 +324,7 @@ def test_what_a_board_forgets_is_found_within_a_round(peer, patient, port, comma
 
 def spoken_to(made: Board, *currents: float, rounds: int = 5) -> tuple[str, ...]:
     """Return the warnings after some rounds of questions, with a write before each as the line does."""
-    for _ in range(rounds * len(protocol.POLL_SEQUENCE)):
+    for _ in range(rounds * len(board_module.POLL_SEQUENCE)):
         give(made, *currents)
         made.poll()
     return made.warnings
@@ -433,32 +357,6 @@ def test_a_warm_coil_has_no_broken_wire(peer, patient, port, warmth: float):
     assert made.currents == pytest.approx((4.0 / warmth, -4.0 / warmth), abs=0.02)
 
 
-def test_a_supply_that_is_too_low_breaks_no_wire(peer, patient, port):
-    peer.answer(simulated(RoboClawBoard(supply=6.0, resistance=2.0), 0.005))
-    made = Board(port, 0, 128, "board 0", CoilBridgeSettings(coil_resistance=2.0), lambda: False)
-    made.configure()
-    assert spoken_to(made, 8.0, 0.0) == ("board 0: a supply of 6 V is too low for the currents",)
-
-
-def test_a_slow_coil_that_is_turned_round_again_and_again_has_no_broken_wire(peer, patient, port):
-    there = RoboClawBoard(inductance=0.05)
-    peer.answer(simulated(there, 0.005))  # 10 ms for a write and a question
-    made = board(port)
-    made.configure()
-    low = 0
-    for at in range(300):
-        give(made, *((4.0, -4.0) if at // 20 % 2 else (-4.0, 4.0)))
-        made.poll()
-        low += max(abs(current) for current in made.currents) < 2.0
-        assert made.warnings == ()
-    assert low > 30  # a few measurements in a row did fall short
-
-
-def test_a_port_is_locked(peer, port):
-    with pytest.raises(DeviceError, match="is held by another process"):
-        ExchangePort(peer.path, 115200, ANSWER_TIMEOUT)
-
-
 def test_what_is_no_port_is_named(tmp_path, monkeypatch):
     def forbid(*_: object) -> int:
         raise PermissionError(errno.EACCES, "denied")
@@ -472,13 +370,3 @@ def test_what_is_no_port_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot open"):
         ExchangePort(str(tmp_path / "file"), 115200, ANSWER_TIMEOUT)
-
-
-def test_a_broken_wire_of_the_second_board_has_the_number_of_its_coil(peer, patient, port):
-    there = RoboClawBoard()
-    peer.answer(simulated(there, 0.005))
-    settings = CoilBridgeSettings(driver_timeout=0.2, max_speed=0.005)
-    made = Board(port, 1, 128, "board 1", settings, lambda: False)
-    made.configure()
-    there.broken.add(1)
-    assert spoken_to(made, 4.0, -4.0) == ("coil 3: 0.00 A measured, -4.00 A commanded",)
