@@ -17,8 +17,8 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "campaign/report/page.html",
-            "campaign/report/page.css",
+            "campaign/page.html",
+            "campaign/page.css",
             "evaluation/report/page.html",
             "evaluation/report/page.css",
             "evaluation/report/page.js",

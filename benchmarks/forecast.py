@@ -33,8 +33,7 @@ from magnetosuture_thread import (
     ThreadPredictor,
 )
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.run import run_procedure
-from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.campaign.run import run_procedure, vary
 from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.errors import ConfigurationError

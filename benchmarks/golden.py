@@ -68,7 +68,8 @@ def _save_bag(folder: Path, target: Path) -> None:
             values[f"{connection.topic} stamp"].append(np.array([stamp], np.float64))
             for name, numbers in _numbers(reader.deserialize(data, connection.msgtype), connection.topic):
                 values[name].append(numbers)
-    np.savez_compressed(target, **{name.replace("/", "|"): np.concatenate(v) for name, v in values.items()})
+    arrays: dict[str, Any] = {name.replace("/", "|"): np.concatenate(v) for name, v in values.items()}
+    np.savez_compressed(target, **arrays)
 
 
 def _record_bags(into: Path, _: argparse.Namespace) -> None:
@@ -161,8 +162,8 @@ def _differences(old: Path, new: Path) -> Iterator[str]:
             if not same and not any(word in name for word in TIMES):
                 yield f"{name}: {a!r}, {b!r} now"
     else:
-        lines = (path.read_text().splitlines() for path in (old, new))
-        yield from list(difflib.unified_diff(*lines, lineterm="", n=0))[2:]
+        a, b = (path.read_text().splitlines() for path in (old, new))
+        yield from list(difflib.unified_diff(a, b, lineterm="", n=0))[2:]
 
 
 def _compare(old: Path, new: Path) -> int:

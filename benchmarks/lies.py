@@ -23,7 +23,7 @@ from rich.table import Table
 
 from benchmarks.keep_out import World
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.campaign.run import vary
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import read_setup
 

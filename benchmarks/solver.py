@@ -88,7 +88,8 @@ def run_case(case: Case, solver: Solver) -> tuple[SpyingSolver, Points]:
 
 def timed(calls: Sequence[Callable[[], Any]], budget: float) -> tuple[NDArray[np.float64], list[Any]]:
     """Make calls in their order, until a budget [s] is spent; return their durations [s] and results."""
-    durations, results = [], []
+    durations: list[int] = []
+    results: list[Any] = []
     gc.collect()
     gc.disable()
     try:

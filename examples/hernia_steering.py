@@ -15,8 +15,7 @@ import numpy as np
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.messages.packing import packed_twist
-from magnetosuture_thread.reproduce.hernia.replay import start_centreline
-from magnetosuture_thread.reproduce.hernia.steering import RATE, SteeredThread, point_filter
+from magnetosuture_thread.reproduce.hernia import RATE, SteeredThread, point_filter, start_centreline
 from magnetosuture_thread.setups import read_setup
 
 BAG = Path(__file__).parent / "hernia_steering"

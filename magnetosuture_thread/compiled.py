@@ -25,6 +25,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
 _COUNTED: dict[str, Any] = {"_nrt": True, "no_cfunc_wrapper": True}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False, "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {**_UNCOUNTED, "no_cpython_wrapper": True}
 _EVENTS = cast(Any, event)  # without types
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
@@ -62,7 +63,7 @@ def compiled_inner(function: _Function) -> _Function:
 
     Without an entry for Python, which takes apart each array of a tuple, a kernel compiles several times as fast.
     """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", no_cpython_wrapper=True, **_UNCOUNTED)(function))
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_INNER)(function))
 
 
 def compiled_without_gil(function: _Function) -> _Function:

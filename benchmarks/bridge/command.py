@@ -77,8 +77,8 @@ class ZeroDelays:
     def of(cls, event: str, delays: Sequence[float], bound: float) -> ZeroDelays:
         """Return the percentiles of some delays [s], of at least one."""
         found = np.array(delays)
-        percentiles = [float(value) for value in np.percentile(found, [50.0, 99.0, 100.0])]
-        return cls(event, len(found), *percentiles, bound, int(np.sum(found > bound)))
+        median, p99, greatest = np.percentile(found, [50.0, 99.0, 100.0]).tolist()
+        return cls(event, len(found), median, p99, greatest, bound, int(np.sum(found > bound)))
 
 
 class BridgeBench:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -26,6 +26,9 @@ from magnetosuture_thread.cli.arguments import whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.processes import NodeProcesses
 
 DELAY, LOSS = 0.05, 0.05  # s, and share of packets
 SETUP = "petri_35mm_polyamide"
@@ -110,16 +113,19 @@ class RigWatch:
         since: when it began to do so without a pause of `DRIVEN_TIME` [s].
         armed: whether the bridge is armed.
         reasons: why the currents are zero.
+
+    Args:
+        processes: none of which may end.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, processes: Sequence[NodeProcesses]) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
         from magnetosuture_thread.nodes import topics
         from magnetosuture_thread.nodes.node import GuardedNode
 
-        self._context = rclpy.Context()
+        self._processes, self._context = processes, rclpy.Context()
         rclpy.init(context=self._context, args=[])
         self._node = GuardedNode("rig_watch", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -141,9 +147,7 @@ class RigWatch:
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=min(left, 0.02))
 
-    def wait(
-        self, condition: Callable[[], bool], what: str, check: Callable[[], Any], timeout: float = TIMEOUT
-    ) -> None:
+    def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
         """Take what comes until a condition holds.
 
         Raises:
@@ -151,7 +155,8 @@ class RigWatch:
         """
         end = time.monotonic() + timeout
         while not condition():
-            check()
+            for each in self._processes:
+                each.check()
             if time.monotonic() > end:
                 raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
             self._executor.spin_once(timeout_sec=0.02)
@@ -178,17 +183,16 @@ class TwoHostBench:
     Args:
         hosts: the rig's and the desk's.
         watch: of the bridge.
-        check: raises if a node has ended.
     """
 
-    def __init__(self, hosts: TwoHosts, watch: RigWatch, check: Callable[[], Any]) -> None:
-        self._hosts, self._watch, self._check = hosts, watch, check
+    def __init__(self, hosts: TwoHosts, watch: RigWatch) -> None:
+        self._hosts, self._watch = hosts, watch
         self._random = random.Random(1)
 
     def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
         """Pull the cable at random moments."""
         self._hosts.impair(report.delay, report.loss)
-        self._watch.wait(self._watch.is_driven, "the coils are not driven", self._check, START_TIMEOUT)
+        self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
         report.driven, report.megabits = self._measure_traffic()
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
@@ -197,9 +201,9 @@ class TwoHostBench:
 
     def _cut(self, report: CutReport, stops: bool) -> None:
         watch = self._watch
-        watch.wait(watch.is_driven, "the coils are not driven", self._check)
+        watch.wait(watch.is_driven, "the coils are not driven")
         watch.spin(self._random.uniform(0.0, PULL_DELAY))
-        watch.wait(lambda: time.time() - watch.driven < RECENT, "the coils are not driven", self._check)
+        watch.wait(lambda: time.time() - watch.driven < RECENT, "the coils are not driven")
         self._hosts.pull()
         pulled = time.time()
         watch.spin(self._random.uniform(*PULLED_TIME))
@@ -214,7 +218,7 @@ class TwoHostBench:
             report.stops_kept += not self._is_driven_within(STILL_TIME) and not watch.armed
             _press("reset", "arm")
         else:
-            watch.wait(lambda: watch.driven > plugged, "the coils are not driven again", self._check)
+            watch.wait(lambda: watch.driven > plugged, "the coils are not driven again")
             report.resumed.append(watch.driven - plugged)
 
     def _is_driven_within(self, duration: float) -> bool:
@@ -264,9 +268,9 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
                 AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=hosts.at_the_desk
             ) as desk,
         ):
-            watch = RigWatch()
+            watch = RigWatch((rig, desk))
             try:
-                bench = TwoHostBench(hosts, watch, lambda: [each.check() for each in (rig, desk)])
+                bench = TwoHostBench(hosts, watch)
                 for delay, loss, cuts in filter(lambda network: network[2], networks):
                     log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
                     reports.append(CutReport(delay, loss))

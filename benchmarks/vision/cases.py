@@ -448,26 +448,6 @@ def _glare_thread(random: Random) -> Case | None:
 
 
 @tried
-def _below_needle(random: Random) -> Case | None:
-    """Return a thread that comes back and lies below its needle for a part of the needle's length."""
-    needle = random_needle(random, within=0.011)
-    side, low, high = random.choice((-1.0, 1.0)), random.uniform(0.15, 0.35), random.uniform(0.5, 0.8)
-    (enter, leave), (way_in, way_out) = needle.axis(np.array([low, high]))
-    aside = side * np.array([-way_in[1], way_in[0]])
-    back = -unit_vector(needle.heading)
-    knots = [needle.tail, needle.tail + 0.9e-3 * back, needle.tail + 2.2e-3 * back - 1.2e-3 * aside]
-    knots += [needle.tail + 1.2e-3 * back - 3.0e-3 * aside, enter - 1.6e-3 * aside - 0.6e-3 * way_in]
-    knots += [enter, leave, leave + 1.6e-3 * side * np.array([-way_out[1], way_out[0]]) + 1.0e-3 * way_out]
-    line = smooth_line(np.array(knots))
-    leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-    line = np.vstack([line, winding_line(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
-    hidden = needle.distances(line[::4][8:]) < 0.5 * needle.width
-    if is_inside(line) and 4 * TURN_STEP * hidden.sum() > 1.5e-3 and arc_lengths(line)[-1] < 0.034:
-        return Case(needle, line, lighting=random_lighting(random))
-    return None
-
-
-@tried
 def _hand_instrument(random: Random) -> Case | None:
     """Return an instrument that a hand holds over the thread."""
     case = usual_case(random, thread=0.026)
@@ -561,7 +541,7 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)}
     classes |= {"suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
     classes |= {"two_covers": _two_covers, "cover_end": _cover_end, "cover_crossing": _cover_crossing}
-    classes |= {"glare_thread": _glare_thread, "below_needle": _below_needle, "hand_instrument": _hand_instrument}
+    classes |= {"glare_thread": _glare_thread, "hand_instrument": _hand_instrument}
     classes |= {"second_thread": partial(_crossed, *STEEP), "second_thread_shallow": partial(_crossed, *SHALLOW)}
     classes |= {"second_thread_beside": _beside}
     return classes

@@ -54,7 +54,6 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
     console.print(table(rows))
-    console.print(table_of_pieces(rows))
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
     return {**figures, "total": total}, total["reversed"] == 0
@@ -88,56 +87,32 @@ def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
     return {"tail": needle.tail.tolist(), "heading": needle.heading, "thread": case.thread.tolist(), **case.labels}
 
 
+CAPTION = """unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees; rev: by 90; >cov:
+by more than the covariance says; px, deg: RMS of the others; line: visible thread that is followed from the tail; pcs:
+that is on pieces; off: share of pieces where no thread is; mis: pieces of a place that is wrong; all: frames said to
+show all of the thread; free: ends said to be its own; not: of these, that are not; dev: RMS of errors over their
+standard deviation"""
+COLUMNS = "pose,unkn,wrong,rev,>cov,px,deg,line,pcs,off,mis,all,not,free,not,dev,ms"
+
+
 def table(rows: list[Row]) -> Table:
     """Return the rows as a table."""
     title = f"the tracker on rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    result = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=CAPTION, caption_justify="left")
     result.add_column("class", no_wrap=True)
-    for name in ("pose", "unkn", "wrong", "rev", ">cov", "px", "deg", "ms"):
+    for name in COLUMNS.split(","):
         result.add_column(name, justify="right", no_wrap=True)
     for row in rows:
-        counts = (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)
         result.add_row(
             row.name,
-            *map(str, counts),
-            _number(row.tail_px, ".2f"),
-            _number(row.angle_deg, ".2f"),
+            *map(str, (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)),
+            *(_number(value, ".2f") for value in (row.tail_px, row.angle_deg)),
+            *(_number(value, ".0%") for value in (row.covered, row.pieces)),
+            _number(row.wrong_pieces, ".1%"),
+            *map(str, (row.misplaced, row.complete, row.incomplete, row.free, row.not_free)),
+            _number(row.normalised, ".1f"),
             f"{row.median_ms:.1f}",
         )
-    result.caption = (
-        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or "
-        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance "
-        "says; px, deg: RMS of the others"
-    )
-    result.caption_justify = "left"
-    return result
-
-
-def table_of_pieces(rows: list[Row]) -> Table:
-    """Return what is said of the thread as a table."""
-    title = f"the thread in rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    result.add_column("class", no_wrap=True)
-    for name in ("line", "pcs", "off", "?", "wrg", "all", "not", "free", "not", "dev"):
-        result.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        counts = (row.unplaced, row.misplaced, row.complete, row.incomplete, row.free, row.not_free)
-        result.add_row(
-            row.name,
-            f"{row.covered:.0%}",
-            f"{row.pieces:.0%}",
-            "" if row.wrong_pieces is None else f"{row.wrong_pieces:.1%}",
-            *map(str, counts),
-            _number(row.normalised, ".1f"),
-        )
-    result.caption = (
-        "line: visible thread that is followed from the tail; pcs: that is on "
-        "pieces; off: share of pieces where no thread is; ?: pieces of unknown "
-        "place; wrg: of a place that is wrong; all: frames said to show all of "
-        "the thread; free: ends said to be its own; not: of these, that are not; "
-        "dev: RMS of errors over their standard deviation"
-    )
-    result.caption_justify = "left"
     return result
 
 

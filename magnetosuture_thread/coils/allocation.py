@@ -21,16 +21,13 @@ from magnetosuture_thread.safety.filter import SPEED
 
 Vector = NDArray[np.float64]
 
-# Weights of the least-squares objectives. Drift cannot be avoided everywhere.
-DRIVE_WEIGHT = 1.0
-TURN_WEIGHT = 1.0
+# Weights of the least-squares objectives; that of velocity and drift, which cannot be avoided everywhere, is 1.
 ALIGN_WEIGHT = 0.1
 # Where a pull across the needle is compensated. The aligning field's own gradient pulls across the needle too: at
 # headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered. In a field against it
 # the needle would turn round: the least field along it is a constraint, by its weight.
 COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT = 0.01, 10.0
 MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
-DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
@@ -43,6 +40,13 @@ COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
+GAIN_DEVIATION = 0.05  # of a calibrated coil
+MAX_CHANGE = 0.2  # of a gain
+DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
+DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and by which a thread turns it from the field
+GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
+MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
+MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 
 
 @dataclass(frozen=True)
@@ -232,7 +236,7 @@ class CoilAllocation:
         sideways = min(max_turn_speed, max(-max_turn_speed, sideways))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
-        align_weight, turn_weight = ALIGN_WEIGHT, TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
+        align_weight, turn_weight = ALIGN_WEIGHT, MAX_FIELD_ANGLE_SINE / max_turn_speed
         if disturbance is not None:
             align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
@@ -242,23 +246,23 @@ class CoilAllocation:
             growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
             error = HEADING_ERROR * math.exp(growth)
             misaligned = error / HEADING_STEP * (self._drifting(tail, heading, HEADING_STEP) - drifting)
-            effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
+            effort = np.hypot(effort, COIL_ERROR / reference_speed * np.hypot(drifting, turned))
         system = np.vstack(
             [
-                DRIVE_WEIGHT / reference_speed * along,
+                along / reference_speed,
                 turn_weight * to_turn,
                 align_weight / self._field * (e @ mean),
-                DRIFT_WEIGHT / reference_speed * drifting,
-                DRIFT_WEIGHT / reference_speed * misaligned,
+                drifting / reference_speed,
+                misaligned / reference_speed,
                 np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
-        target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
+        target[0] = float(velocity @ e) / reference_speed
         target[1] = turn_weight * sideways
         target[2] = align_weight
         if disturbance is not None:
-            target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
+            target[3] = -disturbance.drift / reference_speed
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
@@ -287,19 +291,12 @@ class CoilAllocation:
     def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
         """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
         # Most solutions are inside the bounds, where the unconstrained one is optimal.
-        found = np.linalg.lstsq(system, target, rcond=None)[0]
+        found: Vector = np.linalg.lstsq(system, target, rcond=None)[0].astype(np.float64, copy=False)
         if ((found >= lower) & (found <= upper)).all():
             return found
         # The solver rejects equal bounds; the small gap has no effect.
         bounds = (lower, np.maximum(upper, lower + 1e-9))
         return np.clip(self._solve_bounded(system, target, bounds=bounds, method="bvls").x, lower, upper)
-
-
-GAIN_DEVIATION = 0.05  # of a calibrated coil
-MAX_CHANGE = 0.2  # of a gain
-DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
-DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and by which a thread turns it from the field
-GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
 
 
 class CoilGainEstimator:
@@ -367,10 +364,6 @@ class CoilGainEstimator:
         gains = self.gains + spread * (residual / variance)
         self.gains = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
         self._covariance -= np.outer(spread, spread) / variance
-
-
-MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
-MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 
 
 class CertifiedAllocation:

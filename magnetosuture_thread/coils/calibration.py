@@ -14,7 +14,6 @@ from magnetosuture_thread.coils.field import CoilProperties
 from magnetosuture_thread.configuration import from_mapping, read_yaml, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
 
-FILE_KIND = "coil calibration"
 MODEL = "loops"  # of the field of a coil
 MIN_COILS = 3  # needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
@@ -55,10 +54,10 @@ def read_calibration(path: Path) -> CoilCalibration:
         ConfigurationError: the file is unreadable or no YAML, a key is missing or unknown, or a value has the wrong
             type or is out of bounds; with file, key, value and expectation.
     """
-    content, source = read_yaml(path, FILE_KIND), str(path)
+    content, source = read_yaml(path, "coil calibration"), str(path)
     keys = (*TEXT_KEYS, "model", "coils")
     if not isinstance(content, Mapping):
-        raise ConfigurationError(FILE_KIND, content, f"keys {', '.join(keys)}", source)
+        raise ConfigurationError("coil calibration", content, f"keys {', '.join(keys)}", source)
     unknown = next((key for key in content if key not in keys), None)
     if unknown is not None:
         raise ConfigurationError(str(unknown), content[unknown], f"one of {', '.join(keys)}", source)

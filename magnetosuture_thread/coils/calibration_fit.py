@@ -22,6 +22,19 @@ COLUMNS = ("coil", "current", "x", "y", "bx", "by")
 # Values out of these bounds are assumed to have another unit.
 VALUE_BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx": (1.0, "T"), "by": (1.0, "T")}
 MAX_COILS = 64
+MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
+MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
+MAX_DISTANCE = 1.0  # m, of a coil
+RADIUS_BOUNDS = (0.002, 0.5)  # m
+COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
+START_RATIOS = (1.0, 0.5, 2.0)  # initial distances, relative to that by the field's gradient
+MAX_RELATIVE_RESIDUAL = 0.25  # of the measured field; a larger residual means other coils
+MIN_SINGULAR_VALUE = 1e-6  # of the scaled Jacobian; below, parameters are unidentifiable
+PARAMETERS = ("angle", "distance", "radius", "field_per_current")
+# Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
+# unidentifiable. The field hardly depends on the radius, which has no such limit.
+POOR_DEVIATION = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
+MAX_DEVIATION = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,20 +139,6 @@ def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
 
 
 Array = NDArray[np.float64]
-
-MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
-MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
-MAX_DISTANCE = 1.0  # m, of a coil
-RADIUS_BOUNDS = (0.002, 0.5)  # m
-COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
-START_RATIOS = (1.0, 0.5, 2.0)  # initial distances, relative to that by the field's gradient
-MAX_RELATIVE_RESIDUAL = 0.25  # of the measured field; a larger residual means other coils
-MIN_SINGULAR_VALUE = 1e-6  # of the scaled Jacobian; below, parameters are unidentifiable
-PARAMETERS = ("angle", "distance", "radius", "field_per_current")
-# Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
-# unidentifiable. The field hardly depends on the radius, which has no such limit.
-POOR_DEVIATION = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_current": 0.02}
-MAX_DEVIATION = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
 
 
 @dataclass(frozen=True)

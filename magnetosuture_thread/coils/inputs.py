@@ -23,6 +23,13 @@ SILENCE_TIMEOUT = 0.5  # s; a publisher without a message for this long is gone
 MAX_GAP = 100  # consecutive messages that may get lost
 AGE_WINDOW = 5.0  # s
 SCENE_GRACE_PERIOD = 0.5  # s for which model and bridge may be on different versions of the scene during a change
+BodyVelocity = tuple[float, float, float]
+"""Velocity of the tip along the chord and across it, and as much of that as is of the whole needle [m/s]."""
+ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
+TOPIC = "needle/measured_cp"
+CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
+SIGMA_COUNT = 3.0
+MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
 
 
 def check_stamp(topic: str, stamp: float, now: float, last: float, max_age: float) -> None:
@@ -257,16 +264,6 @@ class PredictionMonitor:
         if arrival - self._agreed <= SCENE_GRACE_PERIOD:
             return ""
         return f"scene: thread_model has {self._version or 'none'}, coil_bridge has {scene_version or 'none'}"
-
-
-BodyVelocity = tuple[float, float, float]
-"""Velocity of the tip along the chord and across it, and as much of that as is of the whole needle [m/s]."""
-
-ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
-TOPIC = "needle/measured_cp"
-CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
-SIGMA_COUNT = 3.0
-MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
 
 
 @dataclass(frozen=True)

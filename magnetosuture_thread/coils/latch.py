@@ -122,9 +122,6 @@ class ArmingLatch:
         self.emergency, self.fault, self.armed = False, "", False
 
 
-MAX_BYTES = 1000  # of the file, which holds one word
-
-
 class RecordedState(Enum):
     """What a bridge leaves behind."""
 
@@ -147,7 +144,7 @@ class StopRecord:
     def read(self) -> RecordedState:
         """Return the state that was left behind; without a file none, and of a damaged one the emergency stop."""
         try:
-            return RecordedState(read_regular(self.path, MAX_BYTES).decode().strip())
+            return RecordedState(read_regular(self.path, 1000).decode().strip())
         except FileNotFoundError:
             return RecordedState.SAFE
         except (OSError, ValueError):

@@ -18,6 +18,18 @@ GAIN = 12.0  # 1/s; of the velocities, below the rate of a camera's poses
 MAX_INTERVAL = 0.2  # s; two poses farther apart say nothing of the motion between them
 MAX_GAP = 1.0  # s; of poses, over which what was measured before is kept: a thread goes on pulling
 VISIBLE = 6e-5  # m; four times the noise of a displacement between two poses
+MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
+MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
+MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
+SHAPE_FACTOR = 4.0  # on that, for a needle at wall or shape: 2 mm with the default pose_uncertainty
+MIN_SHARE = 0.1  # of the expected motion, in its direction, that a needle which follows makes at least
+STILL_SHARE = 0.7  # of the expected motion; a needle that is held, and pulled by its thread, moves less
+MAX_TURN = 1.0  # rad; the field's torque keeps a needle nearer to its direction, against any thread
+PROBE_TURN, PROBE_RATE = 0.2, 4.0  # rad, forty times the noise of a heading, and rad/s
+PROBE_SHARE = 0.2  # of a turn of the field, which the needle makes at least
+PROBE_TIMEOUT = 0.4  # s; a needle that could not be turned by then does not follow
+MAX_ERROR, MAX_ERROR_SHARE = 2.0, 0.8  # of d and of the expected displacement, while a pull is learnt that has changed
+TRUST_TIME = 1.0  # s after a probe that the needle has followed
 
 
 class MotionDisturbance(NamedTuple):
@@ -153,20 +165,6 @@ class MotionObserver:
         e = self._needle.chord_direction(heading)
         x, y = self._velocity
         return MotionDisturbance(float(e[0] * x + e[1] * y), float(e[0] * y - e[1] * x))
-
-
-MIN_WINDOW = 0.15  # s; two time constants of the motion observer, in which it compensates a pull that has changed
-MAX_WINDOW = 3.0  # s; a slower motion than one minimum distance in that time is not judged
-MIN_DISTANCE = 2e-4  # m; ten times the noise of a measured pose
-SHAPE_FACTOR = 4.0  # on that, for a needle at wall or shape: 2 mm with the default pose_uncertainty
-MIN_SHARE = 0.1  # of the expected motion, in its direction, that a needle which follows makes at least
-STILL_SHARE = 0.7  # of the expected motion; a needle that is held, and pulled by its thread, moves less
-MAX_TURN = 1.0  # rad; the field's torque keeps a needle nearer to its direction, against any thread
-PROBE_TURN, PROBE_RATE = 0.2, 4.0  # rad, forty times the noise of a heading, and rad/s
-PROBE_SHARE = 0.2  # of a turn of the field, which the needle makes at least
-PROBE_TIMEOUT = 0.4  # s; a needle that could not be turned by then does not follow
-MAX_ERROR, MAX_ERROR_SHARE = 2.0, 0.8  # of d and of the expected displacement, while a pull is learnt that has changed
-TRUST_TIME = 1.0  # s after a probe that the needle has followed
 
 
 class MotionStep(NamedTuple):

@@ -24,8 +24,8 @@ from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState, make_driver
+from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.stop_record import StopRecord
 from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import (

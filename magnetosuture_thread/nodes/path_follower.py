@@ -10,15 +10,13 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.duration import Duration
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.guidance.path import prepare_paths
-from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 
 
 class PathFollowerNode(StandbyNode[PathFollowerSettings]):

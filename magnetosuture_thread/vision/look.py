@@ -12,11 +12,11 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.dish.tilt import Tilt
+from magnetosuture_thread.vision.dish.find import Tilt
 from magnetosuture_thread.vision.dish.watch import FoundDish, see_dish
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, prepare
+from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
 from magnetosuture_thread.vision.needle.find import find_needles, search_factor
-from magnetosuture_thread.vision.needle.measured_needle import LengthEstimator, MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import find_centreline

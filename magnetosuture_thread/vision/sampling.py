@@ -18,42 +18,6 @@ def middle(values: np.ndarray) -> float:
 
 
 @compiled
-def median_of_windows(image, half, result):
-    """Fill in the median of a square window around each pixel of a small image, as OpenCV's in two thirds of its time.
-
-    Args:
-        image: shape (rows, columns), uint8; outside, the nearest pixel of its border.
-        half: the window's side is 2 half + 1.
-        result: filled, of the same shape.
-    """
-    rows, columns = image.shape
-    rank = (2 * half + 1) ** 2 // 2
-    counts = np.empty(256, np.int32)
-    for row in range(rows):
-        counts[:] = 0
-        for i in range(-half, half + 1):
-            for j in range(-half, half + 1):
-                counts[image[min(max(row + i, 0), rows - 1), min(max(j, 0), columns - 1)]] += 1
-        below, level = 0, 0  # pixels of the window that are darker than the level
-        for column in range(columns):
-            if column > 0:
-                left, right = max(column - half - 1, 0), min(column + half, columns - 1)
-                for i in range(-half, half + 1):
-                    at = min(max(row + i, 0), rows - 1)
-                    old, new = image[at, left], image[at, right]
-                    counts[old] -= 1
-                    counts[new] += 1
-                    below += (new < level) - (old < level)
-            while below > rank:
-                level -= 1
-                below -= counts[level]
-            while below + counts[level] <= rank:
-                below += counts[level]
-                level += 1
-            result[row, column] = level
-
-
-@compiled
 def sample(image, u, v):
     """Return an image at a point, bilinear; 0 outside."""
     column, row = int(np.floor(u)), int(np.floor(v))

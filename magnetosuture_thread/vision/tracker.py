@@ -14,7 +14,7 @@ from magnetosuture_thread.vision.dish.watch import DishWatch, FoundDish
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, shrunk
 from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.look import FrameReader, State, Track, look_once, mask_of, no_pose, why_none
-from magnetosuture_thread.vision.needle.measured_needle import LengthEstimator, MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 

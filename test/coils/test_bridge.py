@@ -135,14 +135,6 @@ def test_source_timeout_and_time_to_stop(timeout: float):
     assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
 
 
-def test_a_lost_pose_stops_while_commands_go_on():
-    plant = Plant().ready()
-    plant.run(0.5)
-    plant.tail, last = None, plant.time
-    assert plant.run(1.0)[-1].reasons == ("no needle pose for 0.2 s",)
-    assert stopped_after(plant, last) <= 0.2 - PERIOD + 1e-9
-
-
 @pytest.mark.parametrize(("lost", "timeout"), [("command", 0.3), ("pose", 0.2)])
 def test_an_input_ends_by_the_monotonic_clock_though_that_of_the_stamps_stands_still(lost: str, timeout: float):
     plant = Plant(CoilBridgeSettings(command_timeout=0.3, pose_timeout=0.2)).ready()
@@ -230,26 +222,6 @@ def test_stops_are_at_once_and_starts_are_not():
     assert not any(0.0 < np.linalg.norm(output.filtered) < 0.014 for output in at_rest)
 
 
-def test_after_a_stop_the_needle_starts_from_rest():
-    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
-    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
-    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
-    plant.run(1.0)
-    plant.bridge.latch.disarm()
-    plant.run(PERIOD)
-    plant.tail = None
-    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
-    assert at_rest is not None
-    assert later is not None
-    assert later.tail.tolist() == at_rest.tail.tolist()
-    plant.bridge.arm(READY)
-    plant.command((0.015, 0.0))
-    first = plant.run(PERIOD)[0]
-    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
-    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
-
-
 def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     settings = CoilBridgeSettings(max_current_slew=100.0, command_timeout=0.1)
     plant = Plant(settings, velocity=(0.015, 0.0)).ready()
@@ -261,16 +233,6 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     after = plant.bridge.step(plant.time, plant.time, READY)
     assert not still(after)
     assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
-
-
-def test_a_late_step_changes_no_more_than_two_in_time():
-    plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
-    plant.run(0.02)
-    before = plant.outputs[-1][1].filtered
-    plant.time += 0.08
-    plant.command((0.015, 0.0))
-    after = plant.bridge.step(plant.time, plant.time, READY).filtered
-    assert np.linalg.norm(after - before) <= 0.1 * 2 * PERIOD + 1e-12
 
 
 def test_two_that_command_at_once_stop_it_until_one_is_silent():
@@ -677,17 +639,3 @@ def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
         tail, heading = needle.moved(tail, heading, along, left, PERIOD, found.drift)
         across.append(abs(found.drift))
     assert max(across) < 1e-3
-
-
-def test_coils_that_were_set_to_zero_for_a_new_scene_moved_no_needle_meanwhile():
-    plant = Plant(CoilBridgeSettings(motion_compensation=True)).ready()
-    plant.run(0.2)
-    plant.time += PERIOD
-    before = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    plant.bridge.rest(plant.time, plant.time)
-    plant.bridge.set_scene(Scene(Dish(0.04)))
-    plant.time += 0.06  # as long as the filter of many corners takes
-    after = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    assert before is not None
-    assert after is not None
-    np.testing.assert_allclose(after.tail, before.tail, atol=1e-12)

@@ -60,16 +60,3 @@ def test_gains_are_bounded():
         lie_along_field(estimator, np.array([1.0 + size, 1.0, 1.0, 1.0]), 3, round(1000 * size))
     assert np.abs(estimator.gains - 1.0).max() <= MAX_CHANGE + 1e-12
     assert np.abs(estimator.gains - 1.0).max() > 0.5 * MAX_CHANGE
-
-
-def test_the_currents_of_the_stamp_count_and_not_those_after_it():
-    gains, random = np.array([1.05, 0.96, 1.02, 0.97]), np.random.default_rng(8)
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    for k in range(200):
-        currents, stamp = random.uniform(-4.0, 4.0, 4), 1.0 + FRAME * k
-        field = COILS.per_current(np.zeros(2)) @ (gains * currents)
-        heading = field / np.linalg.norm(field)
-        estimator.apply(stamp - 0.01, currents)
-        estimator.apply(stamp + 0.01, random.uniform(-4.0, 4.0, 4))
-        estimator.update(-0.5 * NEEDLE.chord * heading, heading, stamp)
-    np.testing.assert_allclose(estimator.gains / estimator.gains.mean(), gains / gains.mean(), atol=0.01)

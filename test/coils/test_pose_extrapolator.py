@@ -22,13 +22,6 @@ def extrapolator_at_origin() -> PoseExtrapolator:
     return made
 
 
-def test_the_age_of_a_pose_goes_by_stamp_or_arrival_whichever_is_longer_ago():
-    for now, arrival in ((1.06, 50.02), (0.98, 50.06)):  # late, or by a clock that is ahead
-        pose = extrapolator_at_origin().pose(now, arrival)
-        assert pose is not None
-        assert pose.age == pytest.approx(0.06)
-
-
 def test_a_velocity_across_turns_the_needle_about_its_middle():
     extrapolator = extrapolator_at_origin()
     extrapolator.apply_velocity(np.array([0.0, 0.0035]), 1.0, 48.95 + 1.0)  # one length in two seconds: 1 rad/s
@@ -50,33 +43,6 @@ def test_a_late_pose_is_carried_by_all_that_the_coils_gave_since_its_stamp():
     np.testing.assert_allclose(pose.tail, [0.02 * 0.05 + 0.01 * 0.05, 0.0], atol=1e-12)
 
 
-def test_a_motion_is_kept_as_the_needle_sees_it():
-    """A pose from within a motion is carried by what the coils give now, not by where that pointed when it began."""
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.01, 0.007]), 1.0, 50.0)
-    whole = extrapolator.pose(1.1, 50.1)
-    half = NEEDLE.moved(np.zeros(2), EAST, 0.01, 0.007, 0.05)
-    extrapolator.update(*half, 1.05, 2, 1.1, 50.1)
-    again = extrapolator.pose(1.1, 50.1)
-    assert whole is not None
-    assert again is not None
-    np.testing.assert_allclose(again.tail, whole.tail, atol=1e-12)
-    np.testing.assert_allclose(again.heading, whole.heading, atol=1e-12)
-
-
-def test_a_needle_that_drifts_and_turns_is_extrapolated_as_in_small_steps():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.004, 0.006]), 1.0, 50.0, drift=0.002)
-    pose, (tail, heading) = extrapolator.pose(1.1, 50.1), (np.zeros(2), EAST)
-    for _ in range(4000):
-        e = NEEDLE.chord_direction(heading)
-        tail, heading = NEEDLE.moved(tail, heading, 0.004, 0.004, 0.1 / 4000)
-        tail = tail + 0.002 * 0.1 / 4000 * np.array([-e[1], e[0]])
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, tail, atol=1e-7)
-    np.testing.assert_allclose(pose.heading, heading, atol=1e-9)
-
-
 def test_where_time_is_set_back_a_pose_is_carried_from_there():
     extrapolator = PoseExtrapolator(NEEDLE, 0.3, 0.045)
     extrapolator.update(np.zeros(2), EAST, 99.9, 1, 100.0, 50.0)
@@ -86,15 +52,6 @@ def test_where_time_is_set_back_a_pose_is_carried_from_there():
     pose = extrapolator.pose(1.15, 50.15)
     assert pose is not None
     np.testing.assert_allclose(pose.tail, [0.001, 0.0], atol=1e-12)
-
-
-def test_a_stamp_from_the_future_takes_nothing_off_the_motion():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.01, 0.0]), 1.0, 50.0)
-    extrapolator.update(np.zeros(2), EAST, 1.14, 2, 1.1, 50.1)
-    pose = extrapolator.pose(1.14, 50.14)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.0004, 0.0], atol=1e-12)
 
 
 def stalled() -> PoseExtrapolator:
@@ -154,12 +111,6 @@ def test_a_pose_that_cannot_be_is_not_believed_and_the_needle_rests(tail: list[f
         extrapolator.update(np.array(tail), EAST, 1.02, 2, 1.02, 50.02)
     assert words in extrapolator.stale_reason(1.02, 50.02)
     assert extrapolator.pose(1.02, 50.02) is None
-
-
-def test_what_a_needle_can_do_is_believed():
-    extrapolator = doubter()
-    assert all(show(extrapolator, [[0.0008 * (k + 1), 0.0] for k in range(10)]))
-    assert extrapolator.pose(1.2, 50.2) is not None
 
 
 def test_a_tracker_that_says_how_uncertain_it_is_may_be_off_by_three_sigma():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.inputs import AGE_WINDOW, CommandWatchdog, PredictionMonitor, StampAges
+from magnetosuture_thread.coils.inputs import AGE_WINDOW, CommandWatchdog, StampAges
 from magnetosuture_thread.errors import InvalidInputError
 
 TIMEOUT = 0.1
@@ -102,12 +102,3 @@ def test_the_minimum_age_of_the_last_seconds_is_kept_for_each_topic():
     assert ages.minimum(0.5 + AGE_WINDOW)["needle/servo_cv"] == 0.020
     assert ages.minimum(2.5 + AGE_WINDOW)["needle/servo_cv"] == 0.030
     assert ages.minimum(3.5 + AGE_WINDOW) == {}
-
-
-def test_a_model_with_another_scene_is_reported_until_its_timeout():
-    monitor = PredictionMonitor(2.0)
-    monitor.update(1.0, True, 1.0, "a", 1.0)
-    assert monitor.scene_mismatch("a", 1.0) == ""
-    assert monitor.scene_mismatch("b", 1.4) == ""  # the model may take half a second
-    assert "has a, coil_bridge has b" in monitor.scene_mismatch("b", 2.9)
-    assert monitor.scene_mismatch("b", 3.1) == ""

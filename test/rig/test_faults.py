@@ -63,9 +63,3 @@ def inside(point: np.ndarray, outline: np.ndarray) -> bool:
     """Return whether a point is inside of a closed outline, by the winding of its corners around it."""
     angles = np.unwrap(np.arctan2(*(np.vstack([outline, outline[:1]]) - point).T[::-1]))
     return bool(abs(angles[-1] - angles[0]) > np.pi)
-
-
-def test_a_fault_lies_where_it_does_whatever_others_there_are():
-    alone = schedule("hand 1 2").covers(1.3, TAIL, TIP)[0].outline
-    (other, _) = schedule("glare 0 1", "hand 1 2", "tool 1 2").covers(1.3, TAIL, TIP)
-    assert (alone == other.outline).all()

@@ -105,17 +105,6 @@ def test_beyond_its_bound_a_needle_that_slides_leaves_a_little(
     assert y / x == pytest.approx(-math.tan(angle), rel=1e-6)
 
 
-def test_between_two_walls_too_near_a_needle_can_still_leave_along_them():
-    walls = [
-        SceneShape(
-            f"wall_{k}", "wall", Polygon(((-0.01, s * 4e-4), (0.01, s * 4e-4), (0.01, s * 2e-3), (-0.01, s * 2e-3)))
-        )
-        for k, s in enumerate((1.0, -1.0))
-    ]
-    found = needle_filter(*walls).filter(np.array([0.004, 0.003]), np.array([-0.0035, 0.0]), EAST)
-    np.testing.assert_allclose(found.filtered, [0.004, 0.0], atol=1e-9)
-
-
 @pytest.mark.parametrize("depth", [1e-5, 8e-5, 1.8e-4])
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_needle_along_a_block_is_taken_off_sideways(depth: float, turned: bool):
@@ -230,17 +219,6 @@ def test_between_two_points_of_a_curved_needle_nothing_gets_closer_than_keep_out
     assert data.keep < 1.04e-3
     bulge = radius - middle  # towards the wall
     assert 1e-3 <= data.keep_wall - bulge < 1.001e-3
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_needle_beside_a_post_is_taken_off_away_from_it(side: float):
-    heading = np.array([0.6, 0.8])
-    beside = side * np.array([-0.8, 0.6])
-    depth, radius = 1e-4, 0.001
-    middle = radius + KEEP + SIDESTEP_MARGIN - depth
-    post = SceneShape("post", "instrument", Disc((float(middle * beside[0]), float(middle * beside[1])), radius))
-    step = needle_filter(post).sidestep(-0.5 * LENGTH * heading, heading)
-    assert step == pytest.approx(-side * SIDESTEP_RATE * depth, rel=0.01)
 
 
 def test_shapes_are_named_right_whatever_kinds_come_before_them():

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.vision.image_header import ImageHeader, image_header
 from magnetosuture_thread.vision.images import (
+    ImageHeader,
     decode_image,
     glare_mask,
+    image_header,
     prepare,
     unpack_image,
 )

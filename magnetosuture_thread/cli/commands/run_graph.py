@@ -281,7 +281,7 @@ def run_hernia(options: argparse.Namespace) -> int:
     `magnetosuture console hernia_ring` is the same with a whole rig.
     DIR, which must not exist, gets hernia.json and hernia.png: six instants, and the barriers over time.
     """
-    from magnetosuture_thread.reproduce.hernia.replay import hernia_lines, hernia_table, replay_hernia
+    from magnetosuture_thread.reproduce.hernia import hernia_lines, hernia_table, replay_hernia
 
     console = make_console()
     log = make_log(console)

@@ -75,9 +75,6 @@ class CoilDriver(Protocol):
         ...
 
 
-MAX_RECORDED = 10_000
-
-
 class RecordingDriver:
     """Records currents where no hardware is configured: in tests, and in replays of bags.
 
@@ -91,7 +88,7 @@ class RecordingDriver:
     def __init__(self, coils: int) -> None:
         self._coils = coils
         self._open = False
-        self.applied: deque[Vector] = deque(maxlen=MAX_RECORDED)
+        self.applied: deque[Vector] = deque(maxlen=10_000)
 
     def open(self) -> None:
         """Accept currents from now on."""

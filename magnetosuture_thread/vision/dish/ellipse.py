@@ -43,14 +43,18 @@ class Ellipse:
     direction: float
     support: float = 0.0
 
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors along the shorter and the longer axis, by rows, shape (2, 2)."""
+        cosine, sine = math.cos(self.direction), math.sin(self.direction)
+        return np.array([[cosine, sine], [-sine, cosine]])
+
     def points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return points of the ellipse and its outward normals, both of shape (count, 2)."""
         turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
-        cosine, sine = math.cos(self.direction), math.sin(self.direction)
-        axes = np.array([[cosine, sine], [-sine, cosine]])
         circle = np.column_stack([np.cos(turns), np.sin(turns)])
-        points = circle * (self.minor, self.major) @ axes + self.centre_px
-        normals = circle * (self.major, self.minor) @ axes
+        points = circle * (self.minor, self.major) @ self.axes + self.centre_px
+        normals = circle * (self.major, self.minor) @ self.axes
         return points, normals / np.hypot(*normals.T)[:, None]
 
     def is_cut(self, shape: tuple[int, ...]) -> bool:
@@ -166,26 +170,35 @@ def _candidates(
         _, _, _, (column, row) = cv2.minMaxLoc(votes)
         votes[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5] = -np.inf
         centre = low + CELL * (np.array([column, row]) + 0.5)
-        found += _around(moved, centre, smallest, largest, back, shape)
+        found += _around(edges, moved, centre, back, shape)
     return found
 
 
 def _around(
-    edges: np.ndarray, centre: np.ndarray, smallest: float, largest: float, back: np.ndarray, shape: tuple[int, ...]
+    edges: np.ndarray, moved: np.ndarray, centre: np.ndarray, back: np.ndarray, shape: tuple[int, ...]
 ) -> list[tuple[float, Ellipse]]:
-    """Return the ellipses around a centre in the stretched image, with their scores."""
+    """Return the ellipses around a centre in the stretched image, with their scores.
+
+    Args:
+        edges: see `_edges`.
+        moved: the same in the stretched image.
+        centre: in the stretched image, shape (2,) [px].
+        back: matrix that takes points of the stretched image back, shape (2, 2).
+        shape: rows and columns of the image.
+    """
+    smallest, largest = MIN_RADIUS * min(shape), MAX_RADIUS * min(shape)
     rings = int(math.log(largest / smallest) / math.log(RING)) + 2
     marks = np.zeros((rings, BINS), np.uint8)
-    ring_support(edges, centre, smallest, RING, ALIGNMENT, marks)
+    ring_support(moved, centre, smallest, RING, ALIGNMENT, marks)
     spread = marks.copy()  # An ellipse is no circle: it lies in several rings.
     for shift in (1, 2):
         spread[shift:] |= marks[:-shift]
         spread[:-shift] |= marks[shift:]
     support = spread.sum(axis=1).astype(float)
     found = []
-    offset = edges[:, :2] - centre
+    offset = moved[:, :2] - centre
     away = np.hypot(*offset.T)
-    facing = np.abs((offset * edges[:, 2:]).sum(axis=1)) > ALIGNMENT * away
+    facing = np.abs((offset * moved[:, 2:]).sum(axis=1)) > ALIGNMENT * away
     for _ in range(2):
         ring = int(support.argmax())
         if support[ring] < 0.35 * BINS:
@@ -197,28 +210,16 @@ def _around(
             continue
         some = np.flatnonzero(near)
         some = some[:: 1 + len(some) // 300]
-        angles = np.arctan2(offset[some, 1], offset[some, 0])
-        best = np.zeros(5)
-        tolerance = max(0.8, AGREEMENT * radius)
-        if not fit_harmonics(angles, away[some], tolerance, 200, BINS, best):
-            continue
-        turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
-        points = centre + (_harmonics(turns) @ best)[:, None] * np.column_stack([np.cos(turns), np.sin(turns)])
-        ellipse = _fitted(points @ back)
+        points = _through(offset[some], max(0.8, AGREEMENT * radius))
+        ellipse = _fitted((centre + points) @ back) if points is not None else None
         if ellipse is None:
             continue
-        support_of, seen = _support(_unstretched(edges, back), shape, ellipse)
+        support_of, seen = _support(edges, shape, ellipse)
         if seen < 0.5 or support_of < _needed(seen):
             continue
-        score = support_of * math.sqrt(seen) * (ellipse.major / min(shape[:2])) ** 0.25
+        score = support_of * math.sqrt(seen) * (ellipse.major / min(shape)) ** 0.25
         found.append((score, replace(ellipse, support=support_of)))
     return found
-
-
-def _unstretched(edges: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return stretched edges as they were."""
-    normals = edges[:, 2:] @ np.linalg.inv(back)
-    return np.column_stack([edges[:, :2] @ back, normals / np.hypot(*normals.T)[:, None]])
 
 
 def _support(edges: np.ndarray, shape: tuple[int, ...], ellipse: Ellipse) -> tuple[float, float]:
@@ -228,14 +229,8 @@ def _support(edges: np.ndarray, shape: tuple[int, ...], ellipse: Ellipse) -> tup
     inside = (points[:, 0] > 1) & (points[:, 1] > 1) & (points[:, 0] < columns - 2) & (points[:, 1] < rows - 2)
     if not inside.any():
         return 0.0, 0.0
-    cosine, sine = math.cos(ellipse.direction), math.sin(ellipse.direction)
-    x, y = _in_axes(edges[:, :2], ellipse)
-    away = np.hypot(x, y)
-    normal = np.column_stack([x / ellipse.minor, y / ellipse.major])
-    normal /= np.maximum(np.hypot(*normal.T), 1e-12)[:, None]
-    gradient = np.column_stack([edges[:, 2:] @ (cosine, sine), edges[:, 2:] @ (-sine, cosine)])
-    tolerance = max(0.8 / ellipse.major, AGREEMENT)
-    agree = (np.abs(away - 1.0) < tolerance) & (np.abs((normal * gradient).sum(axis=1)) > ALIGNMENT)
+    x, y, facing = _facing(edges, ellipse)
+    agree = facing & (np.abs(np.hypot(x, y) - 1.0) < max(0.8 / ellipse.major, AGREEMENT))
     bins = ((np.arctan2(y[agree], x[agree]) / (2.0 * np.pi) + 1.0) * BINS).astype(int) % BINS
     marks = np.zeros(BINS, bool)
     marks[bins] = True
@@ -250,27 +245,18 @@ def _innermost(edges: np.ndarray, shape: tuple[int, ...], best: Ellipse) -> Elli
     enough = 0.85 * best.support
     inner = best
     for _ in range(4):  # edges of wall and lid
-        x, y = _in_axes(edges[:, :2], inner)
+        x, y, facing = _facing(edges, inner)
         away = np.hypot(x, y)
-        normal = np.column_stack([x, y]) / np.maximum(away, 1e-9)[:, None]
-        cosine, sine = math.cos(inner.direction), math.sin(inner.direction)
-        gradient = np.column_stack([edges[:, 2:] @ (cosine, sine), edges[:, 2:] @ (-sine, cosine)])
-        facing = np.abs((gradient * normal).sum(axis=1)) > ALIGNMENT
         outer = 1.0 - max(1.5 * AGREEMENT, 2.0 / inner.major)
         least = INNER_RADIUS * best.major / inner.major
         near = facing & (away > least) & (away < 1.0 + INNER_RADIUS - least)
         near &= (away < outer) | (away > 2.0 - outer)  # not those of the one that is known
         if near.sum() < 20:
             break
-        shape_of = np.zeros(5)
-        angles = np.arctan2(y[near], x[near])
-        tolerance = max(0.8 / inner.major, AGREEMENT)
-        if not fit_harmonics(angles, away[near], tolerance, 200, BINS, shape_of):
-            break
-        turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
-        radii = _harmonics(turns) @ shape_of
-        local = radii[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]) * (inner.minor, inner.major)
-        found = _fitted(local @ np.array([[cosine, sine], [-sine, cosine]]) + inner.centre_px)
+        points = _through(np.column_stack([x, y])[near], max(0.8 / inner.major, AGREEMENT))
+        found = (
+            _fitted(points * (inner.minor, inner.major) @ inner.axes + inner.centre_px) if points is not None else None
+        )
         if found is None or not INNER_RADIUS * best.major < found.major < 0.99 * inner.major:
             break
         support, seen = _support(edges, shape, found)
@@ -285,16 +271,29 @@ def _needed(seen: float) -> float:
     return 0.6 + 0.5 * (1.0 - seen)
 
 
-def _harmonics(turns: np.ndarray) -> np.ndarray:
-    """Return the functions of `fit_harmonics`, shape (n, 5)."""
-    return np.column_stack([np.ones(len(turns)), np.cos(turns), np.sin(turns), np.cos(2 * turns), np.sin(2 * turns)])
+def _through(offsets: np.ndarray, tolerance: float) -> np.ndarray | None:
+    """Return points of the curve around a centre that most offsets from it agree on, shape (BINS, 2); None for none."""
+    best, turns = np.zeros(5), np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
+    angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+    if not fit_harmonics(angles, np.hypot(*offsets.T), tolerance, 200, BINS, best):
+        return None
+    cosine, sine = np.cos(turns), np.sin(turns)
+    radii = np.column_stack([np.ones(BINS), cosine, sine, np.cos(2 * turns), np.sin(2 * turns)]) @ best
+    return np.asarray(radii[:, None] * np.column_stack([cosine, sine]))
+
+
+def _facing(edges: np.ndarray, ellipse: Ellipse) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges along the axes of an ellipse, see `_in_axes`, and whether their gradients lie along its normals."""
+    x, y = _in_axes(edges[:, :2], ellipse)
+    normal = np.column_stack([x / ellipse.minor, y / ellipse.major])
+    along = (normal * (edges[:, 2:] @ ellipse.axes.T)).sum(axis=1)
+    return x, y, np.abs(along) > ALIGNMENT * np.hypot(*normal.T)
 
 
 def _in_axes(points: np.ndarray, ellipse: Ellipse) -> tuple[np.ndarray, np.ndarray]:
     """Return points along the shorter and the longer axis, in halves of them."""
-    cosine, sine = math.cos(ellipse.direction), math.sin(ellipse.direction)
-    offset = points - ellipse.centre_px
-    return offset @ (cosine, sine) / ellipse.minor, offset @ (-sine, cosine) / ellipse.major
+    x, y = ((points - ellipse.centre_px) @ ellipse.axes.T).T
+    return x / ellipse.minor, y / ellipse.major
 
 
 def _refined(image: np.ndarray, ellipse: Ellipse) -> Ellipse | None:

@@ -11,16 +11,20 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import circle_through, find_ellipse
 from magnetosuture_thread.vision.dish.find import (
+    MIN_ANGLE,
     RIM_RAYS,
     RIM_SHARE,
     STILL_PX,
     Guess,
+    Tilt,
     find_cut_dish,
     find_dish,
+    find_tilt,
     floor_level,
     rim_shift,
+    tilt_of,
+    unseen_tilt_covariance,
 )
-from magnetosuture_thread.vision.dish.tilt import MIN_ANGLE, Tilt, find_tilt, tilt_of, unseen_tilt_covariance
 from magnetosuture_thread.vision.images import measured_channel
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -31,8 +35,6 @@ ELLIPSE_ERROR = 0.01  # of a scale by an edge of the wall in a photograph: which
 SCALE_SLACK = 0.03  # that a dish found may differ from the size that a given scale makes of it
 MAX_SCALE_SLACK = 0.1  # the same, beyond which it is another dish; between, the dish's own size gives the scale
 AGREEING = 3  # frames in a row that must agree on a new view
-AGREEMENT_PX, AGREEMENT = 1.0, 0.005  # of centres, and of scales ...
-DEVIATIONS = 2.0  # ... or so many standard deviations of both, as of a dish by its ellipse, if that is more
 LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
 
 
@@ -99,13 +101,13 @@ def see_dish(
     fixed = settings.fixed_view()
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
-        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _found_view(gray, settings, diameter, guesses) is None
-        dark = dark and _found_view(255 - gray, settings, diameter, guesses) is not None
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _with_given(find_dish(gray, diameter, guesses), settings) is None
+        dark = dark and _with_given(find_dish(255 - gray, diameter, guesses), settings) is not None
         return FoundDish(fixed, dark, homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
-        found = _found_view(gray, settings, diameter, guesses)
+        found = _with_given(find_dish(gray, diameter, guesses), settings)
         if found is None:
             continue
         view, remark = found
@@ -119,20 +121,14 @@ def see_dish(
     return _photographed(image, settings, diameter) if photographed else None
 
 
-def _found_view(
-    gray: np.ndarray, settings: VisionTrackerSettings, diameter: float, guesses: dict[int, Guess | None]
-) -> tuple[DishView, str] | None:
-    """Return the view by a dish with a bright floor, and a remark on its scale; None if none is seen."""
-    found = find_dish(gray, diameter, guesses)
-    return _with_given(found, settings) if found is not None else None
-
-
-def _with_given(found: DishView, settings: VisionTrackerSettings) -> tuple[DishView, str] | None:
+def _with_given(found: DishView | None, settings: VisionTrackerSettings) -> tuple[DishView, str] | None:
     """Return a view that was found with what is given of it, and a remark; None if they don't fit at all.
 
     Where a given scale and the dish differ by more than a rim's light can make, all that is known of the scene is
     relative to its dish: the dish gives the scale.
     """
+    if found is None:
+        return None
     scale, remark = settings.metres_per_pixel or found.metres_per_pixel, ""
     apart = found.metres_per_pixel / scale - 1.0
     if abs(apart) > MAX_SCALE_SLACK:
@@ -150,7 +146,7 @@ def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: 
     if ellipse is None:
         return None
     gray, found = measured_channel(image), DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major)
-    tilt, unseen_tilt = tilt_of(ellipse, settings.camera_rotation), MIN_ANGLE
+    tilt, unseen_tilt = tilt_of(ellipse.minor, ellipse.major, ellipse.direction, settings.camera_rotation), MIN_ANGLE
     if tilt is not None and ellipse.is_cut(image.shape):  # The part that is seen does not determine a tilt.
         cut = find_cut_dish(gray, circle_through(image, ellipse), diameter)
         if cut is None:
@@ -240,9 +236,9 @@ class DishWatch:
         return found
 
     def _agree(self, one: FoundDish, other: FoundDish) -> bool:
-        """Say whether two dishes that were found are where one is, as far as is known of each."""
-        slack = DEVIATIONS * max(one.scale_error, other.scale_error)
+        """Say whether two dishes are one: within 1 px and 0.5 % of scale, or within two standard deviations."""
+        slack = 2.0 * max(one.scale_error, other.scale_error)
         scale = one.view.metres_per_pixel
         apart = math.dist(one.view.centre_px, other.view.centre_px)
-        near = apart < max(AGREEMENT_PX, slack * 0.5 * self._diameter / scale)
-        return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(AGREEMENT, slack)
+        near = apart < max(1.0, slack * 0.5 * self._diameter / scale)
+        return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)

@@ -7,18 +7,16 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.measure import measure_needle
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 
 DARK = 0.55  # of the floor's brightness
-INSIDE = 0.985  # part of the dish's radius that is looked at first, to stay off the rim
 AT_WALL = "at the wall"
 MIN_AREA = 0.33  # of the needle's own
 AROUND_PX = 24.0  # around a dark thing, that is measured on
-MAX_CANDIDATES = 6  # beyond which the image is no dish with a needle
 
 
 def search_factor(width_px: float) -> int:
@@ -63,13 +61,13 @@ def _measured(
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`."""
     radius = dish_radius / view.metres_per_pixel
-    radius = radius - RIM_PX if tight else INSIDE * radius
+    radius = radius - RIM_PX if tight else 0.985 * radius  # at first off the rim
     wall = Wall(view.centre_px, radius)
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
     mask, factor = picture.mask, picture.factor
     candidates = _dark_components(picture, view, radius, size.length_px * size.width_px, tight)
-    if len(candidates) > MAX_CANDIDATES:
+    if len(candidates) > 6:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
         if not tight and np.hypot(*(points - view.centre_px).T).max() > radius - 2.0:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.needle.arc import Arc, fit_arc
+from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
 from magnetosuture_thread.vision.needle.comparison import (
     bluntness,
     ends_beyond,
@@ -20,7 +20,6 @@ from magnetosuture_thread.vision.needle.comparison import (
     steel_rows,
     thread_offsets,
 )
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.tail_edge import tail_shift
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
@@ -32,10 +31,7 @@ CLEARLY, DEARER = 1.25, 1.15  # times the cost that the other way has if both co
 SAME_LENGTH = 0.015  # share of the length, that need no proof
 MAX_MISSING, MAX_MISSING_END, END_ROWS = 0.13, 0.15, 3  # share of steel that the image may lack; at an end, in rows
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-BLUNT, NOT_BLUNT = 0.7, 0.5  # bluntness of a tail at least, and of what is no tail at most
-POINTED, NEARLY_POINTED, NOT_POINTED = 0.32, 0.45, 0.6  # bluntness of a tip at most; if nothing else fits; of no tip
-ROD = 0.87  # bluntness of both ends of a rod
-PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
+BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
 TOWARD = 0.8  # cosine between a needle and where it must point
 CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
 ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
@@ -131,7 +127,8 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
-    pull = PULL_PX * max(0.0, float(_excess(steel.surely, fit, width)[3]))
+    # A thread as wide as the needle draws a measured tail outwards by 1.5 px, one deviation.
+    pull = 1.5 * max(0.0, float(_excess(steel.surely, fit, width)[3]))
     if not is_measured:
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
@@ -225,10 +222,10 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
-        if tail < BLUNT or tip > NEARLY_POINTED:
+        if tail < BLUNT or tip > 0.45:
             continue
         their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
-        signs = (their_tail < NOT_BLUNT) + (their_tip > NOT_POINTED)
+        signs = (their_tail < 0.5) + (their_tip > 0.6)
         needed = (CLEARLY, DEARER, 0.0)[signs]  # times the cost, for as many signs against the other way
         if tip > POINTED:  # as the wall blunts a tip
             needed = HOPELESS if signs == 2 else math.inf
@@ -331,7 +328,7 @@ def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     blunt = np.empty((2, 2))
     state = _state(fit.arc, fit.width)
     bluntness(steel.surely, state, fit.length, 0.5 * fit.width, blunt)
-    if blunt.min() < ROD:
+    if blunt.min() < 0.87:
         return False
     around = _excess(steel.surely, fit, fit.width)
     rows = np.empty((int(fit.length), 3))

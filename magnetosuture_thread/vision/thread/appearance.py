@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.vision.images import Picture
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle, within
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
@@ -143,9 +143,9 @@ def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) 
     shown = np.flatnonzero(visible) if visible.sum() >= 8 else np.arange(len(points))
     shown = shown[:: max(1, len(shown) // 32)].copy()  # Compiled code is compiled anew for a view.
     aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    usual = np.empty(len(aside))
-    usual_profile(_profiles(gray, points, aside, shown), aside, 0.5 * REACH_PX, usual)
-    usual = -usual
+    profiles = _profiles(gray, points, aside, shown)
+    floors = np.median(profiles[:, np.abs(aside) > 0.5 * REACH_PX], axis=1)
+    usual = -np.median(profiles - floors[:, None], axis=0)
     centre = len(aside) // 2
     peak = centre - 2 + int(np.argmax(usual[centre - 2 : centre + 3]))
     left = right = peak
@@ -277,17 +277,6 @@ def sample_across(image, points, chosen, aside, profiles):
         for place in range(len(aside)):
             u, v = points[index, 0] + aside[place] * x, points[index, 1] + aside[place] * y
             profiles[row, place] = within(image, u, v)
-
-
-@compiled
-def usual_profile(profiles, aside, beside, usual):
-    """Fill in the median of profiles, each less the median of what lies farther aside than a distance."""
-    off = np.empty_like(profiles)
-    far = np.abs(aside) > beside
-    for row in range(len(profiles)):
-        off[row] = profiles[row] - np.median(profiles[row][far])
-    for place in range(len(aside)):
-        usual[place] = np.median(off[:, place])
 
 
 @compiled

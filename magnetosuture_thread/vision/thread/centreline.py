@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, without_wall
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, TAPER, THIN, edge
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.scene_mask import SceneMask

@@ -38,16 +38,12 @@ RADIUS_PX, RING = 7.0, 48  # around a path's vertices, that belongs to a crossin
 REACH = round(RADIUS_PX / STEP_PX)  # vertices
 SHOWN = 0.45  # of the usual strength, at least, where a strand leaves it
 DIP = 0.8  # of the weaker of two peaks, at most, between them
-FORK, MERGED = 3, 24  # arms, where two strands become one; vertices, over which they may be one
-ARM_PX, MIN_ARM = 28.0, 4  # length over which an arm is measured, and vertices that it has at least
-SAME_PX = 2.5  # from an arm, where another that begins is the same
+FORK = 3  # arms, where two strands become one
+ARM_PX = 28.0  # over which an arm is measured
 ON_ARM_PX, ALONG = 4.0, 0.3  # from an arm's beginning, where a path goes along it if their cosine is greater
 TURNING, CURVATURE_RATE = 0.01, 1e-4  # 1 / px, 1 / px^3; variances of tangent and curvature for each length
-POSITION_ERROR, ANGLE_ERROR = 0.4, 0.15  # px, rad; of a walk's vertex across, and of the direction between two
 FREEDOM = 4.0  # degrees of freedom of Student's distribution: some threads bend far more than most
-MAX_TURN = 2.0  # rad; from the chord, by which a strand leaves an arm
 END_COST = 12.0 + 0.5 * math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of an arm that ends, in any state
-SHORT_COST, WHOLE, EARLY = 4.0, 0.85, 0.2  # of a way that ends before this share of the thread, in full so much before
 
 Circle = tuple[float, float, float]  # u, v and radius [px]
 
@@ -125,7 +121,7 @@ def resolve_crossings(
             break
         low, high = places.pop(0)
         arms = find_arms(ridge, dish, path[low - 1 : high])
-        if len(arms) == FORK and places and places[0][0] - high <= MERGED:
+        if len(arms) == FORK and places and places[0][0] - high <= 24:
             after, end = places[0]
             if len(find_arms(ridge, dish, path[after - 1 : end])) == FORK:
                 high, arms = end, find_arms(ridge, dish, path[low - 1 : end])
@@ -303,7 +299,7 @@ def _peaks(values: NDArray[np.float32], bound: float) -> list[int]:
 
 
 def _lies_on(point: Points, arm: Arm) -> bool:
-    return bool(((arm.path[:, :2] - point) ** 2).sum(axis=1).min() < SAME_PX**2)
+    return bool(((arm.path[:, :2] - point) ** 2).sum(axis=1).min() < 2.5**2)
 
 
 def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) -> Arm | None:
@@ -311,7 +307,7 @@ def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) 
     path, strong = np.zeros((int(ARM_PX / STEP_PX) + 3, 6)), np.ones(int(ARM_PX / STEP_PX) + 3, np.bool_)
     path[0, :5] = start[0], start[1], angle, 0.0, usual
     count = walk_along(ridge, dish, ARM_PX, path, strong, 1)
-    if count <= MIN_ARM:
+    if count <= 4:
         return None
     path, strong = path[1:count], strong[1:count]  # The first vertex isn't in the ridge's middle.
     path[:, 5] -= path[0, 5]
@@ -320,11 +316,12 @@ def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) 
     at = 0.5 * (path[1:, 5] + path[:-1, 5])
     # Generalised least squares: the farther away, the less a direction tells of the beginning.
     near, apart = np.minimum.outer(at, at), np.abs(np.subtract.outer(at, at))
-    noise = TURNING * near + CURVATURE_RATE * near**2 * (near / 3.0 + apart / 2.0) + ANGLE_ERROR**2 * np.eye(len(at))
+    # A vertex is off by 0.4 px across, and the direction between two by 0.15 rad.
+    noise = TURNING * near + CURVATURE_RATE * near**2 * (near / 3.0 + apart / 2.0) + 0.15**2 * np.eye(len(at))
     design = np.column_stack([np.ones_like(at), at])
     weights = np.linalg.solve(noise, design)
     covariance = np.zeros((3, 3))
-    covariance[0, 0], covariance[1:, 1:] = POSITION_ERROR**2, np.linalg.inv(design.T @ weights)
+    covariance[0, 0], covariance[1:, 1:] = 0.4**2, np.linalg.inv(design.T @ weights)
     begun, curvature = covariance[1:, 1:] @ weights.T @ angles
     return Arm(path, strong, float(begun), float(curvature), covariance, float(np.median(path[:, 4])))
 
@@ -360,7 +357,7 @@ def _cost(ridge: Ridge, one: Arm, other: Arm) -> float:
     curve, chord = joining_curve(one, other), math.atan2(across[1], across[0])
     g = float(arc_lengths(curve)[-1])
     a, b = _wrapped(one.angle + math.pi - chord), _wrapped(other.angle - chord)
-    if g < 1.0 or max(abs(a), abs(b)) > MAX_TURN:
+    if g < 1.0 or max(abs(a), abs(b)) > 2.0:  # rad from the chord
         return math.inf
     k = -one.curvature
     error = np.array([a * g + 0.5 * k * g * g, b - a - k * g, other.curvature - k])
@@ -446,7 +443,8 @@ def continuations(
             costs[one, other] = costs[other, one] = cost
     closed, beyond = _beyond(ridge, dish, lengths[1], arms, entry)
     costs[closed] = np.inf
-    early = SHORT_COST * np.clip((WHOLE - (lengths[0] + beyond) / lengths[1]) / EARLY, 0.0, 1.0)
+    # A thread that ends before 85 % of its length costs more, in full before 65 %.
+    early = 4.0 * np.clip((0.85 - (lengths[0] + beyond) / lengths[1]) / 0.2, 0.0, 1.0)
     early[entry] = 0.0
     costs[entry] += early
     costs[:, entry] += early

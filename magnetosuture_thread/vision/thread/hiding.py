@@ -19,10 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Picture, Wall, glare_mask
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.appearance import NEEDLE_PX
 
@@ -111,19 +110,16 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     inside = np.hypot(places[:, 1], places[:, 2]) < 1.0
     if inside.sum() < 4 * places.shape[1]:
         return np.zeros((rows, columns), np.uint8), np.full((rows, columns), 1.0, np.float32)
-    weights = np.zeros((places.shape[1], means.shape[1]))
     some = np.zeros(cells[::-1], np.bool_)
     some[::2, ::2] = True  # far more than enough for so few weights
     fitted = inside & some.ravel()
-    _fit_light(places[fitted], means[fitted].astype(float), weights)
-    light = np.maximum(places @ weights, 1.0)
+    light = np.maximum(places @ _fit_light(places[fitted], means[fitted].astype(float)), 1.0)
     ratios = np.ascontiguousarray((means[inside] / light[inside] - 1.0).T)  # numpy is slow along a short last axis
     bounds = _bound(ratios.mean(axis=0), MIN_CONTRAST), _bound(np.ptp(ratios, axis=0), MIN_COLOUR)
     light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
-    found = np.zeros(small.shape[:2], np.uint8)
-    at_small = cv2.resize(light, size).reshape(*found.shape, -1)
-    _mark_unlike(small.reshape(at_small.shape), at_small, bounds, (*near.centre, near.radius), found)
-    opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    at_small = cv2.resize(light, size).reshape(size[1], size[0], -1)
+    found = _unlike(small.reshape(at_small.shape), at_small, bounds, near)
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] * SHRUNK**2 >= min_area
     large[0] = False
@@ -143,68 +139,47 @@ def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArra
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, far, far * far])
 
 
-@compiled
-def _fit_light(basis, values, weights):
-    """Fill in for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
+def _fit_light(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
 
     Args:
         basis: the functions, shape (cells, functions).
         values: of the colours, shape (cells, colours) [grey levels].
-        weights: filled, shape (functions, colours).
+
+    Returns:
+        Weights, shape (functions, colours).
     """
-    count, size = basis.shape
-    normal, right, residuals = np.empty((size, size)), np.empty(size), np.empty(count)
-    for colour in range(values.shape[1]):
-        own = np.zeros(size)
-        own[0] = np.median(values[:, colour])
+    weights = np.zeros((basis.shape[1], values.shape[1]))
+    for colour, light in enumerate(values.T):
+        own = np.zeros(basis.shape[1])
+        own[0] = np.median(light)
         for _ in range(8):
-            for cell in range(count):
-                residuals[cell] = values[cell, colour]
-                for i in range(size):
-                    residuals[cell] -= basis[cell, i] * own[i]
-            bound = 4.0 * max(0.5, 1.4826 * np.median(np.abs(residuals)))
-            normal[:], right[:] = 1e-6 * np.eye(size), 0.0
-            for cell in range(count):
-                share = max(1.0 - (residuals[cell] / bound) ** 2, 0.0) ** 2
-                if share == 0.0:
-                    continue
-                for i in range(size):
-                    weighted = share * basis[cell, i]
-                    right[i] += weighted * values[cell, colour]
-                    for j in range(i + 1):
-                        normal[i, j] += weighted * basis[cell, j]
-            for i in range(size):
-                for j in range(i):
-                    normal[j, i] = normal[i, j]
+            residuals = light - basis @ own
+            bound = 4.0 * max(0.5, 1.4826 * float(np.median(np.abs(residuals))))
+            weighted = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2 * basis
             before = own
-            own = np.linalg.solve(normal, right)
+            own = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(len(own)), weighted.T @ light)
             if np.abs(own - before).max() < 0.1:  # grey levels
                 break
         weights[:, colour] = own
+    return weights
 
 
-@compiled
-def _mark_unlike(small, light, bounds, dish, found):
-    """Mark where the mean of q_c, or the greatest less the least, is beyond its bound, within a dish.
+def _unlike(small: Mask, light: NDArray[np.float32], bounds: tuple[float, float], dish: Wall) -> NDArray[np.bool_]:
+    """Return where the mean of q_c, or the greatest less the least, is beyond its bound, within a dish.
 
     Args:
         small: the shrunk image, shape (rows, columns, colours), uint8.
         light: of the floor there, of the same shape [grey levels].
         bounds: of the mean and of the range.
-        dish: u, v and radius in the image that is not shrunk [px].
-        found: set to 1 there, shape (rows, columns).
+        dish: in pixels of the image that is not shrunk.
     """
-    rows, columns, colours = small.shape
-    for row in range(rows):
-        for column in range(columns):
-            u, v = SHRUNK * column - dish[0], SHRUNK * row - dish[1]
-            if u * u + v * v >= dish[2] * dish[2]:
-                continue
-            total, least, most = 0.0, np.inf, -np.inf
-            for colour in range(colours):
-                ratio = small[row, column, colour] / light[row, column, colour] - 1.0
-                total, least, most = total + ratio, min(least, ratio), max(most, ratio)
-            found[row, column] = abs(total) > bounds[0] * colours or most - least > bounds[1]
+    rows, columns = small.shape[:2]
+    v, u = SHRUNK * np.arange(rows)[:, None] - dish.centre[1], SHRUNK * np.arange(columns) - dish.centre[0]
+    ratios = [small[..., colour] / light[..., colour] - np.float32(1.0) for colour in range(small.shape[2])]
+    apart = reduce(np.maximum, ratios) - reduce(np.minimum, ratios)
+    beyond = (np.abs(sum(ratios)) > bounds[0] * len(ratios)) | (apart > bounds[1])
+    return np.asarray(beyond & (u * u + v * v < dish.radius**2))
 
 
 def _bound(values: NDArray[np.float64], minimum: float) -> float:

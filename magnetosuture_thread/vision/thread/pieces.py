@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +12,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.images import Picture
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
 from magnetosuture_thread.vision.thread.appearance import (
     FAINTEST,
@@ -37,7 +36,6 @@ TWICE_PX, MAX_TWICE_PX = 2.5, 10.0  # a line this near to another shows the same
 NEAR_PX = 7.0  # from an end, up to which something hides the thread that goes on there
 AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be visible
 BESIDE_POINTS = 6  # last vertices of a piece, beside which its floor is measured
-BARE_STEP, BARE_CHANGE = 0.025, 0.06  # of the floor's light: off a straight line from beside an end to beyond; in all
 BARE_COLOUR = 0.03  # of it, by which colours may change apart, on average over the farthest rings
 
 
@@ -247,7 +245,7 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
     if len(strand.points) < BESIDE_POINTS:
         return False
-    usual = float(_medians(strand.strength[None, -BESIDE_POINTS:])[0])
+    usual = float(np.median(strand.strength[-BESIDE_POINTS:]))
     if usual < max(2.0 * FAINTEST, 4.0 * thread.noise):
         return False
     point, way = strand.points[-1], end_direction(strand.points)
@@ -263,18 +261,12 @@ def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Str
     aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
     last = strand.points[-BESIDE_POINTS - 1 :]  # with one more, for the direction at the first
     beside = across(last, np.concatenate([-aside, aside]))[-BESIDE_POINTS:]
-    floor, beyond = float(_medians(sampled(gray, beside).reshape(1, -1))[0]), sampled(gray, ahead)
+    floor, beyond = float(np.median(sampled(gray, beside))), sampled(gray, ahead)
     if floor - float(beyond[1:].min()) > max(0.5 * usual, FAINTEST + 3.0 * thread.noise):  # It goes on.
         return False
-    light = np.vstack([_medians(sampled_colours(picture.image, at)) for at in (beside, ahead)])
-    light /= np.maximum(_medians(light[None, : len(beside)])[0], 1.0)
+    light = np.vstack([np.median(sampled_colours(picture.image, at), axis=1) for at in (beside, ahead)])
+    light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
     mean = light.mean(axis=1)
     step = np.abs(OFF_LINE @ mean).max()
-    even = step < BARE_STEP and np.abs(mean - 1.0).max() < BARE_CHANGE
+    even = step < 0.025 and np.abs(mean - 1.0).max() < 0.06
     return bool(even and np.ptp(light[-3:].mean(axis=0)) < BARE_COLOUR)
-
-
-def _medians(values: NDArray[Any]) -> NDArray[Any]:
-    """Return medians along the second axis; for few values numpy's own takes several times as long."""
-    ordered, count = np.sort(values, axis=1), values.shape[1]
-    return np.asarray(0.5 * (ordered[:, (count - 1) // 2] + ordered[:, count // 2]))

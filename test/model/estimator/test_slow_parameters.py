@@ -16,7 +16,7 @@ from magnetosuture_thread.model.estimator.parameter_kinds import KINDS, NORMAL_9
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
 from magnetosuture_thread.model.prediction import NeedlePose, Prediction
-from magnetosuture_thread.model.program import as_quadratic_program
+from magnetosuture_thread.model.solvers.osqp import as_quadratic_program
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
@@ -184,7 +184,7 @@ def test_sensitivities_information_and_score_are_those_of_a_dense_filter(end: tu
     other = corrector.sensitivities(moved)
     score, square = 0.5 * (found.score - other.score), 0.5 * (found.square + other.square)
 
-    normals, buffers, known = np.zeros((nodes, 2)), StepBuffers.of(nodes, 2, 1, 2), np.zeros(nodes, dtype=np.bool_)
+    normals, buffers, known = np.zeros((nodes, 2)), StepBuffers.of(nodes, 2, 1), np.zeros(nodes, dtype=np.bool_)
     normals_of(start, normals)
     stiffness = thread.bending_stiffness / (thread.medium.drag_across * unit**4)
     scale = max((1.0 / density[1:]).max(), (points.share / points.variance).max())

@@ -102,32 +102,6 @@ def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: NeedleJoint, root
     np.testing.assert_allclose(decay[1:], 0.2, rtol=4e-3)
 
 
-def test_a_thread_that_is_pulled_lengthwise():
-    made, speed = rig(), 5e-3
-    for k in range(1, 31):
-        made.drive((k * FRAME * speed, 0.0), 0.0, FRAME)
-    # Half a segment at the tail is carried by the needle.
-    along = POLYAMIDE.length * (1.0 - (np.arange(60) + 0.5) / 60.0)
-    expected = POLYAMIDE.drag_along * speed * along
-    np.testing.assert_allclose(made.tension, expected, atol=1e-4 * expected[0])
-    assert np.abs(made.thread[:, 1]).max() < 1e-12
-    np.testing.assert_allclose(made.thread[-1, 0], 30 * FRAME * speed - 19e-3, atol=2e-7)
-
-
-def test_a_glued_thread_keeps_the_tangent_and_a_pinned_one_does_not():
-    turns = []
-    for thread in (CLAMPED, POLYAMIDE):
-        made = rig(thread)
-        for k in range(1, 31):
-            made.drive((0.0, 0.0), k / 30.0, FRAME)
-        first, second = np.diff(made.thread[:3], axis=0)
-        # The tangent at the tail, of second order.
-        tangent = 1.5 * math.atan2(-first[1], -first[0]) - 0.5 * math.atan2(-second[1], -second[0])
-        turns.append(math.remainder(made.heading - tangent, 2.0 * math.pi))
-    assert abs(turns[0]) < 5e-3
-    assert abs(turns[1]) > 0.5
-
-
 def test_without_currents_the_energy_only_falls():
     made = rig(curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),)))
     segment, energies = POLYAMIDE.length / POLYAMIDE.segments, []
@@ -138,18 +112,6 @@ def test_without_currents_the_energy_only_falls():
         made.step(np.zeros(4), FRAME)
     assert (np.diff(energies) < 0.0).all()
     assert energies[-1] < 0.7 * energies[0]
-
-
-def test_the_world_can_be_turned():
-    turn, thread = 0.8, replace(CLAMPED, segments=30)
-    plain = steered(rig(thread, curvature=40.0, heading=0.2), 1.0, 2.0)
-    turned = rig(thread, curvature=40.0, heading=0.2 + turn, field=coils(turn))
-    steered(turned, 1.0, 2.0)
-    c, s = math.cos(turn), math.sin(turn)
-    back = turned.thread @ np.array([[c, -s], [s, c]])
-    assert np.linalg.norm(plain.tail) > 1e-3
-    np.testing.assert_allclose(back, plain.thread, atol=1e-9)
-    assert turned.heading - turn == pytest.approx(plain.heading, abs=1e-7)
 
 
 @pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])

@@ -29,14 +29,6 @@ def test_a_straight_needle_has_the_drag_of_a_cylinder():
     assert turn > across * 7e-3**2 / 12.0
 
 
-def test_half_a_circle_has_the_mean_drag_in_every_direction():
-    needle = body(curvature=math.pi / 7e-3)
-    along, across, _ = needle.drag
-    mean = 0.5 * (along + across)
-    np.testing.assert_allclose(needle.resistance[:2, :2], mean * np.eye(2), rtol=1e-9, atol=1e-9 * mean)
-    np.testing.assert_allclose(needle.tip, [0.0, 2.0 * 7e-3 / math.pi], atol=1e-15)
-
-
 def test_a_curved_needle_is_an_arc_to_the_left_and_its_mirror_image_to_the_right():
     left, right = body(curvature=100.0), body(curvature=-100.0)
     outline = left.outline(50)

@@ -25,16 +25,6 @@ def asked(board: RoboClawBoard, command: int, form: str, time: float) -> tuple[i
     return struct.unpack(form, answer[:-2])
 
 
-def test_duties_are_taken_and_given_back():
-    board = RoboClawBoard()
-    assert board.receive(packet(34, 1000, -2000), 1.0) == b"\xff"
-    assert board.duties == (1000, -2000)
-    assert asked(board, 48, ">hh", 1.0) == (1000, -2000)
-    assert board.receive(packet(32, 5, form=">h"), 1.1) == b"\xff"
-    assert board.receive(packet(33, 6, form=">h"), 1.2) == b"\xff"
-    assert list(board.timeline) == [(1.0, (1000, -2000)), (1.1, (5, -2000)), (1.2, (5, 6))]
-
-
 def test_what_is_not_right_is_not_answered():
     board = RoboClawBoard()
     good = packet(34, 1000, 0)
@@ -109,25 +99,6 @@ def test_an_error_stops_it_until_it_is_reset():
     assert board.receive(packet(200, form=">"), 1.3) == b"\xff"
     assert board.receive(packet(34, 1000, 0), 1.4) == b"\xff"
     assert board.duties == (1000, 0)
-
-
-def test_a_current_is_reported_by_how_it_is_driven():
-    board = RoboClawBoard()
-    board.receive(packet(34, -FULL // 4, FULL // 4), 1.0)
-    first, second = asked(board, 49, ">hh", 2.0)
-    assert first == pytest.approx(600, abs=1)
-    assert second == pytest.approx(600, abs=1)
-    board.receive(packet(34, FULL // 4, FULL // 4), 2.0)
-    assert asked(board, 49, ">hh", 2.0)[0] == pytest.approx(-600, abs=1)
-    board.receive(packet(34, 0, 0), 2.0)
-    assert asked(board, 49, ">hh", 2.0)[0] == pytest.approx(600, abs=1)
-
-
-def test_a_command_may_be_acknowledged_and_not_obeyed():
-    board = RoboClawBoard()
-    board.ignored.add(34)
-    assert board.receive(packet(34, 1000, 0), 1.0) == b"\xff"
-    assert board.duties == (0, 0)
 
 
 def test_a_board_whose_power_was_gone_is_as_it_was_delivered():

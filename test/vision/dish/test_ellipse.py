@@ -11,7 +11,7 @@ import pytest
 from benchmarks.vision.photographs import DIAMETER, RIGHT, ellipse_error, photo_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.dish.ellipse import Ellipse, find_ellipse
-from magnetosuture_thread.vision.dish.tilt import Tilt, find_tilt
+from magnetosuture_thread.vision.dish.find import Tilt, find_tilt
 from magnetosuture_thread.vision.dish.watch import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.vision.scenes import Pose, render

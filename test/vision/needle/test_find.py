@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.vision.images import Layer, prepare
-from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.arc import REVERSED_PX, Arc, LengthEstimator, MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.find import find_needles
-from magnetosuture_thread.vision.needle.measured_needle import REVERSED_PX, LengthEstimator, MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.template import (
     BLOOM_PX,
     THIN,

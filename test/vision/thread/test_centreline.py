@@ -9,8 +9,7 @@ import pytest
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.vision.images import Wall, prepare
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.centreline import WALL_PX, find_centreline
 from magnetosuture_thread.vision.tracker import VisionTracker

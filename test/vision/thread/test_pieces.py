@@ -17,13 +17,11 @@ from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.look import Track
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.thread.appearance import Appearance, Strand, appearance_of
 from magnetosuture_thread.vision.thread.hiding import Hiding
-from magnetosuture_thread.vision.thread.observe import observe
-from magnetosuture_thread.vision.thread.order import Piece, find_order
+from magnetosuture_thread.vision.thread.observe import Piece, find_order, observe
 from magnetosuture_thread.vision.thread.pieces import BARE_COLOUR, is_bare_beyond
 from magnetosuture_thread.vision.tracker import VisionTracker
 

@@ -42,6 +42,10 @@ MAX_MISMATCHES = 2  # consecutive; the first may be a lost packet
 
 # Errors in the boards' manual that the manufacturer's library lacks.
 DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
+ACK = b"\xff"
+MAX_ATTEMPTS = 2
+# Pause after a failure, in which the board drops a partial packet.
+RETRY_DELAY = 0.015  # s
 
 
 class Query(enum.Enum):
@@ -285,11 +289,6 @@ def _open_problem(path: str, error: Exception) -> str:
         return f"no permission for {path}; its group is usually dialout"
     return f"cannot open {path}: {error}"
 
-
-ACK = b"\xff"
-MAX_ATTEMPTS = 2
-# Pause after a failure, in which the board drops a partial packet.
-RETRY_DELAY = 0.015  # s
 
 # The library logs every missing byte, a hundred times a second for a dead board; the driver reports the problem
 # in its state. A level that was set before is kept.

@@ -29,6 +29,9 @@ from magnetosuture_thread.errors import DriverError
 KEEP_ALIVE_PERIOD = 0.02  # s, maximum between two writes; a board's own timeout is at least five times as long
 POLL_PERIOD = 0.02  # s, maximum between two queries, however often currents are commanded
 SHUTDOWN_TIMEOUT = 0.12  # s in which boards are set to zero at the end
+DEFAULT_ADDRESS = 128  # of a board as delivered
+MIN_BAUD_RATE = 38400  # at which a board's longest answer arrives in time
+CLOSE_TIMEOUT = 0.3  # s
 
 
 @dataclass(frozen=True)
@@ -271,12 +274,6 @@ def _set_zero(board: Board) -> bool:
     return True
 
 
-DRIVER_NAME = "roboclaw"
-DEFAULT_ADDRESS = 128  # of a board as delivered
-MIN_BAUD_RATE = 38400  # at which a board's longest answer arrives in time
-CLOSE_TIMEOUT = 0.3  # s
-
-
 class RoboClawDriver:
     """Driver for RoboClaw boards of two coils each: coils 0 and 1 are on the first board, 2 and 3 on the second.
 
@@ -374,29 +371,29 @@ def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[
     """
     ports, addresses = settings.roboclaw_ports, settings.roboclaw_addresses
     if not ports:
-        raise DriverError(DRIVER_NAME, "roboclaw_ports is empty, expected the serial port of each board")
+        raise DriverError("roboclaw", "roboclaw_ports is empty, expected the serial port of each board")
     if 2 * len(ports) != coils:
-        raise DriverError(DRIVER_NAME, f"roboclaw_ports has {len(ports)}, expected one for two of the {coils} coils")
+        raise DriverError("roboclaw", f"roboclaw_ports has {len(ports)}, expected one for two of the {coils} coils")
     if addresses and len(addresses) != len(ports):
         expected = f"one for each of the {len(ports)} roboclaw_ports, or none"
-        raise DriverError(DRIVER_NAME, f"roboclaw_addresses has {len(addresses)}, expected {expected}")
+        raise DriverError("roboclaw", f"roboclaw_addresses has {len(addresses)}, expected {expected}")
     tenths = 10.0 * settings.driver_timeout
     if abs(tenths - round(tenths)) > 1e-6:
-        raise DriverError(DRIVER_NAME, f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second")
+        raise DriverError("roboclaw", f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second")
     if settings.roboclaw_baud_rate < MIN_BAUD_RATE:
         expected = f"at least {MIN_BAUD_RATE}, so that answers come in time"
-        raise DriverError(DRIVER_NAME, f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")
+        raise DriverError("roboclaw", f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")
     found: dict[str, dict[int, int]] = {}
     for number, (path, address) in enumerate(zip(ports, addresses or [DEFAULT_ADDRESS] * len(ports), strict=True)):
         on_port = found.setdefault(path, {})
         if address in on_port.values():
-            raise DriverError(DRIVER_NAME, f"two boards on {path} have address {address}, expected an address for each")
+            raise DriverError("roboclaw", f"two boards on {path} have address {address}, expected an address for each")
         on_port[number] = address
     for path, boards in found.items():
         if shared := set(boards.values()).intersection(_others(found, path)):
             expected = "different addresses, or a path of each that stays with its plug, as under /dev/serial/by-path"
             problem = f"{path} and another port have boards of address {min(shared)}, expected {expected}"
-            raise DriverError(DRIVER_NAME, problem)
+            raise DriverError("roboclaw", problem)
     return found
 
 

@@ -100,15 +100,6 @@ def test_without_being_asked_again_it_goes_to_zero_by_itself(bench):
         assert driver.state().warnings == ()
 
 
-def test_what_stays_in_force_is_written_often_enough(bench):
-    driver = bench.open(apply_timeout=60.0, driver_timeout=0.5, **PATIENT)
-    driver.apply(np.array(CURRENTS), time.monotonic())
-    bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties")
-    since = bench.boards[0].timeline[0][0]
-    bench.wait(lambda: bench.boards[0].heard > since + 1.2, "twice the timeout to pass")
-    assert [duties for _, duties in bench.boards[0].timeline] == [DUTIES[0]]
-
-
 def test_boards_stop_by_themselves_where_the_process_is_killed(bench):
     bench.stage.open()
     process = subprocess.Popen([sys.executable, "-c", ANOTHER, *bench.settings().roboclaw_ports])
@@ -216,30 +207,12 @@ def test_too_much_current_is_a_loss(bench):
     bench.wait(lambda: driver.state().ready, "the driver to be back")
 
 
-def test_a_board_that_limits_a_current_does_not_count_as_disobedient(bench):
-    for board in bench.boards:
-        board.resistance = 0.5
-    driver = bench.open()
-    with bench.held(driver, 9.0, 0.0, 0.0, 0.0):
-        bench.wait(lambda: any("at its limit" in text for text in driver.state().warnings), "the warning")
-        for _ in range(30):
-            bench.heard(0, 1)
-            assert "has duties" not in driver.state().problem
-        assert bench.boards[0].currents[0] == 10.0
-
-
 def test_whatever_happens_in_its_thread_it_comes_back(bench, monkeypatch):
     driver = bench.open()
     with monkeypatch.context() as patch:
         patch.setattr(driver._lines[0], "_report", lambda: 1 / 0)
         bench.wait(lambda: "ZeroDivisionError" in driver.state().problem, "the failure")
     bench.wait(lambda: driver.state().ready, "the driver to be back")
-
-
-def test_a_supply_that_breaks_down_is_a_loss(bench):
-    driver = bench.open()
-    bench.boards[0].supply = 3.0
-    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
 
 
 @pytest.mark.parametrize(
@@ -266,13 +239,6 @@ def test_a_board_that_acknowledges_duties_and_does_not_take_them_is_found(bench)
     with bench.held(driver, *CURRENTS):
         bench.wait(lambda: "has duties (0, 0) instead of (4095, -8191)" in driver.state().problem, "the problem")
         bench.wait(lambda: bench.duties(1) == (0, 0), "zero")
-
-
-def test_a_board_that_does_not_go_to_zero_at_the_start_is_never_ready(bench):
-    bench.boards[0].duties = (100, 0)
-    bench.boards[0].ignored.add(packets.SET_DUTIES)
-    driver = bench.open(ready=False)
-    bench.wait(lambda: "duties 100 and 0 instead of 0 and 0" in driver.state().problem, "the problem")
 
 
 def test_a_port_belongs_to_one_writer(bench):
@@ -324,18 +290,6 @@ def test_a_stop_wins_over_what_was_asked_before_it(bench, shared: bool):
     assert driver.state().losses == 0
 
 
-def test_two_boards_can_share_a_port(bench):
-    bench.share()
-    driver = bench.open()
-    with bench.held(driver, *CURRENTS):
-        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties")
-        bench.stage.lines[0].faults.mute = frozenset({129})
-        bench.wait(lambda: "board 1" in driver.state().problem, "the loss")
-        bench.wait(lambda: bench.duties(0) == bench.duties(1) == (0, 0), "zero")
-        bench.stage.lines[0].faults.mute = frozenset()
-        bench.wait(lambda: [bench.duties(0), bench.duties(1)] == DUTIES, "the duties again")
-
-
 def test_closing_leaves_zero_and_the_port_free(bench):
     driver = bench.open(driver_timeout=1.0)
     with bench.held(driver, *CURRENTS):
@@ -350,15 +304,6 @@ def test_closing_leaves_zero_and_the_port_free(bench):
     driver.close()
     driver.open()
     bench.wait(lambda: driver.state().ready, "the driver to be ready again")
-
-
-def test_closing_ends_the_thread_where_nobody_answers(bench):
-    bench.share()
-    driver = bench.open()
-    bench.stage.lines[0].faults.silent = True
-    bench.wait(lambda: not driver.state().ready, "the loss")
-    driver.close()
-    bench.wait(lambda: not any(t.name.startswith("roboclaw") for t in threading.enumerate()), "the thread to end")
 
 
 def test_nothing_waits_for_a_board(bench):

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.drivers.roboclaw import board as protocol
-from magnetosuture_thread.coils.drivers.roboclaw.board import Query
 
 
 @pytest.mark.parametrize(
@@ -37,16 +34,6 @@ def test_a_duty_is_the_share_of_the_supply(current: float, resistance: float, vo
 )
 def test_a_current_falls_short_below_half_of_what_is_due(due: float, measured: float, expected: bool):
     assert protocol.is_short(due, measured) is expected
-
-
-def test_every_question_is_asked_and_duties_most_of_all():
-    assert set(protocol.POLL_SEQUENCE) == set(Query)
-    assert protocol.POLL_SEQUENCE[0] is Query.DUTIES
-    counts = Counter(protocol.POLL_SEQUENCE)
-    assert counts[Query.DUTIES] == counts[Query.CURRENTS] == max(counts.values())
-    assert all(counts[setting] == 1 for setting in protocol.SETTING_QUERIES)
-    # With two boards on a line and a question each 20 ms, each comes within about a second.
-    assert 2 * 0.02 * len(protocol.POLL_SEQUENCE) < 1.0
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,14 @@ import numpy as np
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.reproduce.hernia.pictures import draw_animation, draw_hernia
-from magnetosuture_thread.reproduce.hernia.steering import HerniaRun, RecordedCommands, point_filter, replay_steering
+from magnetosuture_thread.reproduce.hernia import (
+    HerniaRun,
+    RecordedCommands,
+    draw_animation,
+    draw_hernia,
+    point_filter,
+    replay_steering,
+)
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 

@@ -1,4 +1,4 @@
-"""The report of a campaign as a page of HTML that loads nothing and runs no script."""
+"""The report of a campaign: a page of HTML with pictures of failed runs, which loads nothing and runs no script."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from magnetosuture_thread.campaign.limits import KEEP_OUT_TOLERANCE, MAX_REST, MAX_TIME_RATIO, PENETRATION_TOLERANCE
-from magnetosuture_thread.campaign.report.charts import RunChart, draw_chart
-from magnetosuture_thread.campaign.report.pictures import InstantPicture, outline_shapes, picture_instant
-from magnetosuture_thread.campaign.run import RunResult
+import numpy as np
+
+from magnetosuture_thread.campaign.run import (
+    KEEP_OUT_TOLERANCE,
+    MAX_REST,
+    MAX_TIME_RATIO,
+    PENETRATION_TOLERANCE,
+    RunInstant,
+    RunResult,
+)
 from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
 MAX_STRIPS = 200  # failed runs with pictures
@@ -26,6 +35,10 @@ NAMES = {
     "max_friction_nodes": "too many nodes were under friction",
     "time_s": "it took too long",
 }
+CLOSE_UP = 4.0  # lengths of the needle: side of a close-up
+MIN_CLOSE_UP = 8e-3  # m
+BORDER = 0.02  # of the dish's radius, around it
+MIN_COMMAND = 1e-6  # m/s; a smaller command has no arrow
 
 
 @dataclass(frozen=True)
@@ -36,7 +49,6 @@ class CampaignDetails:
         procedure: that was run.
         setup: what the nodes believe.
         camera: whether frames were rendered and tracked.
-        follower: whether the setup's path follower ran in place of the procedure.
         died: seeds whose process ended early, and why.
         bags: seeds of which there is a bag, with its folder beside the page.
     """
@@ -44,7 +56,6 @@ class CampaignDetails:
     procedure: Procedure
     setup: Setup
     camera: bool
-    follower: bool
     died: dict[int, str]
     bags: dict[int, str]
 
@@ -102,7 +113,6 @@ def write_campaign_page(details: CampaignDetails, runs: Sequence[RunResult]) -> 
         left_out=sum(not run.success for run in runs) - shown,
         tiles=_tiles(details, rows),
         reasons=_reasons(rows),
-        charts=_charts(details, runs),
         shapes=outline_shapes(scene),
         dish_radius=1e3 * scene.dish.radius,
         needle_width=1e3 * details.setup.rig.needle_width,
@@ -149,7 +159,7 @@ def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
     clearance = min(found.min_needle_clearance_m for found in figures)
     penetration = max(found.max_thread_penetration_m for found in figures)
     rest = max(found.longest_rest_s for found in figures)
-    ratios = [ratio for row in rows if row.result.reached and math.isfinite(ratio := time_ratio(row.result))]
+    ratios = [ratio for row in rows if row.result.reached and math.isfinite(ratio := _time_ratio(row.result))]
     tiles = [
         Tile("runs that succeeded", f"{successes} of {count}", _grade(successes == count), "all goals, all limits"),
         Tile("runs that reached all goals", f"{reached} of {count}", _grade(reached == count), "limits apart"),
@@ -174,28 +184,7 @@ def _tiles(details: CampaignDetails, rows: Sequence[RunRow]) -> list[Tile]:
     return tiles
 
 
-def _charts(details: CampaignDetails, runs: Sequence[RunResult]) -> list[RunChart]:
-    tensions = {limits.tension for limits in details.procedure.limits}
-    tension = tensions.pop() if len(tensions) == 1 else math.inf  # goals with limits of their own have no common line
-    marks = [(run.seed, run.success) for run in runs]
-    columns = [
-        ("time over ideal time", "", [time_ratio(run) for run in runs], MAX_TIME_RATIO, False),
-        (
-            "minimum clearance of the needle's axis", "mm",
-            [1e3 * run.figures.min_needle_clearance_m for run in runs], 1e3 * details.min_clearance, True,
-        ),
-        ("longest rest", "s", [run.figures.longest_rest_s for run in runs], MAX_REST, False),
-        (
-            "peak tension", "mN", [1e3 * run.figures.max_tension_n for run in runs],
-            1e3 * tension if tension < 1.0 else math.nan, False,
-        ),
-    ]  # fmt: skip
-    if any(run.figures.wrap_degrees for run in runs):
-        columns.append(("angle swept by the thread", "°", [run.figures.wrap_degrees for run in runs], math.nan, False))
-    return [draw_chart(name, unit, marks, values, limit, lower) for name, unit, values, limit, lower in columns]
-
-
-def time_ratio(run: RunResult) -> float:
+def _time_ratio(run: RunResult) -> float:
     """Return time over ideal time; NaN without an ideal time."""
     figures = run.figures
     return figures.time_s / figures.ideal_time_s if figures.ideal_time_s > 0.0 else math.nan
@@ -203,3 +192,88 @@ def time_ratio(run: RunResult) -> float:
 
 def _grade(is_good: bool) -> str:
     return GOOD if is_good else BAD
+
+
+@dataclass(frozen=True)
+class ShapeOutline:
+    """A shape as the path of an SVG.
+
+    Attributes:
+        kind: of the shape.
+        path: of its outline and holes [mm].
+    """
+
+    kind: str
+    path: str
+
+
+@dataclass(frozen=True)
+class InstantPicture:
+    """An instant as an SVG shows it: lengths in mm, y upwards.
+
+    Attributes:
+        instant: what is shown.
+        box: left, lower end, width and height of what is shown.
+        thread: vertices, as an SVG's list of points.
+        needle: its axis, likewise.
+        path: planned way of its middle, likewise; empty without one.
+        command: ends of an arrow from the tip, x1, y1, x2, y2; empty where nothing is commanded.
+        is_overview: whether the whole dish is shown.
+    """
+
+    instant: RunInstant
+    box: tuple[float, float, float, float]
+    thread: str
+    needle: str
+    path: str
+    command: tuple[float, ...]
+    is_overview: bool
+
+
+def outline_shapes(scene: Scene) -> list[ShapeOutline]:
+    """Return the shapes of a scene."""
+    return [ShapeOutline(shape.kind, _outline(shape.geometry)) for shape in scene.shapes]
+
+
+def picture_instant(instant: RunInstant, scene: Scene, speed: float, *, overview: bool = False) -> InstantPicture:
+    """Return the picture of an instant, the whole dish or the surroundings of the needle.
+
+    Args:
+        instant: to show.
+        scene: around it.
+        speed: at which the arrow of the command has the needle's length [m/s].
+        overview: whether the whole dish is shown.
+    """
+    axis, frame = instant.axis, instant.frame
+    length = float(np.linalg.norm(axis[-1] - axis[0]))
+    if overview:
+        half = (1.0 + BORDER) * scene.dish.radius
+        centre = np.zeros(2)
+    else:
+        half = 0.5 * max(CLOSE_UP * length, MIN_CLOSE_UP)
+        centre = 0.5 * (axis[0] + axis[-1])
+    low = 1e3 * (centre - half)
+    command: tuple[float, ...] = ()
+    if math.hypot(*frame.commanded) > MIN_COMMAND:
+        ends = np.concatenate([axis[-1], axis[-1] + length / speed * frame.commanded])
+        command = tuple(round(1e3 * value, 3) for value in ends.tolist())
+    return InstantPicture(
+        instant,
+        (round(float(low[0]), 3), round(float(low[1]), 3), round(2e3 * half, 3), round(2e3 * half, 3)),
+        _points(frame.thread),
+        _points(axis),
+        "" if instant.path is None else _points(instant.path),
+        command,
+        overview,
+    )
+
+
+def _points(vertices: Points) -> str:
+    return " ".join(f"{1e3 * x:.3f},{1e3 * y:.3f}" for x, y in vertices.tolist())
+
+
+def _outline(geometry: Disc | Polygon) -> str:
+    if isinstance(geometry, Disc):
+        x, y, r = (1e3 * value for value in (*geometry.centre, geometry.radius))
+        return f"M{x - r:.3f},{y:.3f}a{r:.3f},{r:.3f} 0 1 0 {2 * r:.3f},0a{r:.3f},{r:.3f} 0 1 0 {-2 * r:.3f},0z"
+    return "".join(f"M{_points(ring).replace(' ', 'L')}z" for ring in geometry.rings)
