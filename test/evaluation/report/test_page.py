@@ -257,11 +257,13 @@ def drawn(browser: str, folder: Path, page: str) -> str:
     ).stdout
 
 
-BROWSERS = [path for name in ("chromium", "google-chrome") if (path := shutil.which(name))][:1]
+BROWSERS = [
+    pytest.param(path, marks=pytest.mark.slow) for name in ("chromium", "google-chrome") if (path := shutil.which(name))
+]
 
 
 @pytest.mark.parametrize("estimated", [False, True])
-@pytest.mark.parametrize("browser", [None, *BROWSERS])
+@pytest.mark.parametrize("browser", [None, *BROWSERS[:1]])
 def test_a_browser_draws_all_plots_where_there_is_one(tmp_path: Path, page: str, browser: str | None, estimated: bool):
     """The page's script has a place for each plot; a real browser, where there is one, fills them."""
     page = made_page(estimated=True) if estimated else page
