@@ -205,17 +205,10 @@ def filter_state(message: FilterState) -> dict[str, Any]:
 
 def bridge(message: CoilBridgeState) -> dict[str, Any]:
     """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
-    shown: tuple[str, ...] = (
-        "armed",
-        "emergency_stopped",
-        "reasons",
-        "commanded",
-        "filtered",
-        "applied",
-        "saturated",
-        "driver",
+    shown = (
+        *("armed", "emergency_stopped", "reasons", "commanded", "filtered", "applied", "saturated", "driver"),
+        *("driver_ready", "driver_warnings", "current", "measured_current", "refused"),
     )
-    shown += ("driver_ready", "driver_warnings", "current", "measured_current", "refused")
     return {"state": _constant(message, message.state, "STATE_", "fault"), **_plain(message, *shown)}
 
 
@@ -247,7 +240,8 @@ def node_state(status: DiagnosticStatus) -> dict[str, Any]:
 
 def _constant(message: Any, value: int, prefix: str, other: str = "") -> str:
     """Return the name of a message's constant in lower case; of an unknown value `other`, or that of 0."""
-    names = _names(type(message), prefix)
+    kind: Any = type(message)
+    names = _names(kind, prefix)
     return names.get(value, other or names[0])
 
 
