@@ -53,7 +53,8 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
-    console.print(table(rows))
+    for each in tables(rows):
+        console.print(each)
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
     return {**figures, "total": total}, total["reversed"] == 0
@@ -87,32 +88,41 @@ def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
     return {"tail": needle.tail.tolist(), "heading": needle.heading, "thread": case.thread.tolist(), **case.labels}
 
 
-CAPTION = """unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees; rev: by 90; >cov:
-by more than the covariance says; px, deg: RMS of the others; line: visible thread that is followed from the tail; pcs:
-that is on pieces; off: share of pieces where no thread is; mis: pieces of a place that is wrong; all: frames said to
-show all of the thread; free: ends said to be its own; not: of these, that are not; dev: RMS of errors over their
-standard deviation"""
-COLUMNS = "pose,unkn,wrong,rev,>cov,px,deg,line,pcs,off,mis,all,not,free,not,dev,ms"
+POSES = """unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees; rev: by 90; >cov:
+by more than the covariance says; px, deg: RMS of the others"""
+PIECES = """line: visible thread that is followed from the tail; pcs: that is on pieces; off: share of pieces where no
+thread is; mis: pieces of a place that is wrong; all: frames said to show all of the thread; free: ends said to be its
+own; not: of these, that are not; dev: RMS of errors over their standard deviation"""
 
 
-def table(rows: list[Row]) -> Table:
-    """Return the rows as a table."""
-    title = f"the tracker on rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=CAPTION, caption_justify="left")
-    result.add_column("class", no_wrap=True)
-    for name in COLUMNS.split(","):
-        result.add_column(name, justify="right", no_wrap=True)
+def tables(rows: list[Row]) -> tuple[Table, Table]:
+    """Return the rows as a table of needles and one of threads."""
+    title = f"on rendered frames, {rows[0].frames} of each class"
+    needles = _table(f"the needle {title}", "pose unkn wrong rev >cov px deg ms", POSES)
+    threads = _table(f"the thread {title}", "line pcs off mis all not free not dev", PIECES)
     for row in rows:
-        result.add_row(
+        needles.add_row(
             row.name,
             *map(str, (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)),
             *(_number(value, ".2f") for value in (row.tail_px, row.angle_deg)),
+            f"{row.median_ms:.1f}",
+        )
+        threads.add_row(
+            row.name,
             *(_number(value, ".0%") for value in (row.covered, row.pieces)),
             _number(row.wrong_pieces, ".1%"),
             *map(str, (row.misplaced, row.complete, row.incomplete, row.free, row.not_free)),
             _number(row.normalised, ".1f"),
-            f"{row.median_ms:.1f}",
         )
+    return needles, threads
+
+
+def _table(title: str, columns: str, caption: str) -> Table:
+    """Return a table without rows; columns are separated by spaces."""
+    result = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=caption, caption_justify="left")
+    result.add_column("class", no_wrap=True)
+    for name in columns.split():
+        result.add_column(name, justify="right", no_wrap=True)
     return result
 
 
