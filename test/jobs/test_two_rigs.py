@@ -7,11 +7,14 @@ import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 from magnetosuture_msgs.srv import EditShape
+from rclpy.context import Context
 
 from magnetosuture_thread.interface import ADD_SHAPE, ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
@@ -72,7 +75,10 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
         for space in (LEFT, RIGHT):
             arguments = ("--params-file", str(setup), "-r", f"__ns:=/{space}", *REMAPPED[space])
             stack.enter_context(NodeProcesses(names, arguments, environment, folder / space))
-        graph = Graph(domain)
+        context = Context()
+        rclpy.init(context=context, domain_id=domain, args=[])
+        stack.callback(context.try_shutdown)
+        graph = Graph(context, domain)
         stack.callback(graph.close)
         currents = {space: graph.listen_later(within(space, topics.RIG_CURRENTS)) for space in (LEFT, RIGHT)}
         logs = {space: folder / space / "console.log" for space in (LEFT, RIGHT)}
@@ -89,6 +95,11 @@ async def ready(page: Page) -> None:
     own = {*ALL_NODES, "console"} - {PLANNER, "path_follower"}
     await wait(page, lambda: set(page.graph["nodes"]) == own, "the nodes of its rig")
     assert await page.ask(type="acquire_control") == ""
+
+
+def disarmed(page: Page) -> bool:
+    """Return whether a page shows that its bridge is disarmed."""
+    return not page.graph["bridge"]["armed"]
 
 
 async def jog(page: Page) -> None:
@@ -118,7 +129,7 @@ def test_commands_of_one_page_reach_its_own_rig_alone_also_on_a_remapped_topic(r
                 assert np.linalg.norm(tail(other) - still) < 5e-4  # it may still be drawn by its thread
                 await page.release()
                 assert await page.ask(type="bridge_action", action="disarm") == ""
-                await wait(page, lambda page=page: not page.graph["bridge"]["armed"], "the bridge to be disarmed")
+                await wait(page, partial(disarmed, page), "the bridge to be disarmed")
 
     asyncio.run(use())
     assert any(message.twist.linear.x == 0.003 for message in commands)
