@@ -61,7 +61,7 @@ def copy_kernels(package: Path) -> None:
             sys.exit(f"{installed}: expected a copy of {source}")
         status = source.stat()
         os.utime(installed, ns=(status.st_atime_ns, status.st_mtime_ns))
-    for kernel in [*PACKAGE.rglob("__pycache__/*.nb[ci]"), PACKAGE / "__pycache__" / "kernels.stamp"]:
+    for kernel in [*PACKAGE.rglob("__pycache__/*.nb[ci]"), PACKAGE / "__pycache__" / "kernels.json"]:
         copy = package / kernel.relative_to(PACKAGE)
         copy.parent.mkdir(exist_ok=True)
         shutil.copy2(kernel, copy)

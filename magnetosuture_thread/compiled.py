@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -14,6 +16,7 @@ from numba.core import event
 
 PACKAGE = Path(__file__).parent
 COMPILED_MARK = b"magnetosuture_thread.compiled"
+_IMPORT = re.compile(rb"^\s*(?:from|import) magnetosuture_thread\.([\w.]+)", re.MULTILINE)
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -66,30 +69,57 @@ def compilations() -> int:
     return len(_COMPILATIONS.buffer)
 
 
-def delete_stale_cache(package: Path = PACKAGE) -> bool:
-    """Delete the cache where a file with compiled functions has changed since; return whether it had to.
+def _dependencies(package: Path) -> dict[Path, set[Path]]:
+    """Return each source file that has compiled functions, with all files of the package that it imports and itself."""
+    imports: dict[Path, set[Path]] = {}
+    kernels: set[Path] = set()
+    for path in package.rglob("*.py"):
+        text = path.read_bytes()
+        if COMPILED_MARK in text:
+            kernels.add(path)
+        found = {package.joinpath(*module.decode().split(".")).with_suffix(".py") for module in _IMPORT.findall(text)}
+        imports[path] = {file if file.exists() else file.with_suffix("") / "__init__.py" for file in found}
+    closure: dict[Path, set[Path]] = {}
+    for path in kernels:
+        reached, waiting = {path}, [path]
+        while waiting:
+            new = imports.get(waiting.pop(), set()) - reached
+            reached |= new
+            waiting += new
+        closure[path] = {file for file in reached if file in imports}
+    return closure
 
-    numba checks the file of a function only. But a compiled function contains the code of all functions that it calls,
-    from other files too, and would keep their old code.
+
+def delete_stale_cache(package: Path = PACKAGE) -> bool:
+    """Delete cached functions of files of which any import has changed since; return whether there were such files.
+
+    numba checks the file of a function only. But a compiled function contains the code of all functions and constants
+    that it uses, from other files too, and would keep their old values.
     """
-    state = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        if COMPILED_MARK in path.read_bytes():
-            status = path.stat()
-            state.update(f"{path.relative_to(package)} {status.st_mtime_ns} {status.st_size}\n".encode())
-    stamp = package / "__pycache__" / "kernels.stamp"
-    with contextlib.suppress(OSError):
-        if stamp.read_text() == state.hexdigest():
-            return False
+
+    def state_of(files: Iterable[Path]) -> str:
+        told = ((file.relative_to(package), file.stat()) for file in sorted(files))
+        return hashlib.sha256("".join(f"{n} {s.st_mtime_ns} {s.st_size}\n" for n, s in told).encode()).hexdigest()
+
+    stamp = package / "__pycache__" / "kernels.json"
+    before: dict[str, str] = {}
+    with contextlib.suppress(OSError, ValueError):
+        before = dict(json.loads(stamp.read_text()))
+    states = {"package": state_of(package.rglob("*.py"))}
+    if before.get("package") == states["package"]:
+        return False
+    states |= {str(path.relative_to(package)): state_of(files) for path, files in _dependencies(package).items()}
+    stale = [package / name for name in states if name != "package" and before.get(name) != states[name]]
     # Where nothing can be written, there is no such cache either: numba's is then in the user's home.
     with contextlib.suppress(OSError):
-        for kernel in [*package.rglob("__pycache__/*.nbi"), *package.rglob("__pycache__/*.nbc")]:
-            kernel.unlink(missing_ok=True)
+        for path in stale:
+            for kernel in path.parent.glob(f"__pycache__/{path.stem}.*.nb[ci]"):
+                kernel.unlink(missing_ok=True)
         stamp.parent.mkdir(exist_ok=True)
         written = stamp.with_suffix(f".{os.getpid()}")
-        written.write_text(state.hexdigest())
+        written.write_text(json.dumps(states))
         written.replace(stamp)
-    return True
+    return bool(stale)
 
 
 delete_stale_cache()

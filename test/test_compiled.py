@@ -20,32 +20,32 @@ def test_a_compiled_function_is_the_same_function():
     assert half.__doc__ == "Return half."
 
 
-def test_kernels_are_forgotten_when_any_file_with_compiled_functions_changes(tmp_path: Path):
+def test_kernels_are_deleted_when_a_file_that_they_depend_on_changes(tmp_path: Path):
     """Numba itself looks only at the file of the function that is called."""
-    kernels = tmp_path / "room" / "__pycache__"
-    kernels.mkdir(parents=True)
-    callee, other = tmp_path / "callee.py", tmp_path / "other.py"
-    callee.write_text("from magnetosuture_thread.compiled import compiled\n")
-    other.write_text("x = 1\n")
+    cache = tmp_path / "room" / "__pycache__"
+    cache.mkdir(parents=True)
+    (tmp_path / "room/caller.py").write_text(
+        "from magnetosuture_thread.compiled import compiled\nfrom magnetosuture_thread.callee import f\n"
+    )
+    (tmp_path / "callee.py").write_text("from magnetosuture_thread.constants import X\n")
+    (tmp_path / "constants.py").write_text("X = 1\n")
+    (tmp_path / "other.py").write_text("from magnetosuture_thread.compiled import compiled\n")
+    kernels = [cache / "caller.f-1.py311.nbi", cache / "caller.f-1.py311.1.nbc"]
 
-    def cached() -> bool:
-        return (kernels / "caller.nbi").exists() and (kernels / "caller.1.nbc").exists()
+    def is_kept(*, changed: str = "") -> bool:
+        if changed:
+            os.utime(tmp_path / changed, (1.0, 1.0))
+        for kernel in kernels:
+            kernel.write_text("code")
+        delete_stale_cache(tmp_path)
+        return all(kernel.exists() for kernel in kernels)
 
-    def cache() -> None:
-        (kernels / "caller.nbi").write_text("index")
-        (kernels / "caller.1.nbc").write_text("code")
-
-    cache()
-    assert delete_stale_cache(tmp_path)
-    assert not cached()
-    cache()
-    assert not delete_stale_cache(tmp_path)
-    assert cached()
-    other.write_text("x = 2\n")  # holds no compiled function
-    assert not delete_stale_cache(tmp_path)
-    os.utime(callee, (1.0, 1.0))
-    assert delete_stale_cache(tmp_path)
-    assert not cached()
+    assert not is_kept()  # of an unknown state
+    assert is_kept()
+    assert is_kept(changed="other.py")
+    for name in ("callee.py", "constants.py", "room/caller.py"):
+        assert not is_kept(changed=name), name
+        assert is_kept()
 
 
 def test_a_second_start_compiles_nothing():

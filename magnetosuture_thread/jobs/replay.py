@@ -47,7 +47,7 @@ from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, 
 from magnetosuture_thread.nodes.replay.clock import Timeline
 from magnetosuture_thread.nodes.replay.player import DEPTH, LiveReplay
 from magnetosuture_thread.nodes.run import Interruption
-from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.offline.observations import CHANGING
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.scene import write_scene
 
