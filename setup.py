@@ -17,10 +17,8 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "campaign/report/page.html",
-            "campaign/report/page.css",
-            "catalog/page.html",
-            "catalog/page.js",
+            "campaign/page.html",
+            "campaign/page.css",
             "evaluation/report/page.html",
             "evaluation/report/page.css",
             "evaluation/report/page.js",

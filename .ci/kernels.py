@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from magnetosuture_thread.compiled import PACKAGE
-from magnetosuture_thread.forecast.making import make_forecaster
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import read_setup
@@ -25,7 +25,7 @@ SETUP = "petri_35mm_polyamide_post"
 # Tests with kernels that no setup has: in space and of PyElastica, which share hardly any with the setups, ...
 IN_SPACE = (
     "test/benchmarks/test_solver.py::test_simulators_follow_the_rod",
-    "test/test_examples.py::test_an_example_runs[mesh_in_space]",
+    "test/test_examples.py::test_an_example_runs[ball_in_space]",
 )
 # ... and of the other formulations, of needle and rod, and of forecasts in batches, which share most.
 BESIDES = (

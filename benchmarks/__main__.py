@@ -11,14 +11,10 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import contact, golden, keep_out, lies
-from benchmarks.attack import command as attack
+from benchmarks import attack, contact, forecast, golden, keep_out, lies, page, solver
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
-from benchmarks.forecast import command as forecast
 from benchmarks.network import command as network
-from benchmarks.page import command as page
-from benchmarks.solver import command as solver
 from benchmarks.vision import command as vision
 from magnetosuture_thread.cli.arguments import EXIT_CODES, STANDARD_OUTPUT, check_outputs, output_file
 from magnetosuture_thread.cli.main import exit_code

@@ -27,8 +27,13 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.reproduce.hernia.replay import paper_model, read_steering, start_centreline
-from magnetosuture_thread.reproduce.hernia.steering import point_filter, replay_steering
+from magnetosuture_thread.reproduce.hernia import (
+    paper_model,
+    point_filter,
+    read_steering,
+    replay_steering,
+    start_centreline,
+)
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.setups import Setup, read_setup

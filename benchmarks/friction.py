@@ -41,7 +41,7 @@ def measure_friction() -> dict[str, Any]:
         for stiffness in STIFFNESSES
     ]
     times = {f"{friction:g}": step_time(friction) for friction in (0.0, 0.3)}
-    return {"capstans": capstans, "stiff_capstans": stiff, "creep_m": creep(0.5), "step": times}
+    return {"capstans": capstans, "stiff_capstans": stiff, "step": times}
 
 
 def friction_table(figures: dict[str, Any]) -> Table:
@@ -56,7 +56,6 @@ def friction_table(figures: dict[str, Any]) -> Table:
         case_name = f"capstan, mu = {case['friction']:g}, E I = {case['stiffness']:g} T1 R^2, 0.5 turns"
         name = f"{case_name}: T2 / T1, by elastica theory, flexible"
         table.add_row(name, f"{case['measured']:.3f}, {case['elastica']:.3f}, {case['flexible']:.3f}")
-    table.add_row("thread held around a post, slip in 60 s", f"{1e6 * figures['creep_m']:.4f} µm")
     for friction, step in figures["step"].items():
         name = f"step, n = 81, {step['contacts']:.0f} nodes in contact, mu = {friction}"
         table.add_row(name, f"{step['median_us']:.0f} µs, {step['solves']:.1f} solves")
@@ -166,20 +165,6 @@ def stiff_capstan(friction: float, stiffness: float, free: int = 250) -> StiffCa
         bent = predictor.thread.bending_stiffness / (low * radius**2)
         found.append((ratio, elastica_ratio(friction, float(theta), float(bent)), gain))
     return StiffCapstan(*np.mean(found, axis=0).tolist())
-
-
-def creep(friction: float) -> float:
-    """Return how far a thread slips around a post in a minute, while a flow draws at both of its ends [m]."""
-    medium = Medium(1.0, 0.5, flow=(1e-3, 0.0))
-    thread = Thread("thread", 0.0195, 90, DIAMETER, 1e-13, medium, Attachment.PINNED)
-    predictor = ThreadPredictor(thread, Workspace((Disc((0.0, 0.0), POST),), 2e-3, friction=(friction,)))
-    turned, radius = np.linspace(math.pi / 2, 1.5 * math.pi, 40), POST + 0.5 * DIAMETER
-    around = radius * np.column_stack([np.cos(turned), np.sin(turned)])
-    path = np.vstack([[(4e-3, 3e-3), (5e-3, 2.5e-3), (5e-3, 1.6e-3)], around, [(0.03, -radius)]])
-    rest = NeedlePose(0.0, path[0], np.array([-1.0, 0.0]))
-    predictor.start(rest, path, strict=False)
-    ends = [predictor.step(NeedlePose(0.1 * k, rest.tail, rest.heading)).positions[-1, 0] for k in range(1, 701)]
-    return abs(float(ends[-1] - ends[100]))  # ten seconds to settle
 
 
 def step_time(friction: float) -> dict[str, float]:

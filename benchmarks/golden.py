@@ -68,14 +68,16 @@ def _save_bag(folder: Path, target: Path) -> None:
             values[f"{connection.topic} stamp"].append(np.array([stamp], np.float64))
             for name, numbers in _numbers(reader.deserialize(data, connection.msgtype), connection.topic):
                 values[name].append(numbers)
-    np.savez_compressed(target, **{name.replace("/", "|"): np.concatenate(v) for name, v in values.items()})
+    arrays: dict[str, Any] = {name.replace("/", "|"): np.concatenate(v) for name, v in values.items()}
+    np.savez_compressed(target, **arrays)
 
 
 def _record_bags(into: Path, _: argparse.Namespace) -> None:
-    for bag in sorted(p.parent for p in Path("examples").rglob("metadata.yaml")):
-        _run("replay", bag, "--offline", "--output", into / bag.name)
-        _save_bag(into / bag.name / "bag", into / f"{bag.name}.npz")
-    _run("evaluate", "examples", "--output", into / "evaluation")
+    bag = Path("examples/post_wrap")
+    _run("replay", bag, "--offline", "--output", into / "replay")
+    _save_bag(into / "replay/bag", into / "replay.npz")
+    _run("evaluate", bag, "--output", into / "evaluation")
+    _run("reproduce", "hernia", "examples/hernia_steering", "--output", into / "hernia")
 
 
 def _record_reference(into: Path, given: argparse.Namespace) -> None:
@@ -94,7 +96,7 @@ def _record_forecast(into: Path, _: argparse.Namespace) -> None:
     scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)})
     predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=40, scene=scene)
     safety = NeedleSafetyFilter(scene, needle_length=0.004, needle_curvature=60.0, max_speed=0.008, hold_time=0.15)
-    forecaster = ThreadForecaster(predictor.thread, scene, safety, workers=1)
+    forecaster = ThreadForecaster(predictor.thread, scene, safety)
     predictor.start(NeedlePose(0.0, np.array([-0.001, 0.0054]), np.array([1.0, 0.0])))
     vertices, margins, forecasts = [], [], []
     for step in range(1, 150):
@@ -102,11 +104,11 @@ def _record_forecast(into: Path, _: argparse.Namespace) -> None:
         tail = 0.0056 * np.array([np.cos(angle), np.sin(angle)])
         pose = NeedlePose(step / 30.0, tail, np.array([np.sin(angle), -np.cos(angle)]))
         prediction = predictor.step(pose)
-        vertices.append(prediction.vertices)
+        vertices.append(prediction.positions)
         margins.append(prediction.margins["obstacle"].minimum)
         if step % 30 == 0:
             for command in ((0.005, 0.0), (0.0, -0.006)):
-                start = ForecastStart(pose, prediction.vertices)
+                start = ForecastStart(pose, prediction.positions)
                 forecasts.append(forecaster.forecast(start, np.array(command), 2.0).vertices)
     np.savez_compressed(into / "post.npz", vertices=vertices, margins=margins, forecasts=np.array(forecasts))
 
@@ -160,8 +162,8 @@ def _differences(old: Path, new: Path) -> Iterator[str]:
             if not same and not any(word in name for word in TIMES):
                 yield f"{name}: {a!r}, {b!r} now"
     else:
-        lines = (path.read_text().splitlines() for path in (old, new))
-        yield from list(difflib.unified_diff(*lines, lineterm="", n=0))[2:]
+        a, b = (path.read_text().splitlines() for path in (old, new))
+        yield from list(difflib.unified_diff(a, b, lineterm="", n=0))[2:]
 
 
 def _compare(old: Path, new: Path) -> int:

@@ -16,6 +16,7 @@ import math
 import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -36,6 +37,7 @@ TOLERANCE = 5e-6  # m; deeper is a violation
 READY = DriverState(True)
 SUBSTEP = 2e-5  # m of way between two looks at the clearance
 REPORT_EVERY = 500.0  # s of simulated time
+START = 100.0  # s; time of the first step
 EPISODE = 4.0  # s of simulated time with the same parameters and scene
 
 
@@ -155,28 +157,26 @@ def random_scene(random: np.random.Generator) -> Scene:
     radius = float(random.uniform(0.008, 0.025))
     shapes: list[SceneShape] = []
 
-    def at(share: float = 0.9) -> np.ndarray:
-        return share * radius * math.sqrt(random.uniform()) * np.array(_unit(random.uniform(-math.pi, math.pi)))
-
     def add(description: dict[str, object]) -> None:
         with contextlib.suppress(ConfigurationError):  # what bounds no area is left out
             shapes.append(shape_from_mapping(f"shape_{len(shapes)}", description))
 
+    def add_polygon(corners: np.ndarray, angle: float, centre: np.ndarray) -> None:
+        c, s = math.cos(angle), math.sin(angle)
+        add({"polygon": {"outline": (corners @ np.array([[c, s], [-s, c]]) + centre).tolist()}})
+
     for _ in range(int(random.integers(0, 5))):
         kind = int(random.integers(0, 7))
-        centre, size, angle = at(), float(random.uniform(0.05, 0.4)) * radius, float(random.uniform(-math.pi, math.pi))
+        centre = 0.9 * radius * math.sqrt(random.uniform()) * _unit(random.uniform(-math.pi, math.pi))
+        size, angle = float(random.uniform(0.05, 0.4)) * radius, float(random.uniform(-math.pi, math.pi))
         if kind == 0:
             add({"disc": {"center": centre.tolist(), "radius": 0.5 * size}})
         elif kind == 1:  # a splinter
-            corners = [(0.0, 0.0), (2.0 * size, 0.02 * size), (0.0, 0.1 * size)]
-            add({"polygon": {"outline": _turned(corners, angle, centre)}})
+            add_polygon(size * np.array([(0.0, 0.0), (2.0, 0.02), (0.0, 0.1)]), angle, centre)
         elif kind == 2:  # a star
             count = int(random.integers(3, 9))
-            radii = [size, 0.35 * size] * count
-            corners = [
-                (r * math.cos(math.pi * k / count), r * math.sin(math.pi * k / count)) for k, r in enumerate(radii)
-            ]
-            add({"polygon": {"outline": _turned(corners, angle, centre)}})
+            radii, turn = np.tile([size, 0.35 * size], count), math.pi * np.arange(2 * count) / count
+            add_polygon(np.column_stack([radii * np.cos(turn), radii * np.sin(turn)]), angle, centre)
         elif kind == 3:
             inner = float(random.uniform(0.3, 0.8)) * radius
             add({"annulus": {"center": (0.3 * centre).tolist(), "inner_radius": inner, "outer_radius": 1.2 * inner}})
@@ -185,28 +185,19 @@ def random_scene(random: np.random.Generator) -> Scene:
             for side in (1.0, -1.0):
                 low, high = sorted((0.5 * side * gap, 0.5 * side * (gap + 2.0 * thick)))
                 corners = [(-long, low), (long, low), (long, high), (-long, high)]
-                add({"polygon": {"outline": _turned(corners, angle, 0.3 * centre)}})
+                add_polygon(np.array(corners), angle, 0.3 * centre)
         elif kind == 5:  # a U
             gap, thick = float(random.uniform(1e-3, 4e-3)), 0.2 * size
-            corners = [
-                (0.0, 0.0),
-                (size, 0.0),
-                (size, thick),
-                (thick, thick),
-                (thick, thick + gap),
-                (size, thick + gap),
-            ]
-            corners += [(size, 2.0 * thick + gap), (0.0, 2.0 * thick + gap)]
-            add({"polygon": {"outline": _turned(corners, angle, 0.5 * centre)}})
+            x = [0.0, size, size, thick, thick, size, size, 0.0]
+            y = [0.0, 0.0, thick, thick, thick + gap, thick + gap, 2.0 * thick + gap, 2.0 * thick + gap]
+            add_polygon(np.column_stack([x, y]), angle, 0.5 * centre)
         else:  # rough
-            angles = np.sort(random.uniform(-math.pi, math.pi, 40))
-            lengths = size * random.uniform(0.6, 1.0, 40)
-            corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(lengths, angles, strict=True)]
-            add({"polygon": {"outline": _turned(corners, angle, centre)}})
-    dish = Dish(2.0 * radius, 0.003)
+            turn = np.sort(random.uniform(-math.pi, math.pi, 40))
+            radii = size * random.uniform(0.6, 1.0, 40)
+            add_polygon(np.column_stack([radii * np.cos(turn), radii * np.sin(turn)]), angle, centre)
     while True:
         try:
-            return Scene(dish, tuple(shapes))
+            return Scene(Dish(2.0 * radius, 0.003), tuple(shapes))
         except ConfigurationError:
             shapes.pop()
 
@@ -228,14 +219,39 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add what another found."""
-        for name in ("seconds", "steps", "episodes", "driven", "pressed", "stalls", "faults", "violations"):
+        for name in ("seconds", "steps", "episodes", "driven", "pressed", "stalls", "faults", "violations", "worst"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.deepest = max(self.deepest, other.deepest)
-        self.worst += other.worst
+
+
+class LatePoses:
+    """Poses of a needle that are true at their stamp, and come later.
+
+    Args:
+        random: of the times.
+        period: between two poses [s].
+        delay: maximum of their age when they come [s].
+        begin: stamp of the first [s].
+    """
+
+    def __init__(self, random: np.random.Generator, period: float, delay: float, begin: float) -> None:
+        self._random, self._period, self._delay, self.next = random, period, delay, begin
+        self._waiting: deque[tuple[float, float, tuple[np.ndarray, np.ndarray]]] = deque()
+
+    def take(self, needle: Needle, stamp: float) -> None:
+        """Measure a pose, unless it would come before the last."""
+        late = self._delay * float(self._random.uniform(0.5, 1.0))
+        if not self._waiting or stamp + late >= self._waiting[-1][0]:
+            self._waiting.append((stamp + late, stamp, needle.pose()))
+
+    def due(self, now: float) -> Iterator[tuple[float, tuple[np.ndarray, np.ndarray]]]:
+        """Yield stamp and pose of those that have come."""
+        while self._waiting and self._waiting[0][0] <= now:
+            yield self._waiting.popleft()[1:]
 
 
 def attack(seed: int, duration: float = EPISODE) -> Tally:
-    """PrescribedMotion a needle for a while with random parameters in a random scene, all told by the seed."""
+    """Drive a needle for a while with random parameters in a random scene, all told by the seed."""
     random = np.random.default_rng(seed)
     found = Tally(episodes=1)
     for _ in range(100):
@@ -252,23 +268,17 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
         return found
     bridge.latch.activate()
     bridge.arm(READY)
-    keep, period = settings.keep_out, 1.0 / settings.rate
-    holds, pose_period = min(settings.command_timeout, settings.driver_timeout), float(random.uniform(0.005, 0.1))
-    pose_period = min(pose_period, 0.3 * settings.pose_timeout)
+    period, now, end = 1.0 / settings.rate, START, START + duration
+    pose_period = min(float(random.uniform(0.005, 0.1)), 0.3 * settings.pose_timeout)
     delay = float(random.uniform(0.0, 0.9)) * max(0.0, settings.pose_timeout - 3.0 * period - pose_period)
-    poses: deque[tuple[float, float, tuple[np.ndarray, np.ndarray]]] = deque()
-    now, end, next_pose, number = 100.0, 100.0 + duration, 100.0, 0
-    velocity, command, mode, until = 0j, np.zeros(2), 0, 0.0
+    poses, number = LatePoses(random, pose_period, delay, now), 0
+    command, mode, until = np.zeros(2), 0, 0.0
     clearance = world.clearance([needle.points()])
     while now < end:
-        # Poses are true at their stamp, and come later.
-        if now >= next_pose:
-            late = delay * float(random.uniform(0.5, 1.0))
-            if not poses or now + late >= poses[-1][0]:
-                poses.append((now + late, now, needle.pose()))
-            next_pose = now + pose_period
-        while poses and poses[0][0] <= now:
-            _, stamp, (tail, heading) = poses.popleft()
+        if now >= poses.next:
+            poses.take(needle, now)
+            poses.next = now + pose_period
+        for stamp, (tail, heading) in poses.due(now):
             number += 1
             try:
                 bridge.on_pose(tail, heading, stamp, number, now, now)
@@ -277,15 +287,12 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
                     raise
         if now >= until:
             mode, until = int(random.integers(0, 6)), now + float(random.uniform(0.05, 1.0))
-            command = (
-                settings.max_speed
-                * float(random.choice([1.0, 2.0, random.uniform()]))
-                * np.array(_unit(random.uniform(-math.pi, math.pi)))
-            )
+            speed = settings.max_speed * float(random.choice([1.0, 2.0, random.uniform()]))
+            command = speed * _unit(random.uniform(-math.pi, math.pi))
         if mode in (1, 2, 3):
             command = _towards(needle, world, settings.max_speed, mode, random)
         elif mode == 4:
-            command = settings.max_speed * np.array(_unit(random.uniform(-math.pi, math.pi)))
+            command = settings.max_speed * _unit(random.uniform(-math.pi, math.pi))
         bridge.command("needle", command, now, found.steps + 1, now, now)
         bridge.on_margins(now, True, 1.0, scene.version, now)
         outcome = bridge.step(now, now, READY)
@@ -298,40 +305,40 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
         velocity = complex(*outcome.applied)
         found.steps += 1
         found.driven += abs(velocity) > 0.0
-        gap = period
-        if random.uniform() < 0.05:
-            gap = max(period, float(random.choice([1.0, 1.5, random.uniform()])) * settings.driver_timeout)
-            found.stalls += 1
-        # The coils hold their currents; when nobody asks for any, they stop at some time from `holds` on.
-        moving = gap
-        if gap > holds:
-            moving = min(
-                gap,
-                float(random.choice([holds, settings.driver_timeout, random.uniform(holds, settings.driver_timeout)])),
-            )
-        way = abs(velocity) * moving
+        gap, moving = _gap(random, settings, found)
+        way = abs(velocity) * moving * _swing(needle)
         if way > 0.0:
-            if clearance - way * _swing(needle) < keep:
-                count = min(400, max(2, math.ceil(way * _swing(needle) / SUBSTEP)))
+            if clearance - way < settings.keep_out:
+                count = min(400, max(2, math.ceil(way / SUBSTEP)))
                 axes = [needle.moved(velocity, moving * k / count).points() for k in range(1, count + 1)]
-                least = world.clearance(axes)
                 found.pressed += 1
-                found.deepest = max(found.deepest, keep - least)
-                if keep - least > TOLERANCE:
+                depth = settings.keep_out - world.clearance(axes)
+                found.deepest = max(found.deepest, depth)
+                if depth > TOLERANCE:
                     found.violations += 1
-                    found.worst.append({"seed": seed, "time": now - 100.0, "deeper": keep - least})
-            # Poses fall due within the motion too.
-            while next_pose < now + moving:
-                late = delay * float(random.uniform(0.5, 1.0))
-                at = needle.moved(velocity, next_pose - now)
-                if not poses or next_pose + late >= poses[-1][0]:
-                    poses.append((next_pose + late, next_pose, at.pose()))
-                next_pose += pose_period
+                    found.worst.append({"seed": seed, "time": now - START, "deeper": depth})
+            while poses.next < now + moving:  # poses fall due within the motion too
+                poses.take(needle.moved(velocity, poses.next - now), poses.next)
+                poses.next += pose_period
             needle = needle.moved(velocity, moving)
             clearance = world.clearance([needle.points()])
         now += gap
         found.seconds += gap
     return found
+
+
+def _gap(random: np.random.Generator, settings: CoilBridgeSettings, found: Tally) -> tuple[float, float]:
+    """Return the time to the next step, a stall now and then, and for how long of it the coils hold their currents."""
+    period, certain = 1.0 / settings.rate, min(settings.command_timeout, settings.driver_timeout)
+    gap = period
+    if random.uniform() < 0.05:
+        gap = max(period, float(random.choice([1.0, 1.5, random.uniform()])) * settings.driver_timeout)
+        found.stalls += 1
+    if gap <= certain:
+        return gap, gap
+    # When nobody asks for currents, the coils stop at some time between both timeouts.
+    stops = [certain, settings.driver_timeout, random.uniform(certain, settings.driver_timeout)]
+    return gap, min(gap, float(random.choice(stops)))
 
 
 def _swing(needle: Needle) -> float:
@@ -368,13 +375,8 @@ def _towards(needle: Needle, world: World, speed: float, mode: int, random: np.r
     return speed * np.array([tip.real, tip.imag]) / max(abs(tip), 1e-9)
 
 
-def _unit(angle: float) -> tuple[float, float]:
-    return math.cos(angle), math.sin(angle)
-
-
-def _turned(corners: list[tuple[float, float]], angle: float, centre: np.ndarray) -> list[list[float]]:
-    c, s = math.cos(angle), math.sin(angle)
-    return [[c * x - s * y + centre[0], s * x + c * y + centre[1]] for x, y in corners]
+def _unit(angle: float) -> np.ndarray:
+    return np.array([math.cos(angle), math.sin(angle)])
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -385,11 +387,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Attack the promise; return the figures and whether it was kept."""
-    total, began, seed = Tally(), time.process_time(), options.seed
-    shown = 0.0
+    log, total, began, shown = make_log(console), Tally(), time.process_time(), 0.0
     while total.seconds < options.seconds:
-        total.add(attack(seed))
-        seed += 1
+        total.add(attack(options.seed + total.episodes))
         if total.seconds >= shown + REPORT_EVERY:
             shown = total.seconds
             print(f"{shown:.0f} s, {total.violations} violations", file=sys.stderr, flush=True)
@@ -400,7 +400,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     }
     if math.isinf(total.deepest):
         figures["deepest"] = None  # the needle was never near; JSON has no infinity
-    make_log(console)(
+    log(
         f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls, "
         f"{total.faults} faults: "
         f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"

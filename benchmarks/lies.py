@@ -23,7 +23,7 @@ from rich.table import Table
 
 from benchmarks.keep_out import World
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.campaign.run import vary
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import read_setup
 
@@ -174,26 +174,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Run all lies; return the figures, and whether every one but an honest tracker's ended in a fault."""
-    cases = list(product(options.setup or SETUPS, options.lie or LIES, range(options.seeds)))
+    setups, lies = options.setup or SETUPS, options.lie or LIES
     with ProcessPoolExecutor(options.workers) as pool:
-        runs = list(pool.map(run_lie, cases))
-    for name in options.setup or SETUPS:
+        runs = list(pool.map(run_lie, product(setups, lies, range(options.seeds))))
+    for name in setups:
         table = Table(title=f"{name}: lies about the needle's pose, simulated")
         for column in ("lie", "latched", "after [s]", "travel [mm]", "speed", "broken"):
             table.add_column(column, justify="left" if column == "lie" else "right", no_wrap=True)
-        for kind in options.lie or LIES:
+        for kind in lies:
             found = [r for r in runs if (r["setup"], r["lie"]) == (name, kind) and not r["stopped_before"]]
             latched = [r for r in found if r["stopped_s"] is not None]
-            table.add_row(
-                kind,
-                f"{len(latched)}/{len(found)}",
-                *(
-                    f"{np.median(values):.2f} ({max(values):.2f})" if values else "-"
-                    for values in ([r["stopped_s"] for r in latched], [1e3 * r["travel_m"] for r in latched])
-                ),
-                f"{max((r['peak_speed_ratio'] for r in found), default=0.0):.2f}",
-                f"{sum(r['broken'] for r in found)}",
-            )
+            after, travel = [r["stopped_s"] for r in latched], [1e3 * r["travel_m"] for r in latched]
+            shown = [f"{np.median(values):.2f} ({max(values):.2f})" if values else "-" for values in (after, travel)]
+            speed = max((r["peak_speed_ratio"] for r in found), default=0.0)
+            broken = sum(r["broken"] for r in found)
+            table.add_row(kind, f"{len(latched)}/{len(found)}", *shown, f"{speed:.2f}", str(broken))
         console.print(table)
     before = sum(bool(r["stopped_before"]) for r in runs)
     console.print(

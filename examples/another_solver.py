@@ -1,12 +1,10 @@
-"""The same step by three solvers: the structured one, OSQP, and one of the package qpsolvers if it is installed."""
-
-from importlib.util import find_spec
+"""The same step by two solvers: the structured one and OSQP."""
 
 import numpy as np
 
 from magnetosuture_thread import Disc, NeedlePose, Scene, ThreadPredictor
 
-SOLVERS = ["banded", "osqp"] + (["clarabel"] if find_spec("qpsolvers") and find_spec("clarabel") else [])
+SOLVERS = ["banded", "osqp"]
 
 scene = Scene.create(dish_diameter=0.05, shapes={"post": Disc((-0.006, 0.003), 0.002)})
 threads = {}

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
-from benchmarks.page.measurements import BROWSERS
+from benchmarks.page import BROWSERS
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "console.png"
 SCREEN: ViewportSize = {"width": 1366, "height": 768}

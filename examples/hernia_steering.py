@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.interface import OPERATOR_COMMAND
-from magnetosuture_thread.reproduce.hernia.replay import start_centreline
-from magnetosuture_thread.reproduce.hernia.steering import RATE, SteeredThread, point_filter
+from magnetosuture_thread.messages.packing import packed_twist
+from magnetosuture_thread.reproduce.hernia import RATE, SteeredThread, point_filter, start_centreline
 from magnetosuture_thread.setups import read_setup
 
 BAG = Path(__file__).parent / "hernia_steering"
@@ -71,8 +70,7 @@ def main() -> None:
         needle = point_filter(setup.scene, setup.coils.keep_out, setup.coils.approach_rate)
         for time, (x, y) in keys(SteeredThread(setup.model, start_centreline(setup), needle)):
             stamp = 1_000_000_000 + round(time * 1e9)
-            message = MESSAGES.twist_message(stamp, np.array([x, y]))
-            bag.write_message(OPERATOR_COMMAND.recorded, stamp, message)
+            bag.write(OPERATOR_COMMAND.recorded, stamp, packed_twist(stamp, np.array([x, y])))
 
 
 if __name__ == "__main__":

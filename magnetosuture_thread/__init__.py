@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient, check_gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
-    from magnetosuture_thread.geometry.obstacles import Disc, Mesh, Polygon, Workspace
+    from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
@@ -29,7 +29,7 @@ _HOME = {
     "barrier": ("Barrier", "Gradient", "check_gradient"),
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
-    "geometry.obstacles": ("Disc", "Mesh", "Polygon", "Workspace"),
+    "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
     "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
     "model.estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
@@ -61,7 +61,6 @@ __all__ = [
     "Margins",
     "Material",
     "Medium",
-    "Mesh",
     "NeedlePose",
     "NeedleSafetyFilter",
     "Polygon",

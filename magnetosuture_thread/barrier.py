@@ -196,7 +196,7 @@ def check_gradient(barrier: Barrier, positions: Points, tolerance: float = 1e-4)
     return float(error.max(initial=0.0))
 
 
-class CompiledBarrier(Barrier):
+class RowBarrier(Barrier):
     """A built-in barrier: compiled code writes all of its rows at once."""
 
     @abstractmethod

@@ -22,8 +22,10 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 # Said of every function, as numba takes it over from whatever calls one first where it is not said.
-_COUNTED: dict[str, Any] = {"_nrt": True}
-_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+# Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
+_COUNTED: dict[str, Any] = {"_nrt": True, "no_cfunc_wrapper": True}
+_UNCOUNTED: dict[str, Any] = {"_nrt": False, "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {**_UNCOUNTED, "no_cpython_wrapper": True}
 _EVENTS = cast(Any, event)  # without types
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
@@ -56,12 +58,25 @@ def compiled_uncounted(function: _Function) -> _Function:
     return cast(_Function, numba.njit(cache=True, error_model="numpy", **_UNCOUNTED)(function))
 
 
+def compiled_inner(function: _Function) -> _Function:
+    """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash.
+
+    Without an entry for Python, which takes apart each array of a tuple, a kernel compiles several times as fast.
+    """
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_INNER)(function))
+
+
 def compiled_without_gil(function: _Function) -> _Function:
     """Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.
 
     For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
     """
     return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
+
+
+def compiled_uncounted_without_gil(function: _Function) -> _Function:
+    """Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_UNCOUNTED)(function))
 
 
 def compilations() -> int:

@@ -10,6 +10,7 @@ of the actuators.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
 SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
@@ -33,19 +34,35 @@ class ServiceInterface:
     about: str
 
 
+class Quality(Enum):
+    """How messages of a topic are delivered; see `nodes/topics.py` for the profiles."""
+
+    RELIABLE = "reliable, the newest ten"
+    SENSOR = "best effort, the newest five"
+    # Of frames that wait only the newest two: a tracker that was held up would otherwise be late for many more, and
+    # coils rest while poses are old.
+    FRAMES = "best effort, the newest two"
+    NEWEST = "best effort, the newest"
+    LATCHED = "reliable, the last one also for who comes later"
+
+
 @dataclass(frozen=True)
 class Channel:
-    """A topic: its name and type.
+    """A topic.
 
     Attributes:
         name: without a leading slash, so that a namespace can come before it.
         type_name: for example `nav_msgs/msg/Path`.
         about: what its messages are, for the reference.
+        quality: of service.
+        absolute: whether no namespace comes before it.
     """
 
     name: str
     type_name: str
     about: str
+    quality: Quality = Quality.RELIABLE
+    absolute: bool = False
 
     @property
     def recorded(self) -> str:
@@ -53,14 +70,20 @@ class Channel:
         return f"/{self.name}"
 
 
-IMAGE = Channel("camera/image_raw", "sensor_msgs/msg/Image", "camera frames, in place of the compressed ones")
-COMPRESSED_IMAGE = Channel("camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "camera frames")
-CAMERA_INFO = Channel("camera/camera_info", "sensor_msgs/msg/CameraInfo", "the lens, whose distortion is undone")
+IMAGE = Channel(
+    "camera/image_raw", "sensor_msgs/msg/Image", "camera frames, in place of the compressed ones", Quality.FRAMES
+)
+COMPRESSED_IMAGE = Channel(
+    "camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "camera frames", Quality.FRAMES
+)
+CAMERA_INFO = Channel(
+    "camera/camera_info", "sensor_msgs/msg/CameraInfo", "the lens, whose distortion is undone", Quality.SENSOR
+)
 NEEDLE_POSE = Channel(
     "needle/measured_cp",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "the needle's tail, x axis along the needle there; where nothing tells tail and tip apart, the heading has "
-    "a standard deviation of more than 1 rad, which all subscribers refuse",
+    "the needle's tail, x axis along the needle; a heading with a deviation above 1 rad is unknown",
+    Quality.SENSOR,
 )
 TRACKER_STATE = Channel(
     "needle/tracker_state",
@@ -71,8 +94,7 @@ TIP_SETPOINT = Channel("needle/setpoint_cp", "geometry_msgs/msg/PoseStamped", "w
 OPERATOR_COMMAND = Channel(
     "operator/servo_cv",
     "geometry_msgs/msg/TwistStamped",
-    "velocity of the tip that an operator commands; has priority, and pauses a procedure; by the operator "
-    "page, or your joystick",
+    "velocity of the tip commanded by an operator's page or joystick; has priority, pauses a procedure",
 )
 FILTER_STATE = Channel(
     "needle/filter_state",
@@ -85,15 +107,12 @@ NEEDLE_COMMAND = Channel(
     "velocity of the tip, followed while no operator commands; of one node at a time",
 )
 NEEDLE_SETPOINT = Channel(
-    "needle/setpoint_cv",
-    "geometry_msgs/msg/TwistStamped",
-    "applied velocity, that the currents give",
+    "needle/setpoint_cv", "geometry_msgs/msg/TwistStamped", "applied velocity, that the currents give"
 )
 MEASURED_THREAD = Channel(
     "thread/measured",
     "nav_msgs/msg/Path",
-    "the measured centreline from the tail on, for viewers: half of a thread looks like a short one; "
-    "thread_model takes it where nobody publishes thread/observation",
+    "the measured centreline from the tail on, for viewers, and where there is no thread/observation",
 )
 THREAD_OBSERVATION = Channel(
     "thread/observation",
@@ -101,46 +120,42 @@ THREAD_OBSERVATION = Channel(
     "the pieces of the thread that a frame shows, whether they are all of it, and what may hide the rest",
 )
 PREDICTED_THREAD = Channel(
-    "thread/predicted",
-    "magnetosuture_msgs/msg/PredictedThread",
-    "the thread by the model alone",
+    "thread/predicted", "magnetosuture_msgs/msg/PredictedThread", "the thread by the model alone"
 )
 ESTIMATED_THREAD = Channel(
     "thread/estimated",
     "magnetosuture_msgs/msg/EstimatedThread",
-    "the thread by model and camera, with a covariance for each node, and the forces that the model does not "
-    "know of; from the first measurement on, and again with the same stamp where an observation comes late",
+    "the thread by model and camera, with covariances and unknown forces; again where an observation is late",
 )
 FORECAST = Channel(
     "thread/forecast",
     "magnetosuture_msgs/msg/ThreadForecast",
-    "where needle and thread will be if the present command is held, and what happens when; with every "
-    "estimate, where the parameter forecast_horizon is above 0",
+    "where needle and thread will be if the command is held, where forecast_horizon is above 0",
 )
 MARGINS = Channel(
     "thread/margins",
     "magnetosuture_msgs/msg/SafetyMargins",
-    "every barrier, the wall included; the minimum of each kind, contact, friction; of the estimated thread "
-    "where there is one, with the 99 % bound of each",
+    "every barrier, its minimum and 99 % bound, contact, friction; of the estimated thread if there is one",
 )
 THREAD_MARKERS = Channel(
     "thread/markers",
     "visualization_msgs/msg/MarkerArray",
-    "for RViz and Foxglove: the thread in the colour of its friction, and the minimum of each barrier "
-    "(namespace margins); of an estimated one also the band of its deviation (deviation), the prediction "
-    "(predicted) and forces that were found (disturbances); of a forecast the thread at three instants and "
-    "what happens when (forecast)",
+    "for RViz and Foxglove, in the namespaces thread, margins, deviation, predicted, disturbances, forecast",
 )
-SCENE = Channel("scene", "magnetosuture_msgs/msg/Scene", "the dish and the named shapes in it, from now on")
+SCENE = Channel(
+    "scene", "magnetosuture_msgs/msg/Scene", "the dish and the named shapes in it, from now on", Quality.LATCHED
+)
 SCENE_MARKERS = Channel(
     "scene/markers",
     "visualization_msgs/msg/MarkerArray",
     "the dish and its shapes, for RViz and Foxglove",
+    Quality.LATCHED,
 )
 MATERIAL = Channel(
     "thread/material",
     "magnetosuture_msgs/msg/ThreadMaterial",
     "material, liquid and attachment of the thread from now on; by you, or a calibration",
+    Quality.LATCHED,
 )
 CURRENTS = Channel(
     "coils/currents",
@@ -151,19 +166,26 @@ BRIDGE_STATE = Channel(
     "coils/state",
     "magnetosuture_msgs/msg/CoilBridgeState",
     "state, armed, reasons, velocities, driver",
+    Quality.LATCHED,
 )
 PROCEDURE_STATE = Channel(
     "procedure/state",
     "magnetosuture_msgs/msg/ProcedureState",
     "state, goals met, progress, why it is paused or has failed",
+    Quality.LATCHED,
 )
 PROCEDURE_PLAN = Channel(
     "procedure/plan",
     "nav_msgs/msg/Path",
     "where the middle of the needle is to go, from where it was when it was planned",
+    Quality.LATCHED,
 )
-PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", "a person holds the page's button now")
-DIAGNOSTICS = Channel("diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "what every node reports of itself")
+PROCEDURE_HOLD = Channel(
+    "procedure/hold", "std_msgs/msg/Header", "a person holds the page's button now", Quality.NEWEST
+)
+DIAGNOSTICS = Channel(
+    "diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "what every node reports of itself", absolute=True
+)
 
 # Services of the coil bridge, of the thread model where it forecasts, of the scene server, of the needle planner, of a
 # replayed bag and of the simulated rig.
@@ -200,9 +222,7 @@ SERVICES = {
 
 # What only a simulation knows; never an input of the graph.
 GROUND_TRUTH_NEEDLE = Channel(
-    "ground_truth/needle",
-    "geometry_msgs/msg/PoseStamped",
-    "simulated ground truth of the needle",
+    "ground_truth/needle", "geometry_msgs/msg/PoseStamped", "simulated ground truth of the needle"
 )
 GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "simulated ground truth of the thread")
 GROUND_TRUTH_PULL = Channel(
@@ -215,10 +235,33 @@ CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
 RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents", "the wires to the simulated coils")
 FAULT_REQUEST = Channel(
-    "rig/fault",
-    "std_msgs/msg/String",
-    "kind and duration of a fault, in force from now on; by you",
+    "rig/fault", "std_msgs/msg/String", "kind and duration of a fault, in force from now on; by you"
 )
 CLOCK = Channel(
-    "clock", "rosgraph_msgs/msg/Clock", "simulated time, for every node with use_sim_time; also by a replay"
+    "clock",
+    "rosgraph_msgs/msg/Clock",
+    "simulated time, for every node with use_sim_time; also by a replay",
+    Quality.SENSOR,
+    absolute=True,
 )
+
+INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND)
+OUTPUTS = (
+    NEEDLE_POSE,
+    TRACKER_STATE,
+    MEASURED_THREAD,
+    THREAD_OBSERVATION,
+    PREDICTED_THREAD,
+    ESTIMATED_THREAD,
+    FORECAST,
+    MARGINS,
+    THREAD_MARKERS,
+    FILTER_STATE,
+    NEEDLE_SETPOINT,
+    CURRENTS,
+    BRIDGE_STATE,
+    DIAGNOSTICS,
+)
+SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
+GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
+PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle planner, where there is one

@@ -11,9 +11,9 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import Configuration
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
+from magnetosuture_thread.planning.follower import PathFollowerSettings
 from magnetosuture_thread.planning.procedure import Procedure
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +10,11 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread import __version__, cli
+from magnetosuture_thread import cli
 from magnetosuture_thread.cli import commands
 from magnetosuture_thread.cli.main import COMMANDS, MOVED, make_parser
 from magnetosuture_thread.model.formulations import FORMULATIONS
 from magnetosuture_thread.model.solvers import SOLVERS
-from test.evaluation.test_reference_scores import write
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -43,11 +41,6 @@ def test_help_names_every_command_and_the_exit_codes():
         "0 done, 1 the job failed, 2 wrong use",
     ):
         assert words in shown.stdout
-
-
-def test_the_version_is_that_of_the_package():
-    shown = run("--version")
-    assert (shown.returncode, shown.stdout) == (0, f"magnetosuture {__version__}\n")
 
 
 def test_every_command_of_every_file_is_in_the_parser():
@@ -160,15 +153,6 @@ def test_a_command_of_before_is_refused_and_the_new_one_named(
         assert capsys.readouterr().err == f"error: the command '{name}' is now {instead}\n"
 
 
-def test_brackets_in_an_error_are_shown_as_they_are(monkeypatch, capsys, tmp_path: Path):
-    monkeypatch.chdir(tmp_path)
-    for name in ("a[red]b", "x[/y]"):
-        assert cli.main(["replay", name, "--output", "out"]) == 1
-        captured = capsys.readouterr()
-        assert f"checking {name}" in captured.out
-        assert f"{name}: does not exist" in captured.err
-
-
 def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):
     with_ros = ("magnetosuture_thread.nodes", "magnetosuture_thread.jobs.replay", "magnetosuture_thread.jobs.simulate")
     for name in [name for name in sys.modules if name.startswith(with_ros[0]) or name in with_ros]:
@@ -179,23 +163,6 @@ def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path
     assert cli.main(["replay", str(short_bag), "--output", str(tmp_path / "out")]) == 1
     assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_evaluate_prints_a_table_and_writes_figures_and_pictures(tmp_path: Path):
-    write(tmp_path, "straight")
-    figures, pictures = tmp_path / "figures.json", tmp_path / "pictures"
-    done = run("evaluate", str(tmp_path), "--json", str(figures), "--pictures", str(pictures), "--segments", "20")
-    assert done.returncode == 0, done.stderr
-    assert "mean of the cases" in done.stdout
-    assert json.loads(figures.read_text())["cases"][0]["name"] == "straight"
-    assert (pictures / "straight.png").is_file()
-
-
-def test_evaluate_refuses_what_is_no_trajectory(tmp_path: Path):
-    (tmp_path / "broken.npz").write_bytes(b"no archive")
-    refused = run("evaluate", str(tmp_path))
-    assert refused.returncode == 1
-    assert "broken.npz: is no reference trajectory" in refused.stderr
 
 
 def test_the_words_of_the_command_are_those_of_the_model(capsys: pytest.CaptureFixture[str]):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from dataclasses import FrozenInstanceError, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,11 +10,9 @@ import pytest
 
 from magnetosuture_thread.configuration import (
     Configuration,
-    configuration_fields,
     from_mapping,
     quantity,
     read_yaml,
-    to_mapping,
 )
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.parameter_files import key_matches, load_setup
@@ -74,19 +71,6 @@ def test_an_invalid_value_is_refused_in_one_line(values, words):
     assert "\n" not in str(caught.value)
 
 
-def test_an_object_made_directly_is_checked_too():
-    with pytest.raises(ConfigurationError):
-        Oven(shelves=0)
-    with pytest.raises(FrozenInstanceError):
-        Oven().shelves = 3  # type: ignore[misc]
-
-
-def test_mapping_goes_there_and_back():
-    oven = Oven(temperature=500.0, corners=(0.0, 1.0))
-    assert from_mapping(Oven, to_mapping(oven)) == oven
-    assert {about.name for about in configuration_fields(Oven)} == set(to_mapping(oven))
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -117,15 +101,6 @@ def test_a_setup_file_is_read_as_ros_reads_it(tmp_path: Path):
     path = tmp_path / "oven.yaml"
     path.write_text("oven: {ros__parameters: {temperature: 4e2, use_sim_time: true, qos_overrides: {a: 1}}}")
     assert load_setup(path, [Oven])["oven"].temperature == 400.0
-
-
-def test_an_empty_list_in_a_setup_file_is_one(tmp_path: Path):
-    path = tmp_path / "oven.yaml"
-    path.write_text("oven: {ros__parameters: {corners: []}}")
-    assert load_setup(path, [Oven])["oven"].corners == ()
-    path.write_text("oven: {ros__parameters: {temperature: []}}")
-    with pytest.raises(ConfigurationError, match="expected a number"):
-        load_setup(path, [Oven])
 
 
 def test_an_unreadable_setup_file_is_refused(tmp_path: Path):
@@ -209,12 +184,6 @@ def test_a_section_that_is_for_nobody_or_says_too_much_is_refused(tmp_path: Path
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_of_ros_may_stand_under_every_key(tmp_path: Path):
-    path = tmp_path / "kitchen.yaml"
-    path.write_text("/**: {ros__parameters: {use_sim_time: true, viscosity: 2.0, qos_overrides./scene.depth: 3}}")
-    assert load_setup(path, [Kettle])["kettle"].viscosity == 2.0
-
-
 @pytest.mark.parametrize(
     ("key", "node", "is_for"),
     [
@@ -249,10 +218,3 @@ def test_a_setup_past_its_budget_is_refused(tmp_path: Path, text: str, words: st
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ConfigurationError, match=words):
         read_yaml(tmp_path / "a.yaml", "setup file")
-
-
-def test_a_pipe_or_device_is_no_setup(tmp_path: Path):
-    os.mkfifo(tmp_path / "a.yaml")
-    for path in (tmp_path / "a.yaml", Path("/dev/zero"), tmp_path):
-        with pytest.raises(ConfigurationError, match="a folder, pipe or device"):
-            read_yaml(path, "setup file")

@@ -17,7 +17,7 @@ SAYS = {
     "another_solver": "osqp and banded differ by 0.00 nm",
     "calibration": "stiffness over drag: 1.(29|31?)e-09 m.4/s, identified",  # the bag's thread has 1.306e-09
     "free_thread": "nearest node to the wall: 4.97 mm",
-    "mesh_in_space": "4 nodes lie on the mesh",
+    "ball_in_space": "nodes lie on the ball",
     "needle_filter": "in the end: stopped by post, upper_half",
     "offline_replay": "needle found in 119 of 121 frames",
     "own_barrier": "moving_disc: at least",

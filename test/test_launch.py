@@ -17,10 +17,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.interface import (
     ALL_NODES,
-    DISH_FRAME,
-    NEEDLE_COMMAND,
     NODES,
-    OPERATOR_COMMAND,
     PROCESSES,
     RIG_NODES,
     STANDBY_NODES,
@@ -30,7 +27,6 @@ ROOT = Path(__file__).parent.parent
 INSTALLED: dict[str, str] = {}  # packages of the ROS installation
 LIFECYCLE = {"perception", "coil_bridge", *(set(STANDBY_NODES) & set(ALL_NODES) - set(NODES))}
 AUTOSTART = next(a.quantity.choices for a in configuration_fields(CoilBridgeSettings) if a.name == "autostart")
-SHIPPED = sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 
 
 def kept(kind: str) -> Callable[..., SimpleNamespace]:
@@ -92,27 +88,6 @@ def nodes(description: list[Any], **arguments: str) -> list[Any]:
     return list(function.function(Context(given)))
 
 
-def test_a_setup_is_one_of_those_that_ship(description):
-    (setup,) = (entry for entry in description if entry.kind == "argument" and entry.given[0] == "setup")
-    assert setup.choices == SHIPPED
-    assert setup.default_value in setup.choices
-
-
-def test_every_switch_names_its_choices(description):
-    switches = {entry.given[0]: entry for entry in description if entry.kind == "argument"}
-    for name in ("use_sim_time", "simulated", "planner", "console", "enclaves"):
-        assert switches[name].choices == ["true", "false"]
-        assert switches[name].default_value == "false"
-
-
-def test_nobody_but_one_node_commands_on_the_topic_below_the_operator(description):
-    """The operator's page has a topic of its own, above that of planner and path follower."""
-    for planner in ("true", "false"):
-        started = {node.executable for node in nodes(description, simulated="true", console="true", planner=planner)}
-        assert len(started & {"path_follower", "needle_planner"}) == 1
-    assert OPERATOR_COMMAND.name != NEEDLE_COMMAND.name
-
-
 def test_every_node_gets_the_same_file_and_namespace(description):
     started = nodes(description, setup="hernia_ring")
     assert {node.executable for node in started} == {"scene_server", *PROCESSES, *RIG_NODES, "console"}
@@ -151,20 +126,6 @@ def test_lifecycle_nodes_alone_go_as_far_as_autostart_says(description, planner:
         for parameters in node.parameters[1:]:
             given |= parameters
         assert given.get("autostart") == ("inactive" if node.executable in LIFECYCLE else None)
-
-
-def test_a_planner_comes_in_place_of_the_path_follower(description):
-    started = {node.executable for node in nodes(description, planner="true")}
-    assert started == {"scene_server", *PROCESSES, "rig_simulator", "needle_planner", "console"}
-
-
-def test_the_frame_of_the_dish_is_published_where_tf2_is_installed(description, monkeypatch: pytest.MonkeyPatch):
-    assert "tf2_ros" not in {node.package for node in nodes(description)}
-    monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
-    (transform,) = (node for node in nodes(description, parent_frame="bench") if node.package == "tf2_ros")
-    assert transform.arguments == ["--frame-id", "bench", "--child-frame-id", DISH_FRAME]
-    assert (transform.namespace.name, transform.remappings) == ("namespace", [("/tf_static", "tf_static")])
-    assert "tf2_ros" not in {node.package for node in nodes(description, parent_frame="")}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from rosbags.rosbag2 import StoragePlugin
 
 from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.cli.terminal import make_console
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.report.page import _template
 from magnetosuture_thread.evaluation.tables import failed_row, flat, table_csv
@@ -80,23 +79,6 @@ def test_only_new_and_regular_files_are_written(tmp_path: Path, capsys: pytest.C
     assert (tmp_path / "file.json").read_text() == "kept"
     assert cli.main(["bag", "check", str(bag), "--json", str(tmp_path / "file.json")]) == 0
     assert json.loads((tmp_path / "file.json").read_text())["messages"] == 3
-
-
-def test_names_reach_the_terminal_escaped(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    folder = tmp_path / f"bag{NASTY}"
-    folder.mkdir()
-    path = write_mcap(folder / f"{NASTY}.mcap", texts(3, f"/{NASTY}"), {f"/{NASTY}": STRING})
-    assert cli.main(["bag", "check", str(path)]) == 0
-    assert cli.main(["bag", "check", str(folder / f"no{NASTY}")]) == 1
-    assert cli.main(["track", str(path)]) == 1
-    shown = "".join(capsys.readouterr())
-    assert r"\x1b[31m\u202eb\x9b1m" in shown
-    assert not set(shown) & {"\x1b", "\u202e", "\x9b"}
-
-
-def test_a_console_escapes_whatever_is_printed(capsys: pytest.CaptureFixture[str]):
-    make_console().print(NASTY, markup=False)
-    assert capsys.readouterr().out == "a\\x1b[31m\\u202eb\\x9b1m\n"
 
 
 def test_tables_and_pages_show_names_escaped():

@@ -26,7 +26,6 @@ from magnetosuture_thread import (
     MagnetosutureError,
     Material,
     Medium,
-    Mesh,
     NeedlePose,
     NeedleSafetyFilter,
     Polygon,
@@ -179,16 +178,6 @@ def test_a_centreline_that_ends_early_is_continued_where_that_is_asked_for_and_o
     np.testing.assert_allclose(of_start(centreline=STRAIGHT * 1.05).positions[-1], [-0.019, 0.0], atol=1e-9)
 
 
-def test_numbers_of_numpy_and_lists_are_taken_as_what_they_are():
-    predictor = CREATE(length=np.float32(0.019), segments=np.int64(25), scene=EMPTY, fixed_nodes=np.array([25]))
-    assert predictor.thread.segments == 25
-    assert predictor.fixed_nodes == (25,)
-    start: Any = NeedlePose
-    predictor.start(start(0, [0, 0], [1, 0]), STRAIGHT.tolist())
-    assert of_call(commanded=[0.002, 0.0], tail=[0.0, 0.0], heading=(1, 0)).filtered.tolist() == [0.002, 0.0]
-    assert made(Disc)(centre=np.array([0, 1e-3]), radius=np.float64(1e-3)) == Disc((0.0, 1e-3), 1e-3)
-
-
 # What is returned and not made by users, and what has no numbers.
 RECORDS = {"BarrierMargins", "FilteredCommand", "Forecast", "Gradient", "Margins", "Prediction", "ThreadEstimate"}
 OTHERS = {"MATERIALS", "Attachment", "ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"}
@@ -205,7 +194,6 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
     ),
     "Material": (MATERIAL, "diameter elastic_modulus stiffness_weight"),
     "Medium": (MEDIUM, " ".join(Medium.__dataclass_fields__)),
-    "Mesh": (made(Mesh, vertices=np.eye(3), faces=[[0, 1, 2]]), "vertices faces"),
     "NeedlePose": (of_step, "stamp tail heading deviation"),
     "NeedleSafetyFilter": (
         FILTER,

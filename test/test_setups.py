@@ -11,15 +11,10 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file, share_directory
-from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
 SHIPPED = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
-
-
-def test_there_are_setups():
-    assert "petri_35mm_polyamide" in SHIPPED
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -129,50 +124,6 @@ def test_the_rig_may_be_another_than_the_nodes_believe(tmp_path: Path):
     assert read_setup(str(path)).rig.needle_length == 0.008
 
 
-@pytest.mark.parametrize(
-    ("scene", "waypoints", "words"),
-    [
-        (
-            "dish_35mm",
-            "0.0, 0.0, 0.0175, 0.0",
-            r"waypoints: got \[0.0175, 0.0\], expected within the dish",
-        ),
-        ("dish_35mm_post", "0.0, 0.0, 0.008, 0.004", r"got \[0.008, 0.004\], expected a point outside of post"),
-        ("hernia_ring", "0.0, 0.0105", r"expected a point outside of ring"),
-    ],
-)
-def test_a_path_through_a_wall_or_a_shape_is_refused(tmp_path: Path, scene: str, waypoints: str, words: str):
-    path = tmp_path / "path.yaml"
-    path.write_text(
-        f"/**: {{ros__parameters: {{scene: {scene}}}}}\n"
-        f"/**/path_follower: {{ros__parameters: {{waypoints: [{waypoints}]}}}}\n"
-    )
-    with pytest.raises(ConfigurationError, match=words) as caught:
-        read_setup(str(path))
-    assert str(caught.value).startswith(str(path))
-    assert read_setup(str(path), Scene(Dish(0.15))).follower.waypoints  # where nothing is in its way
-
-
-def test_a_point_in_a_hole_is_in_nobodys_way(tmp_path: Path):
-    path = tmp_path / "hole.yaml"
-    path.write_text(
-        "/**: {ros__parameters: {scene: hernia_ring}}\n"
-        "/**/path_follower: {ros__parameters: {waypoints: [0.0, 0.005]}}\n"
-    )
-    assert read_setup(str(path)).scene.names[0] == "ring"
-
-
-def test_a_setup_without_a_scene_says_so_once_it_is_needed(tmp_path: Path):
-    path = tmp_path / "none.yaml"
-    path.write_text("/**/thread_model: {ros__parameters: {segments: 30}}\n")
-    setup = read_setup(str(path))
-    with pytest.raises(ConfigurationError, match=r"scene: got 'none', expected a scene file under /\*\*"):
-        _ = setup.scene
-    other = Scene(Dish(0.15))
-    assert setup.with_scene(other).scene is other
-    assert read_setup(str(path), other).scene is other
-
-
 def test_a_scene_that_is_none_is_refused_with_the_setup(tmp_path: Path):
     path = tmp_path / "odd.yaml"
     path.write_text("/**: {ros__parameters: {scene: hernia}}\n")
@@ -182,34 +133,8 @@ def test_a_scene_that_is_none_is_refused_with_the_setup(tmp_path: Path):
         read_setup(str(path))
 
 
-def test_a_setup_is_found_by_path(tmp_path: Path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("/**/thread_model: {ros__parameters: {segments: 30}}\n")
-    assert read_setup(str(path)).model.segments == 30
-
-
-def test_a_needle_in_millimetres_is_refused(tmp_path: Path):
-    path = tmp_path / "millimetres.yaml"
-    path.write_text("/**: {ros__parameters: {needle_length: 7.0}}\n")
-    with pytest.raises(ConfigurationError) as caught:
-        read_setup(str(path))
-    expected = "got 7.0, expected a number from 0.001 to 0.05 m; given in metres?"
-    assert str(caught.value) == f"{path}: vision_tracker.needle_length: {expected}"
-
-
 def test_an_unknown_setup_is_refused_with_the_known_ones():
     with pytest.raises(ConfigurationError, match="petri_150mm_silk"):
         find_setup_file("petri_36mm")
     with pytest.raises(ConfigurationError, match=r"nowhere\.yaml"):
         find_setup_file("nowhere.yaml")
-
-
-def test_a_thread_must_make_sense(tmp_path: Path):
-    for text, words in (
-        ("segments: 2000", "so that a segment is longer than thick"),
-        ("viscosity: 1000.0", "from 0.0001 to 100 Pa s"),
-    ):
-        path = tmp_path / "odd.yaml"
-        path.write_text(f"/**/thread_model: {{ros__parameters: {{{text}}}}}\n")
-        with pytest.raises(ConfigurationError, match=words):
-            read_setup(str(path))

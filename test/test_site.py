@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -70,17 +69,3 @@ def test_nothing_is_loaded_from_a_network(site: Path):
     sheets = "".join(path.read_text(encoding="utf-8") for path in site.rglob("*.css"))
     assert "@import" not in sheets
     assert "url(http" not in sheets.replace("'", "").replace('"', "")
-
-
-def test_a_table_of_results_gets_the_newest_commit_of_its_rows():
-    spec = importlib.util.spec_from_file_location("commits_of_tables", ROOT / "docs" / "commits_of_tables.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    text = "# Results\n\n| a |\n|---|\n| 1 |\n| 2 |\n\nEnd.\n"
-    commits = ["old", "old", "old", "old", "new", "old", "newest", "newest"]
-    dated = module.with_commits(text, commits, ["newest", "new", "old"])
-    assert dated.splitlines()[5:8] == ["| 2 |", "", "*Commit new.*"]
-    assert "Not committed yet" in module.with_commits(text, ["000000000"] * 8, ["old"])
-    assert module.with_commits(text, [], []) == text  # without a history

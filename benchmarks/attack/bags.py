@@ -1,4 +1,4 @@
-"""Damages bags at random, and checks what reading, repairing and salvaging make of them."""
+"""Damages bags at random, and checks what reading and repairing make of them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread.bags.bag_folder import METADATA_FILE
+from magnetosuture_thread.bags.check import write_repaired_bag
 from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.repair import write_repaired_bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import MagnetosutureError
 
@@ -33,6 +33,7 @@ MESSAGES_EACH = 500  # of each topic
 PERIOD = 33_000_000  # ns between two messages of a topic
 SECOND = 10**9
 KINDS = ("flip", "zeros", "noise", "cut", "remove", "repeat", "swap")
+OUTCOMES = ("whole", "damage_noticed", "refused", "altered_and_unchecked", "ended")
 PROMISES = ("altered_as_sound", "silently_lost", "tracebacks", "too_slow", "too_large")
 TYPES = {
     "/thread/measured": "nav_msgs/msg/Path",
@@ -43,9 +44,7 @@ TYPES = {
 Message = tuple[str, int, bytes]
 
 
-def attack_bags(
-    count: int, seed: int, progress: Callable[[float], None] = lambda share: None
-) -> tuple[dict[str, Any], list[str], bool]:
+def attack_bags(count: int, seed: int, progress: Callable[[float], None]) -> tuple[dict[str, Any], list[str]]:
     """Damage bags of both formats in turn, and judge what becomes of each.
 
     Args:
@@ -54,10 +53,10 @@ def attack_bags(
         progress: called with the share done, 0 to 1.
 
     Returns:
-        Figures by format, lines for a person, and whether all promises were kept.
+        Figures by format, with what was broken, and lines for a person.
     """
     figures: dict[str, Any] = {}
-    examples: list[str] = []
+    broken: list[str] = []
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
         bags = {"mcap": _write_mcap(folder / "mcap"), "sqlite3": _write_sqlite(folder / "sqlite3")}
@@ -66,29 +65,24 @@ def attack_bags(
         worst = dict.fromkeys(bags, (0.0, 0.0))
         for index in range(count):
             name = list(bags)[index % len(bags)]
-            chance = random.Random(f"{seed} {index}")
             target = folder / "damaged"
-            kinds = _damaged_copy(bags[name], target, chance)
+            kinds = _damaged_copy(bags[name], target, random.Random(f"{seed} {index}"))
             found, seconds, megabytes = check_bag(target, original)
             found["too_slow"] += seconds > MAX_SECONDS
             found["too_large"] += megabytes > MAX_MEGABYTES
             totals[name] += found
             worst[name] = max(worst[name][0], seconds), max(worst[name][1], megabytes)
-            examples += [f"{name}, attack {index} ({kinds}): {promise}" for promise in PROMISES if found[promise]]
+            broken += [f"{name}, attack {index} ({kinds}): {promise}" for promise in PROMISES if found[promise]]
             progress((index + 1) / count)
     lines = []
     for name, total in totals.items():
         seconds, megabytes = worst[name]
+        number = sum(total[key] for key in OUTCOMES)
         figures[name] = {key: total[key] for key in (*OUTCOMES, *PROMISES)}
-        figures[name] |= {"bags": sum(total[key] for key in OUTCOMES), "max_s": seconds, "max_mb": megabytes}
+        figures[name] |= {"bags": number, "max_s": seconds, "max_mb": megabytes}
         shown = ", ".join(f"{total[key]} {key.replace('_', ' ')}" for key in (*OUTCOMES, *PROMISES))
-        lines.append(f"{name}: {figures[name]['bags']} bags: {shown}; at most {seconds:.1f} s and {megabytes:.0f} MB")
-    broken = sum(total[promise] for total in totals.values() for promise in PROMISES)
-    figures["broken"] = examples
-    return figures, [*lines, *examples[:20]], not broken
-
-
-OUTCOMES = ("whole", "damage_noticed", "refused", "altered_and_unchecked", "ended")
+        lines.append(f"{name}: {number} bags: {shown}; at most {seconds:.1f} s and {megabytes:.0f} MB")
+    return {**figures, "broken": broken}, lines
 
 
 def original_messages() -> list[Message]:
@@ -195,7 +189,7 @@ def check_bag(bag: Path, original: Counter[Message]) -> tuple[Counter[str], floa
 
 
 def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
-    """Return what reading, repairing and salvaging make of a bag."""
+    """Return what reading and repairing make of a bag."""
     found: Counter[str] = Counter()
     try:
         opened = Bag(bag)
@@ -207,30 +201,20 @@ def _check(bag: Path, original: Counter[Message]) -> dict[str, int]:
     except MagnetosutureError:
         return {"refused": 1}
     altered, missing = (read - original).total(), (original - read).total()
-    is_noticed = opened.damage is not None or bool(refused) or bool(opened.unverified)
+    is_noticed = opened.damage is not None or bool(refused)
     is_doubted = is_noticed or bool(opened.unchecked)
-    if is_noticed:
-        found["damage_noticed"] = 1
-    elif altered or missing:
-        found["altered_and_unchecked"] = 1
-    else:
-        found["whole"] = 1
+    found["damage_noticed" if is_noticed else "altered_and_unchecked" if altered or missing else "whole"] = 1
     # Of a message that was altered unnoticed the original is missing, and the altered one is there in its place.
     found["silently_lost"] += missing > altered and not is_noticed
-    found["altered_as_sound"] += altered > 0 and (not is_doubted or (is_noticed and not opened.unverified))
-    for unverified in (False, True):
-        output = bag.with_name(f"repaired_{unverified}")
-        shutil.rmtree(output, ignore_errors=True)
-        try:
-            write_repaired_bag(opened, output, "repaired", unverified=unverified)
-            new = Bag(output)
-        except MagnetosutureError:
-            continue
-        finally:
-            repaired = output.is_dir() and any(output.glob("*.mcap"))
-        if not repaired:
-            continue
-        made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
-        is_marked = bool(new.unverified) or (bool(new.unchecked) and not is_noticed)
-        found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
+    found["altered_as_sound"] += altered > 0 and (not is_doubted or is_noticed)
+    output = bag.with_name("repaired")
+    shutil.rmtree(output, ignore_errors=True)
+    try:
+        write_repaired_bag(opened, output, "repaired")
+        new = Bag(output)
+    except MagnetosutureError:
+        return dict(found)
+    made = Counter((record.topic, record.time, record.data) for _, record in new.every_record(Counter()))
+    is_marked = bool(new.unchecked) and not is_noticed
+    found["altered_as_sound"] += (made - original).total() > 0 and not is_marked
     return dict(found)

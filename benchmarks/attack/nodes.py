@@ -2,42 +2,44 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import random
+import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
+import aiohttp
 import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from benchmarks.attack.hostile import Attacker
-from benchmarks.attack.page import WatchingPage
 from benchmarks.attack.probe import READY, STOP, UNARMED
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, RIG_NODES, SCENE_SERVER
-from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.jobs.graph import START_TIMEOUT, OwnGraph, own_graph
 from magnetosuture_thread.setups import read_setup
 
 SETUP = "petri_35mm_polyamide"
 TARGETS = (SCENE_SERVER, *RIG_NODES, *NODES)
 CONSOLE, PAGE = "console", "page"
+PAGE_URL = "the operator's page: "  # before it in what the console prints
 WORDS = {STOP: "emergency stop: {} answers", PAGE: "operator's page: {} intervals between states"}
 MAX_DELAY, MAX_STOP_DELAY = 0.5, 0.2  # s
 RATE = 150.0  # attacks a second
 CLOCK_SHARE = 0.25  # of all attacks, on a graph with a simulated clock
-START_TIMEOUT = 240.0  # s; the first start on a machine compiles
 DISCOVERY_TIME = 8.0  # s for the services of all nodes, then for its clients: an answer to an unknown client is lost
 LAST_ANSWERS = 20.0  # s for what is still unanswered
 
 
-def attack_nodes(
-    count: int, seed: int, progress: Callable[[float], None] = lambda share: None
-) -> tuple[dict[str, Any], list[str], bool]:
+def attack_nodes(count: int, seed: int, progress: Callable[[float], None]) -> tuple[dict[str, Any], list[str]]:
     """Attack all nodes, first by the time of the day, then by a simulated clock.
 
     Args:
@@ -46,121 +48,168 @@ def attack_nodes(
         progress: called with the share done, 0 to 1.
 
     Returns:
-        Figures, lines for a person, and whether all promises were kept.
+        Figures, with what was broken, and lines for a person.
     """
+    attack = _Attack(count, progress)
     with_clock = round(CLOCK_SHARE * count)
-    sent, delays, events = Counter[str](), defaultdict[str, list[float]](list), Counter[str]()
-    examples: list[str] = []
-    done = 0
-
-    def advance() -> None:
-        nonlocal done
-        done += 1
-        progress(done / count)
-
     for number, clock in ((count - with_clock, False), (with_clock, True)):
         if number:
-            examples += _attack_graph(number, random.Random(f"{seed} {clock}"), clock, sent, delays, events, advance)
-    figures: dict[str, Any] = {"sent": dict(sent), "ended": events["ended"], "unanswered": events["unanswered"]}
-    figures |= {"unarmed": events[UNARMED], "answers": {name: _summary(each) for name, each in sorted(delays.items())}}
-    broken = list(examples)
-    for name, each in delays.items():
-        limit = MAX_STOP_DELAY if name == STOP else MAX_DELAY
-        if late := sum(delay > limit for delay in each):
-            broken.append(
-                f"{name}: {late} of {len(each)} answers took longer than {limit:g} s, at most {max(each):.2f} s"
-            )
-    if not delays[STOP]:
-        broken.append("no emergency stop was answered")
-    figures["broken"] = broken
-    lines = [
-        ", ".join(f"{number} {kind}" for kind, number in sent.items())
-        + f": {events['ended']} nodes ended, {events['unanswered']} requests without an answer"
-    ]
-    for name, each in figures["answers"].items():
-        what = WORDS.get(name, f"{name}: {{}} answers").format(each["count"])
-        lines.append(f"{what}, median {each['median_ms']:.1f} ms, at most {each['max_ms']:.1f} ms")
-    return figures, [*lines, *broken[:20]], not broken
+            attack.attack(number, random.Random(f"{seed} {clock}"), clock)
+    return attack.figures()
 
 
-def _attack_graph(
-    count: int,
-    chance: random.Random,
-    clock: bool,
-    sent: Counter[str],
-    delays: dict[str, list[float]],
-    events: Counter[str],
-    advance: Callable[[], None],
-) -> list[str]:
-    """Attack a graph of its own; add to the figures, and return what went wrong."""
-    problems: list[str] = []
-    setup = str(read_setup(SETUP).path.resolve())
-    arguments = ["--params-file", setup, "-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed"]
-    if clock:
-        arguments += ["-p", "use_sim_time:=true", "-p", "rig_simulator:rate:=1.0"]
-    with reserved_domain() as domain, TemporaryDirectory() as temporary:
-        environment, logs = graph_environment(domain), Path(temporary)
-        with (
-            environment_of(environment),
-            NodeProcesses(TARGETS, arguments, environment, logs) as nodes,
-            WatchingPage(logs / f"{CONSOLE}.log") as page,
-        ):
-            targets = f"nodes:=[{', '.join(TARGETS)}]"
-            nodes.start(CONSOLE, arguments=["-p", "console:port:=0"])
-            nodes.start("probe", module="benchmarks.attack.probe", arguments=["-p", targets])
-            context = Context()
-            rclpy.init(context=context, domain_id=domain, args=[])
-            node = rclpy.create_node("attacker", context=context, start_parameter_services=False)
-            listener = rclpy.create_node("listener", context=context, start_parameter_services=False)
-            executor = SingleThreadedExecutor(context=context)
-            executor.add_node(node)
-            try:
-                _wait_until(lambda: READY in (logs / "probe.log").read_text().splitlines(), nodes)
-                _wait_until(lambda: {CONSOLE, *TARGETS} <= set(node.get_node_names()), nodes)
-                _spin(executor, DISCOVERY_TIME)
-                attacker = Attacker(node, listener, list(TARGETS), chance, clock=clock)
-                _spin(executor, DISCOVERY_TIME)
-                _wait_until(lambda: bool(page.gaps), nodes)
+class _Attack:
+    """Counts of all attacks, and delays of all answers [s] by the node's name, `STOP` or `PAGE`."""
+
+    def __init__(self, count: int, progress: Callable[[float], None]) -> None:
+        self.sent, self.events = Counter[str](), Counter[str]()
+        self.delays = defaultdict[str, list[float]](list)
+        self.broken: list[str] = []
+        self._count, self._progress = count, progress
+
+    def figures(self) -> tuple[dict[str, Any], list[str]]:
+        """Return the figures, with what was broken, and lines for a person."""
+        events, sent = self.events, ", ".join(f"{number} {kind}" for kind, number in self.sent.items())
+        lines = [f"{sent}: {events['ended']} nodes ended, {events['unanswered']} requests without an answer"]
+        answers = {}
+        for name, each in sorted(self.delays.items()):
+            median, p99, largest = (float(1e3 * value) for value in np.quantile(each, (0.5, 0.99, 1.0)))
+            answers[name] = {"count": len(each), "median_ms": median, "p99_ms": p99, "max_ms": largest}
+            what = WORDS.get(name, f"{name}: {{}} answers").format(len(each))
+            lines.append(f"{what}, median {median:.1f} ms, at most {largest:.1f} ms")
+            limit = MAX_STOP_DELAY if name == STOP else MAX_DELAY
+            if late := sum(delay > limit for delay in each):
+                took = f"took longer than {limit:g} s, at most {max(each):.2f} s"
+                self.broken.append(f"{name}: {late} of {len(each)} answers {took}")
+        if not self.delays[STOP]:
+            self.broken.append("no emergency stop was answered")
+        counts = {"ended": events["ended"], "unanswered": events["unanswered"], "unarmed": events[UNARMED]}
+        return {"sent": dict(self.sent), **counts, "answers": answers, "broken": self.broken}, lines
+
+    def attack(self, count: int, chance: random.Random, clock: bool) -> None:
+        """Attack a graph of its own."""
+        setup = str(read_setup(SETUP).path.resolve())
+        arguments = ["--params-file", setup]
+        arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed"]
+        if clock:
+            arguments += ["-p", "use_sim_time:=true", "-p", "rig_simulator:rate:=1.0"]
+        with TemporaryDirectory() as temporary:
+            logs = Path(temporary)
+            with own_graph(TARGETS, arguments, logs, "", lambda text: None) as graph:
+                graph.nodes.start(CONSOLE, arguments=["-p", "console:port:=0"])
+                targets = f"nodes:=[{', '.join(TARGETS)}]"
+                graph.nodes.start("probe", module="benchmarks.attack.probe", arguments=["-p", targets])
+                self._attack(graph, logs, count, chance, clock)
+            for line in (logs / "probe.log").read_text().splitlines():
+                name, _, delay = line.partition(" ")
+                if delay and name in (STOP, *TARGETS):
+                    self.delays[name].append(float(delay))
+                self.events[UNARMED] += line == UNARMED
+
+    def _attack(self, graph: OwnGraph, logs: Path, count: int, chance: random.Random, clock: bool) -> None:
+        context = Context()
+        rclpy.init(context=context, domain_id=graph.domain, args=[])
+        node = rclpy.create_node("attacker", context=context, start_parameter_services=False)
+        listener = rclpy.create_node("listener", context=context, start_parameter_services=False)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        try:
+            _wait_until(lambda: READY in (logs / "probe.log").read_text().splitlines(), graph)
+            _wait_until(lambda: {CONSOLE, *TARGETS} <= set(node.get_node_names()), graph)
+            _spin(executor, DISCOVERY_TIME)
+            attacker = Attacker(node, listener, list(TARGETS), chance, clock=clock)
+            _spin(executor, DISCOVERY_TIME)
+            with _WatchingPage(logs / f"{CONSOLE}.log") as page:
+                _wait_until(lambda: bool(page.gaps), graph)
                 page.gaps.clear()
                 began = time.monotonic()
                 for index in range(count):
                     attacker.attack()
-                    advance()
+                    self._progress((sum(self.sent.values()) + index + 1) / self._count)
                     for name in (CONSOLE, *TARGETS):
-                        if nodes.ended(name):
+                        if graph.nodes.ended(name):
                             last = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()[-1:]
-                            problems.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
-                            events["ended"] += 1
-                            nodes.start(name)
+                            self.broken.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
+                            self.events["ended"] += 1
+                            graph.nodes.start(name)
                     _spin(executor, began + (index + 1) / RATE - time.monotonic())
                 until = time.monotonic() + LAST_ANSWERS
                 while attacker.unanswered and time.monotonic() < until:
                     _spin(executor, 0.1)
-                events["unanswered"] += len(attacker.unanswered)
-                for service, number in Counter(attacker.unanswered.values()).items():
-                    problems.append(f"{service}: {number} requests were not answered")
-                sent.update(attacker.sent)
-                delays[PAGE] += page.gaps
-                if page.losses:
-                    problems.append(f"the page lost the console {page.losses} times")
-            finally:
-                executor.shutdown()
-                listener.destroy_node()
-                node.destroy_node()
-                context.try_shutdown()
-        for line in (logs / "probe.log").read_text().splitlines():
-            name, _, delay = line.partition(" ")
-            if delay and name in (STOP, *TARGETS):
-                delays[name].append(float(delay))
-            events[UNARMED] += line == UNARMED
-    return problems
+            self.events["unanswered"] += len(attacker.unanswered)
+            for service, number in Counter(attacker.unanswered.values()).items():
+                self.broken.append(f"{service}: {number} requests were not answered")
+            self.sent.update(attacker.sent)
+            self.delays[PAGE] += page.gaps
+            if page.losses:
+                self.broken.append(f"the page lost the console {page.losses} times")
+        finally:
+            executor.shutdown()
+            listener.destroy_node()
+            node.destroy_node()
+            context.try_shutdown()
 
 
-def _wait_until(is_there: Callable[[], bool], nodes: NodeProcesses) -> None:
+class _WatchingPage:
+    """A page in a thread of its own that watches the graph under attack; it connects again when it has to.
+
+    Args:
+        log: the file with what the console prints.
+
+    Attributes:
+        gaps: between two states of one connection [s].
+        losses: connections that the server ended.
+    """
+
+    def __init__(self, log: Path) -> None:
+        self.gaps: list[float] = []
+        self.losses = 0
+        self._log = log
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
+
+    def __enter__(self) -> _WatchingPage:
+        """Begin to watch."""
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Disconnect."""
+        self._ends.set()
+        self._thread.join()
+
+    async def _run(self) -> None:
+        async with aiohttp.ClientSession() as session:
+            while not self._ends.is_set():
+                lines = self._log.read_text(errors="replace").splitlines()
+                url = urlsplit([line for line in lines if line.startswith(PAGE_URL)][-1].removeprefix(PAGE_URL))
+                try:
+                    await self._watch(session, f"http://{url.netloc}", parse_qs(url.fragment)["token"][0])
+                except aiohttp.ClientError:
+                    await asyncio.sleep(0.2)
+
+    async def _watch(self, session: aiohttp.ClientSession, address: str, token: str) -> None:
+        async with session.ws_connect(f"{address}/socket?token={token}", origin=address) as socket:
+            await socket.send_json({"type": "hello", "token": token, "automated": True})
+            last = None
+            while not self._ends.is_set():
+                message = await socket.receive(timeout=60.0)
+                if message.type not in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY):
+                    self.losses += 1
+                    return
+                is_frame = message.type is aiohttp.WSMsgType.BINARY
+                if is_frame or json.loads(message.data)["type"] == "state":
+                    await socket.send_json({"type": "acknowledge", "kind": "frame" if is_frame else "state"})
+                    now = time.monotonic()
+                    self.gaps += [] if last is None or is_frame else [now - last]
+                    last = last if is_frame else now
+
+
+def _wait_until(is_there: Callable[[], bool], graph: OwnGraph) -> None:
     """Wait until all nodes are there for someone."""
     deadline = time.monotonic() + START_TIMEOUT
     while not is_there():
-        nodes.check()
+        graph.nodes.check()
         if time.monotonic() > deadline:
             raise GraphError(f"after {START_TIMEOUT:g} s not all nodes have been discovered")
         time.sleep(0.1)
@@ -172,9 +221,3 @@ def _spin(executor: SingleThreadedExecutor, duration: float) -> None:
     executor.spin_once(timeout_sec=0.0)
     while (left := until - time.monotonic()) > 0.0:
         executor.spin_once(timeout_sec=left)
-
-
-def _summary(delays: list[float]) -> dict[str, float]:
-    """Return the figures of some delays [s]."""
-    median, p99, largest = 1e3 * np.quantile(delays, (0.5, 0.99, 1.0))
-    return {"count": len(delays), "median_ms": float(median), "p99_ms": float(p99), "max_ms": float(largest)}

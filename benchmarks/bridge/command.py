@@ -8,14 +8,313 @@ are kept busy. Takes nine minutes.
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import yaml
 from rich.console import Console
+from rich.table import Table
 
-from benchmarks.bridge.measurements import measure_bridge
-from benchmarks.bridge.report import bridge_table
+from benchmarks.bridge.drive_watch import DriveWatch
 from magnetosuture_thread.cli.arguments import whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.setups import read_setup
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.clients import CoilClient
+    from magnetosuture_thread.nodes.processes import NodeProcesses
+
+SETUP = "petri_35mm_polyamide"
+BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
+MOVING = 0.3  # s for which the coils must be driven before something is killed
+ATTEMPTS = 7  # to arm
+HEARD = 10.0  # s for a process to start and to be heard
+TIMEOUT = 30.0  # s for anything to happen
+KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
+FULL = 32767  # duty of the full supply
+SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
+
+Log = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class ZeroDelays:
+    """Times from an event to zero duty on all boards.
+
+    Attributes:
+        event: what happened.
+        count: how often the coils were driven then.
+        median: [s]
+        p99: [s]
+        greatest: [s]
+        bound: what they should not exceed [s].
+        beyond: how many do.
+    """
+
+    event: str
+    count: int
+    median: float
+    p99: float
+    greatest: float
+    bound: float
+    beyond: int
+
+    @classmethod
+    def of(cls, event: str, delays: Sequence[float], bound: float) -> ZeroDelays:
+        """Return the percentiles of some delays [s], of at least one."""
+        found = np.array(delays)
+        median, p99, greatest = np.percentile(found, [50.0, 99.0, 100.0]).tolist()
+        return cls(event, len(found), median, p99, greatest, bound, int(np.sum(found > bound)))
+
+
+class BridgeBench:
+    """A bridge with simulated boards on serial lines, and all that can fail around it, as processes.
+
+    Args:
+        stage: the boards.
+        nodes: the processes.
+        client: makes one for the bridge's switches.
+        logs: folder of what the processes print.
+        progress: called with the share of a stage done, 0 to 1.
+
+    Attributes:
+        restarts: how often a process that was started after a kill was not heard, until the bridge was started anew.
+    """
+
+    def __init__(
+        self, stage: PowerStage, nodes: NodeProcesses, client: Callable[[], CoilClient], logs: Path, progress: Progress
+    ) -> None:
+        self.watch = DriveWatch(stage)
+        self._nodes, self._client, self._logs, self._progress = nodes, client, logs, progress
+        self.restarts = 0
+
+    def start(self, name: str, **parameters: float | str) -> None:
+        """Start the bridge, or a stand-in for a commander, a tracker or a fuzzer."""
+        if name == "coil_bridge":
+            self._nodes.start(name)
+            self.arm()
+            return
+        given = [f"kind:={name}", *(f"{key}:={value}" for key, value in parameters.items())]
+        arguments = ["-r", f"__node:={name}", *(part for each in given for part in ("-p", each))]
+        self._nodes.start(name, module="benchmarks.bridge.traffic", arguments=arguments)
+
+    def stop_trials(self, trials: int) -> list[float]:
+        """Let a commander fall silent again and again; return the times from its last command to zero [s]."""
+        self.start("commander")
+        self.drive()
+        self._nodes.kill("commander")
+        self.wait(lambda: not self._driven(), "zero")
+        self.start("commander", burst=BURST, pause=PAUSE)
+        log, delays, last = self._logs / "commander.log", list[float](), time.monotonic()
+        while len(delays) < trials:
+            time.sleep(0.2)
+            stops = [float(line) for line in log.read_text().split("\n")[:-1]]  # the last line may be half written
+            if self._driven():
+                last = time.monotonic()
+            elif time.monotonic() - last > HEARD:
+                self.arm()  # a machine that stands still for longer than a board's answer may take is a fault
+            delays = self.watch.to_zero(stops)
+            self._progress(len(delays) / trials)
+            if time.monotonic() > last + TIMEOUT:
+                raise GraphError("waited in vain for the trials")
+        self._nodes.kill("commander")
+        return delays[:trials]
+
+    def kills(self, name: str, times: int) -> list[float]:
+        """Kill a process again and again while the coils are driven; return the times to zero [s]."""
+        delays = []
+        for done in range(times):
+            self.drive()
+            began = time.monotonic()
+            self._nodes.kill(name)
+            self.wait(lambda: not self._driven(), f"zero after {name} was killed")
+            delays += self.watch.to_zero([began])
+            self._progress((done + 1) / times)
+            self.start(name)
+        return delays
+
+    def fuzz(self, count: int) -> float:
+        """Publish hostile messages and see that the bridge works afterwards.
+
+        Returns:
+            The greatest current asked of a board meanwhile [A].
+
+        Raises:
+            GraphError: it does not.
+        """
+        for name in ("commander", "tracker"):
+            self._nodes.kill(name)
+        # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
+        self.wait(lambda: not self._driven(), "zero")
+        time.sleep(2.0 * SILENCE_TIMEOUT)
+        self.watch.forget()
+        self.start("fuzzer", count=count)
+        self.wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", TIMEOUT + count / 200.0)
+        self._nodes.kill("fuzzer")  # whose work is done
+        self.watch.look()
+        greatest = self.watch.largest / FULL * SUPPLY / RESISTANCE
+        self.arm()
+        self.start("tracker")
+        self.start("commander")
+        self.drive()
+        return greatest
+
+    def drive(self) -> None:
+        """Wait until the coils have been driven for a while, and start all anew where they are not."""
+        for _ in range(ATTEMPTS):
+            try:
+                self.wait(self._driven_for_a_while, "the coils to be driven", HEARD)
+                return
+            except GraphError:
+                # A killed process may leave Fast DDS's shared memory such that no later one is heard.
+                self.restarts += 1
+                for name in ("commander", "tracker", "coil_bridge"):
+                    self._nodes.kill(name)
+                for name in ("coil_bridge", "tracker", "commander"):
+                    self.start(name)
+        self.wait(self._driven_for_a_while, "the coils to be driven")
+
+    def arm(self) -> None:
+        """Arm the bridge; start it anew where it is not heard."""
+        for attempt in range(ATTEMPTS):
+            try:
+                # Another each time: the one that is not heard may be the client.
+                with self._client() as client:
+                    client.execute("reset")  # one that was killed while armed waits for it
+                    client.execute("arm")
+                return
+            except GraphError as error:
+                self._nodes.check()
+                if attempt == ATTEMPTS - 1:
+                    raise GraphError(f"the bridge cannot be armed: {error}") from None
+                if attempt % 2:
+                    self.restarts += 1
+                    self._nodes.kill("coil_bridge")
+                    self._nodes.start("coil_bridge")
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
+        """Wait until a condition holds.
+
+        Raises:
+            GraphError: it does not within the timeout [s].
+        """
+        deadline = time.monotonic() + timeout
+        while not condition():
+            time.sleep(0.01)
+            if time.monotonic() > deadline:
+                with self._client() as client:
+                    raise GraphError(f"waited in vain for {what}; the bridge says: {client.state()}")
+
+    def _driven(self) -> bool:
+        self.watch.look()
+        return self.watch.driven
+
+    def _driven_for_a_while(self) -> bool:
+        return self._driven() and time.monotonic() - self.watch.turns[-1][0] > MOVING
+
+
+def measure_bridge(
+    trials: int,
+    kills: int,
+    hostile: int,
+    *,
+    busy: bool = True,
+    log: Log = print,
+    progress: Progress = lambda share: None,
+) -> dict[str, Any]:
+    """Measure a coil bridge that drives simulated RoboClaw boards, on a machine all of whose cores are busy.
+
+    Args:
+        trials: of a commander that falls silent.
+        kills: of each process.
+        hostile: messages.
+        log: called with a line for a person at each stage.
+        progress: called with the share of a stage done, 0 to 1.
+        busy: whether to keep all cores busy meanwhile.
+
+    Returns:
+        The figures: `delays` as of `ZeroDelays`; `loop`, by how much an interval of the loop differs from its period
+        (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`; `hostile` messages,
+        the `greatest_current` meanwhile and its limit `max_current` [A]; `restarts` as of `BridgeBench`.
+    """
+    # Only here, where it is needed: without ROS the other commands still work.
+    from magnetosuture_thread.nodes.clients import CoilClient
+    from magnetosuture_thread.nodes.processes import (
+        NodeProcesses,
+        environment_of,
+        graph_environment,
+        reserved_domain,
+    )
+
+    settings = read_setup(SETUP).coils
+    delays: list[ZeroDelays] = []
+
+    def add(event: str, found: list[float], bound: float) -> None:
+        delays.append(spread := ZeroDelays.of(event, found, bound))
+        log(f"  {event}: median {1e3 * spread.median:.1f}, maximum {1e3 * spread.greatest:.1f} ms")
+
+    with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
+        folder = Path(name)
+        ports = [str(folder / f"board_{index}") for index in range(2)]
+        stage = PowerStage(ports, SUPPLY, RESISTANCE, INDUCTANCE)
+        # No thread is predicted here, and nothing shall go slower for that; there is no needle that could follow.
+        alone = {"without_prediction": "slow", "speed_without_prediction": settings.max_speed, "pose_uncertainty": 0.01}
+        boards = {"roboclaw_ports": ports, "roboclaw_addresses": [board.address for board in stage.boards]}
+        parameters = {"driver": "roboclaw", **boards, "coil_resistance": RESISTANCE, **alone}
+        file = folder / "parameters.yaml"
+        file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
+        arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]
+        environment, logs = graph_environment(domain), folder / "logs"
+        stage.open()
+        try:
+            with environment_of(environment), NodeProcesses((), arguments, environment, logs) as nodes, _load(busy):
+                bench = BridgeBench(stage, nodes, CoilClient, logs, progress)
+                bench.start("coil_bridge")
+                bench.start("tracker")
+                log(f"{trials} times a commander that falls silent")
+                add("last command", bench.stop_trials(trials), settings.command_timeout + 1.0 / settings.rate)
+                with CoilClient() as client:
+                    loop, scheduling = client.loop_timing()
+                bench.start("commander")
+                for victim in ("commander", "tracker", "coil_bridge"):
+                    log(f"{kills} times kill -9 of the {victim}")
+                    add(f"kill -9 of {victim}", bench.kills(victim, kills), KILL_BOUND)
+                log(f"{hostile} hostile messages")
+                greatest = bench.fuzz(hostile)
+        finally:
+            stage.close()
+    return {
+        "delays": [asdict(each) for each in delays],
+        **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
+        **{"greatest_current": greatest, "max_current": settings.max_current, "restarts": bench.restarts},
+    }
+
+
+@contextmanager
+def _load(busy: bool) -> Iterator[None]:
+    """Keep every core busy, if asked to."""
+    work = [sys.executable, "-c", "while True: pass"]
+    hogs = [subprocess.Popen(work, start_new_session=True) for _ in range((os.cpu_count() or 1) * busy)]
+    try:
+        yield
+    finally:
+        for hog in hogs:
+            hog.send_signal(signal.SIGKILL)
+            hog.wait()
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +332,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
     with progress(console, "bridge") as advance:
-        report = measure_bridge(options.trials, options.kills, options.hostile, log=make_log(console), progress=advance)
-    console.print(bridge_table(report))
-    return report.to_json(), True
+        figures = measure_bridge(
+            options.trials, options.kills, options.hostile, log=make_log(console), progress=advance
+        )
+    console.print(bridge_table(figures))
+    return figures, True
+
+
+def bridge_table(figures: dict[str, Any]) -> Table:
+    """Return the figures as a table that fits 80 columns."""
+    table = Table(title="coil bridge with simulated boards, all cores busy; times in ms", title_justify="left")
+    table.caption = f"zero: of the duties of all boards; loop at {figures['rate']:g} Hz, {figures['scheduling']}"
+    table.add_column("", no_wrap=True)
+    for name in ("median", "p99", "maximum", "bound", "beyond"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for each in figures["delays"]:
+        values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest", "bound"))
+        table.add_row(each["event"], *values, f"{each['beyond']}/{each['count']}")
+    table.add_row("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", "")
+    current, limit = f"{figures['greatest_current']:.2f} A", f"{figures['max_current']:.2f} A"
+    table.add_row(f"{figures['hostile']} hostile messages", "", "", current, limit, "alive")
+    table.add_row("restarts after a kill", "", "", "", "", str(figures["restarts"]))
+    return table

@@ -14,8 +14,7 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.messages.reading import pose_deviation
 from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.session import TrackerSession

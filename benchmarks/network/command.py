@@ -9,16 +9,288 @@ devices), and about half an hour.
 from __future__ import annotations
 
 import argparse
-from typing import Any
+import random
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.network.measurements import CutReport, measure_network
+from benchmarks.network.hosts import TwoHosts
 from magnetosuture_thread.cli.arguments import whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.setups import read_setup
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.nodes.processes import NodeProcesses
 
 DELAY, LOSS = 0.05, 0.05  # s, and share of packets
+SETUP = "petri_35mm_polyamide"
+AT_THE_RIG = ("scene_server", "rig_simulator", "vision_tracker", "coil_bridge")
+AT_THE_DESK = ("thread_model", "path_follower", "console")
+# Not by TCP, whose packets wait for one that was lost.
+ENVIRONMENT = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "DEFAULT"}
+COMMAND_TIMEOUT = 0.2  # s, for a command that was on its way for 50 ms, and one after it that was lost
+BRIDGE = {
+    "coil_bridge:driver": "simulated",
+    "coil_bridge:autostart": "armed",
+    "coil_bridge:command_timeout": str(COMMAND_TIMEOUT),
+}
+# What is sent anew with every pose is not worth waiting for.
+BEST_EFFORT = {
+    f"{node}:qos_overrides./{topic}.{end}.reliability": "best_effort"
+    for topic, sender in (("needle/servo_cv", "path_follower"), ("thread/margins", "thread_model"))
+    for node, end in ((sender, "publisher"), ("coil_bridge", "subscription"))
+}
+ROUNDS = 500  # of the setup's path, so that it does not end
+DRIVEN_TIME = 0.3  # s for which the coils must be driven before the cable is pulled
+RECENT = 0.1  # s since the last current that is not zero, with which the coils are taken for driven
+PULL_DELAY = 1.0  # s that may go by before, at random
+PULLED_TIME = (0.3, 4.0)  # s for which the cable is out, at random
+STOP_EVERY = 10  # cuts of which in one the emergency stop is pressed at the rig while the cable is out
+STILL_TIME = 2.0  # s for which a stopped bridge must stay at zero after the cable is back
+TRAFFIC_TIME = 10.0  # s
+TIMEOUT = 60.0  # s for anything to happen ...
+START_TIMEOUT = 300.0  # ... but for the first start on a machine, which compiles
+
+Log = Callable[[str], None]
+Progress = Callable[[float], None]
+
+
+@dataclass
+class CutReport:
+    """What pulling the cable did on one network.
+
+    Attributes:
+        delay: of each packet [s].
+        loss: share of packets that is lost.
+        zero: of each cut, time until the last current that is not zero [s].
+        resumed: of each cut without an emergency stop, time from plugging until the coils are driven again [s].
+        late: cuts after which the coils were driven for longer than the command's timeout, or again while it was out.
+        stops: cuts in which the emergency stop was pressed.
+        stops_kept: those of them that stayed at zero until a reset.
+        driven: share of time in which the coils are driven while the cable is in.
+        megabits: traffic from the rig to the desk and back, with camera frames for the operator's page [Mbit/s].
+    """
+
+    delay: float
+    loss: float
+    zero: list[float] = field(default_factory=list)
+    resumed: list[float] = field(default_factory=list)
+    late: int = 0
+    stops: int = 0
+    stops_kept: int = 0
+    driven: float = 0.0
+    megabits: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the coils were at zero in time after every cut, and no stopped bridge went on by itself."""
+        return self.late == 0 and self.stops == self.stops_kept
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures for a file [s]."""
+        times = {
+            f"{name}_{kind}": float(of(getattr(self, name)))
+            for name in ("zero", "resumed")
+            for kind, of in (("median", np.median), ("maximum", np.max))
+        }
+        names = ("delay", "loss", "late", "stops", "stops_kept", "driven", "megabits")
+        return {"cuts": len(self.zero), **times, **{name: getattr(self, name) for name in names}}
+
+
+class RigWatch:
+    """Subscribes to the currents that the bridge gives to the simulated rig, and to its state.
+
+    Attributes:
+        driven: when the bridge last gave currents that are not zero, by the system's clock [s]; -inf before the first.
+        since: when it began to do so without a pause of `DRIVEN_TIME` [s].
+        armed: whether the bridge is armed.
+        reasons: why the currents are zero.
+
+    Args:
+        processes: none of which may end.
+    """
+
+    def __init__(self, processes: Sequence[NodeProcesses]) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        from magnetosuture_thread.nodes import topics
+        from magnetosuture_thread.nodes.node import GuardedNode
+
+        self._processes, self._context = processes, rclpy.Context()
+        rclpy.init(context=self._context, args=[])
+        self._node = GuardedNode("rig_watch", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        topics.RIG_CURRENTS.subscribe(self._node, self._on_currents)
+        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
+        self.driven = self.since = -np.inf
+        self.armed, self.reasons = False, ""
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def spin(self, duration: float) -> None:
+        """Take what comes for a while."""
+        end = time.monotonic() + duration
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=min(left, 0.02))
+
+    def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
+        """Take what comes until a condition holds.
+
+        Raises:
+            GraphError: it does not within the timeout [s].
+        """
+        end = time.monotonic() + timeout
+        while not condition():
+            for each in self._processes:
+                each.check()
+            if time.monotonic() > end:
+                raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def is_driven(self) -> bool:
+        """Whether the coils are driven, and have been for a while."""
+        now = time.time()
+        return now - self.driven < DRIVEN_TIME <= now - self.since
+
+    def _on_currents(self, message: Any) -> None:
+        if np.any(np.abs(message.current) > 0.0):
+            given = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+            if given - self.driven > DRIVEN_TIME:
+                self.since = given
+            self.driven = given
+
+    def _on_state(self, message: Any) -> None:
+        self.armed, self.reasons = message.armed, "; ".join(message.reasons)
+
+
+class TwoHostBench:
+    """The graph over two hosts, and the cable between them.
+
+    Args:
+        hosts: the rig's and the desk's.
+        watch: of the bridge.
+    """
+
+    def __init__(self, hosts: TwoHosts, watch: RigWatch) -> None:
+        self._hosts, self._watch = hosts, watch
+        self._random = random.Random(1)
+
+    def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
+        """Pull the cable at random moments."""
+        self._hosts.impair(report.delay, report.loss)
+        self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
+        report.driven, report.megabits = self._measure_traffic()
+        for number in range(cuts):
+            self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
+            progress((number + 1) / cuts)
+        self._hosts.impair(0.0, 0.0)
+
+    def _cut(self, report: CutReport, stops: bool) -> None:
+        watch = self._watch
+        watch.wait(watch.is_driven, "the coils are not driven")
+        watch.spin(self._random.uniform(0.0, PULL_DELAY))
+        watch.wait(lambda: time.time() - watch.driven < RECENT, "the coils are not driven")
+        self._hosts.pull()
+        pulled = time.time()
+        watch.spin(self._random.uniform(*PULLED_TIME))
+        if stops:
+            _press("stop")
+        report.zero.append(max(0.0, watch.driven - pulled))
+        report.late += report.zero[-1] > COMMAND_TIMEOUT
+        self._hosts.plug()
+        plugged = time.time()
+        if stops:
+            report.stops += 1
+            report.stops_kept += not self._is_driven_within(STILL_TIME) and not watch.armed
+            _press("reset", "arm")
+        else:
+            watch.wait(lambda: watch.driven > plugged, "the coils are not driven again")
+            report.resumed.append(watch.driven - plugged)
+
+    def _is_driven_within(self, duration: float) -> bool:
+        before = self._watch.driven
+        self._watch.spin(duration)
+        return self._watch.driven > before
+
+    def _measure_traffic(self) -> tuple[float, tuple[float, float]]:
+        watch, began, before = self._watch, time.monotonic(), self._hosts.traffic()
+        driven = steps = 0
+        while time.monotonic() - began < TRAFFIC_TIME:
+            watch.spin(0.05)
+            driven += time.time() - watch.driven < RECENT
+            steps += 1
+        elapsed = time.monotonic() - began
+        there, back = (8e-6 * (now - then) / elapsed for now, then in zip(self._hosts.traffic(), before, strict=True))
+        return driven / steps, (there, back)
+
+
+def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, progress: Progress) -> list[CutReport]:
+    """Run the graph over two hosts and pull the cable between them; return a report of each network.
+
+    Args:
+        networks: delay [s], share of packets lost, and cuts of each; those without cuts are left out.
+        log: called with a line for a person at each stage.
+        progress: called with the share of a stage done, 0 to 1.
+
+    Raises:
+        GraphError: the hosts cannot be made, a node ended, or the coils are not driven.
+    """
+    setup = read_setup(SETUP)
+    reports: list[CutReport] = []
+    with TwoHosts() as hosts, tempfile.TemporaryDirectory() as folder:
+        # Imported here: threads that it starts have to be on the rig's host.
+        from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment
+
+        environment = {**graph_environment(1), **ENVIRONMENT}
+        path = ",".join(map(str, (*setup.follower.waypoints,) * ROUNDS))
+        shared = ["--params-file", str(setup.path.resolve()), *_parameters(BEST_EFFORT)]
+        at_the_rig = [*shared, *_parameters(BRIDGE)]
+        at_the_desk = [*shared, *_parameters({"path_follower:waypoints": f"[{path}]", "console:port": "0"})]
+        log("starting the nodes at the rig and at the desk")
+        with (
+            environment_of(environment),
+            NodeProcesses(AT_THE_RIG, at_the_rig, environment, Path(folder, "rig")) as rig,
+            NodeProcesses(
+                AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=hosts.at_the_desk
+            ) as desk,
+        ):
+            watch = RigWatch((rig, desk))
+            try:
+                bench = TwoHostBench(hosts, watch)
+                for delay, loss, cuts in filter(lambda network: network[2], networks):
+                    log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
+                    reports.append(CutReport(delay, loss))
+                    bench.pull_cable(reports[-1], cuts, progress)
+            finally:
+                watch.close()
+    return reports
+
+
+def _parameters(values: Mapping[str, str]) -> list[str]:
+    return [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
+
+
+def _press(*switches: str) -> None:
+    """Press switches of the bridge, at the rig."""
+    from magnetosuture_thread.nodes.clients import CoilClient
+
+    with CoilClient() as client:
+        for switch in switches:
+            client.execute(switch)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -36,27 +308,26 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     """Pull the cable; return the figures, and whether the coils were at zero in time after each cut."""
     networks = [(0.0, 0.0, options.cuts), (DELAY, LOSS, options.impaired_cuts)]
     with progress(console, "network") as advance:
-        reports, bound = measure_network(networks, log=make_log(console), progress=advance)
-    console.print(network_table(reports, bound))
-    return {"bound": bound, "networks": [report.to_json() for report in reports]}, all(r.passed for r in reports)
+        reports = measure_network(networks, make_log(console), advance)
+    console.print(network_table(reports))
+    figures = {"bound": COMMAND_TIMEOUT, "networks": [report.to_json() for report in reports]}
+    return figures, all(report.passed for report in reports)
 
 
-def network_table(reports: list[CutReport], bound: float) -> Table:
+def network_table(reports: list[CutReport]) -> Table:
     """Return the figures of each network as a table."""
     table = Table(title="Two hosts, simulated rig")
-    for heading in ("network", "cuts", f"at zero within {bound:g} s", "median, greatest [s]"):
-        table.add_column(heading)
-    for heading in ("goes on, median, greatest [s]", "stops kept", "driven", "Mbit/s"):
+    zero = f"at zero within {COMMAND_TIMEOUT:g} s"
+    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept", "driven", "Mbit/s"):
         table.add_column(heading)
     for report in reports:
-        figures = report.to_json()
+        found = report.to_json()
         table.add_row(
             f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost",
-            str(figures["cuts"]),
-            str(figures["cuts"] - report.late),
-            f"{figures['zero_median']:.3f}, {figures['zero_maximum']:.3f}",
-            f"{figures['resumed_median']:.2f}, {figures['resumed_maximum']:.2f}",
-            f"{report.stopped[1]} of {report.stopped[0]}",
+            f"{found['cuts'] - report.late} of {found['cuts']}",
+            f"{found['zero_median']:.3f}, {found['zero_maximum']:.3f}",
+            f"{found['resumed_median']:.2f}, {found['resumed_maximum']:.2f}",
+            f"{report.stops_kept} of {report.stops}",
             f"{report.driven:.0%}",
             f"{report.megabits[0]:.1f}, {report.megabits[1]:.1f}",
         )

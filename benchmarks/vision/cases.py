@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import ParamSpec
 
 import cv2
 import numpy as np
@@ -19,16 +20,16 @@ from benchmarks.vision.frames import (
     Needle,
     dark_field,
     distorted,
-    drawn_path,
+    drawn_thread,
     lens_with,
     tilted,
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import STEEL_BGR, Cover
-from magnetosuture_thread.rig.camera.scene import Lighting
+from magnetosuture_thread.rig.camera import STEEL_BGR, Cover, Lighting
 
 Random = np.random.Generator
 MakeCase = Callable[[Random], Case]
+Drawn = ParamSpec("Drawn")
 
 WITHIN, THREAD_WITHIN = 0.0150, 0.0163  # m; of the dish's centre, in which a needle and a thread lie
 CURVATURES = (-190.0, 0.0, 0.0, 0.0, 110.0, 190.0)  # 1/m
@@ -39,14 +40,23 @@ SIZES = {320: (320, 240), 640: (640, 480), 1280: (1280, 960), 1920: (1920, 1080)
 COLOURS = {
     "black": (38.0, 34.0, 34.0),
     "violet": (132.0, 78.0, 100.0),
-    "white": (250.0, 250.0, 250.0),
-    "undyed": (196.0, 206.0, 210.0),
 }
-WIDTHS_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 4.0, 6.0, 12.0)
+WIDTHS_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 4.0, 6.0)
 COVERS = (1.5, 3.0, 6.0, 10.0)  # mm
 COVER_BGR = ((168.0, 176.0, 205.0), (60.0, 58.0, 55.0), (210.0, 205.0, 200.0))
-NO_THREAD = np.array([[0.5, 0.5], [0.519, 0.5]])  # m; outside of the image
 SKIN_BGR = (150.0, 170.0, 225.0)
+
+
+def tried(make: Callable[Drawn, Case | None]) -> Callable[Drawn, Case]:
+    """Return a function that draws a case at random, again and again until one fits into the dish."""
+
+    def draw(*given: Drawn.args, **options: Drawn.kwargs) -> Case:
+        for _ in range(MAX_TRIES):
+            if (case := make(*given, **options)) is not None:
+                return case
+        raise RuntimeError(f"no case of {make.__name__} fits into the dish")
+
+    return draw
 
 
 def unit_vector(angle: float) -> Points:
@@ -102,95 +112,93 @@ def _crosses_itself(thread: Points) -> bool:
     return bool((apart[near] < 0.7e-3).any())
 
 
-def usual_case(random: Random, length: float = 0.007, thread: float = 0.019, within: float = WITHIN) -> Case:
+@tried
+def usual_case(random: Random, length: float = 0.007, thread: float = 0.019, within: float = WITHIN) -> Case | None:
     """Return a needle with a thread that leaves backwards and crosses nothing."""
-    for _ in range(MAX_TRIES):
-        needle = random_needle(random, length, within)
-        line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
-        if is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
-            return Case(needle, line, lighting=random_lighting(random), quality=int(random.integers(80, 97)))
-    raise RuntimeError("no thread fits into the dish")
+    needle = random_needle(random, length, within)
+    line = winding_line(random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.4), thread)
+    if is_inside(line) and _is_clear(needle, line) and not _crosses_itself(line):
+        return Case(needle, line, lighting=random_lighting(random), quality=int(random.integers(80, 97)))
+    return None
 
 
-def _folded(low: float, high: float, length: float, random: Random) -> Case:
+@tried
+def _folded(low: float, high: float, length: float, random: Random) -> Case | None:
     """Return a thread that lies beside, under or over its needle, at an angle from the heading [degrees]."""
-    for _ in range(MAX_TRIES):
-        needle = random_needle(random, length, width=random.uniform(0.28e-3, 0.42e-3))
-        fold = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
-        how = str(random.choice(("under", "over", "beside")))
-        along = random.uniform(0.6, 1.6) * length
-        if how == "beside":  # It leaves backwards and turns around in a small bend.
-            radius, side = random.uniform(0.2e-3, 0.5e-3), math.copysign(1.0, fold)
-            turns = np.linspace(0.0, np.pi - abs(fold), 20)
-            first = needle.heading + np.pi
-            centre = needle.tail + radius * unit_vector(first - side * 0.5 * np.pi)
-            begun = centre + radius * np.array([unit_vector(first + side * (0.5 * np.pi - turn)) for turn in turns])
-            start, angle = begun[-1], needle.heading + fold
-        else:
-            begun, start, angle = needle.tail[None], needle.tail, needle.heading + fold
-        straight = winding_line(random, start, angle, along, 60.0)
-        line = np.vstack([begun, straight[1:]])
-        leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-        line = np.vstack([line, winding_line(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
-        beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
-        if is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
-            labels = {"fold": math.degrees(fold), "how": how}
-            width = random.uniform(0.8, 1.6)
-            light, over = random_lighting(random), how == "over"
-            return Case(needle, line, thread_px=width, lighting=light, thread_over=over, labels=labels)
-    raise RuntimeError("no thread fits into the dish")
+    needle = random_needle(random, length, width=random.uniform(0.28e-3, 0.42e-3))
+    fold = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
+    how = str(random.choice(("under", "over", "beside")))
+    along = random.uniform(0.6, 1.6) * length
+    if how == "beside":  # It leaves backwards and turns around in a small bend.
+        radius, side = random.uniform(0.2e-3, 0.5e-3), math.copysign(1.0, fold)
+        turns = np.linspace(0.0, np.pi - abs(fold), 20)
+        first = needle.heading + np.pi
+        centre = needle.tail + radius * unit_vector(first - side * 0.5 * np.pi)
+        begun = centre + radius * np.array([unit_vector(first + side * (0.5 * np.pi - turn)) for turn in turns])
+        start, angle = begun[-1], needle.heading + fold
+    else:
+        begun, start, angle = needle.tail[None], needle.tail, needle.heading + fold
+    straight = winding_line(random, start, angle, along, 60.0)
+    line = np.vstack([begun, straight[1:]])
+    leaving = math.atan2(*(line[-1] - line[-2])[::-1])
+    line = np.vstack([line, winding_line(random, line[-1], leaving, 0.019 - arc_lengths(line)[-1])[1:]])
+    beyond = line[arc_lengths(line) > 1.4 * length + 1e-3]
+    if is_inside(line) and needle.distances(beyond[::4]).min() > 0.8e-3 and not _crosses_itself(line[20:]):
+        labels = {"fold": math.degrees(fold), "how": how}
+        width = random.uniform(0.8, 1.6)
+        light, over = random_lighting(random), how == "over"
+        return Case(needle, line, thread_px=width, lighting=light, thread_over=over, labels=labels)
+    return None
 
 
-def thread_with_loop(random: Random) -> Case:
+@tried
+def thread_with_loop(random: Random) -> Case | None:
     """Return a thread with a loop."""
-    for _ in range(MAX_TRIES):
-        needle = random_needle(random)
-        first = winding_line(
-            random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3)
-        )
-        angle = math.atan2(*(first[-1] - first[-2])[::-1])
-        turn, radius = random.choice((-1.0, 1.0)), random.uniform(1.2e-3, 2.2e-3)
-        turns = np.arange(0.0, random.uniform(1.7, 1.95) * np.pi, TURN_STEP / radius)
-        steps = angle + turn * turns
-        loop = first[-1] + np.cumsum(TURN_STEP * np.column_stack([np.cos(steps), np.sin(steps)]), axis=0)
-        line = np.vstack([first, loop])
-        line = np.vstack(
-            [line, winding_line(random, line[-1], float(steps[-1]), 0.026 - arc_lengths(line)[-1], 100.0)[1:]]
-        )
-        own = line[::2]
-        apart = np.linalg.norm(own[:, None] - own[None], axis=2)
-        meets = np.triu(apart < 2.0 * TURN_STEP, 20).any()
-        if is_inside(line) and _is_clear(needle, line) and meets:
-            return Case(needle, line, lighting=random_lighting(random))
-    raise RuntimeError("no thread fits into the dish")
+    needle = random_needle(random)
+    first = winding_line(
+        random, needle.tail, needle.heading + np.pi + random.normal(0.0, 0.3), random.uniform(4e-3, 7e-3)
+    )
+    angle = math.atan2(*(first[-1] - first[-2])[::-1])
+    turn, radius = random.choice((-1.0, 1.0)), random.uniform(1.2e-3, 2.2e-3)
+    turns = np.arange(0.0, random.uniform(1.7, 1.95) * np.pi, TURN_STEP / radius)
+    steps = angle + turn * turns
+    loop = first[-1] + np.cumsum(TURN_STEP * np.column_stack([np.cos(steps), np.sin(steps)]), axis=0)
+    line = np.vstack([first, loop])
+    line = np.vstack([line, winding_line(random, line[-1], float(steps[-1]), 0.026 - arc_lengths(line)[-1], 100.0)[1:]])
+    own = line[::2]
+    apart = np.linalg.norm(own[:, None] - own[None], axis=2)
+    meets = np.triu(apart < 2.0 * TURN_STEP, 20).any()
+    if is_inside(line) and _is_clear(needle, line) and meets:
+        return Case(needle, line, lighting=random_lighting(random))
+    return None
 
 
-def _crossing_needle(random: Random) -> Case:
+@tried
+def _crossing_needle(random: Random) -> Case | None:
     """Return a thread that comes back and crosses its needle, under or over it."""
-    for _ in range(MAX_TRIES):
-        needle = random_needle(random, within=0.011)
-        side, share = random.choice((-1.0, 1.0)), random.uniform(0.3, 0.75)
-        at, along = (values[0] for values in needle.axis(np.array([share])))
-        aside = side * np.array([-along[1], along[0]])
-        way = math.cos(lean := random.uniform(-0.7, 0.7)) * aside + math.sin(lean) * along
-        back = -unit_vector(needle.heading)
-        out = needle.tail + 2.2e-3 * back
-        knots = [
-            needle.tail,
-            needle.tail + 0.9e-3 * back,
-            out - 1.2e-3 * aside,
-            at - 2.6e-3 * way,
-            at,
-            at + 2.6e-3 * way,
-        ]
-        line = smooth_line(np.array(knots))
-        leaving = math.atan2(*(line[-1] - line[-2])[::-1])
-        line = np.vstack([line, winding_line(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
-        after = line[(arc_lengths(line) > 1.5e-3)]
-        near = needle.distances(after[::4])
-        if is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
-            return Case(needle, line, lighting=random_lighting(random), thread_over=bool(random.random() < 0.5))
-    raise RuntimeError("no thread fits into the dish")
+    needle = random_needle(random, within=0.011)
+    side, share = random.choice((-1.0, 1.0)), random.uniform(0.3, 0.75)
+    at, along = (values[0] for values in needle.axis(np.array([share])))
+    aside = side * np.array([-along[1], along[0]])
+    way = math.cos(lean := random.uniform(-0.7, 0.7)) * aside + math.sin(lean) * along
+    back = -unit_vector(needle.heading)
+    out = needle.tail + 2.2e-3 * back
+    knots = [
+        needle.tail,
+        needle.tail + 0.9e-3 * back,
+        out - 1.2e-3 * aside,
+        at - 2.6e-3 * way,
+        at,
+        at + 2.6e-3 * way,
+    ]
+    line = smooth_line(np.array(knots))
+    leaving = math.atan2(*(line[-1] - line[-2])[::-1])
+    line = np.vstack([line, winding_line(random, line[-1], leaving, random.uniform(6e-3, 9e-3), 150.0)[1:]])
+    after = line[(arc_lengths(line) > 1.5e-3)]
+    near = needle.distances(after[::4])
+    if is_inside(line) and (near < 0.5 * needle.width).sum() < 15 and near[-30:].min() > 1e-3:
+        return Case(needle, line, lighting=random_lighting(random), thread_over=bool(random.random() < 0.5))
+    return None
 
 
 def smooth_line(knots: Points) -> Points:
@@ -200,28 +208,28 @@ def smooth_line(knots: Points) -> Points:
     return points_at(line, np.arange(0.0, arc_lengths(line)[-1], TURN_STEP))
 
 
-def _at_wall(end: str, random: Random) -> Case:
+@tried
+def _at_wall(end: str, random: Random) -> Case | None:
     """Return a straight needle whose tip, tail or side touches the wall, or nearly so."""
     length, width = 0.007, 0.0004
-    for _ in range(MAX_TRIES):
-        angle, gap = random.uniform(-np.pi, np.pi), random.uniform(0.0, 0.4e-3)
-        outward = unit_vector(angle)
-        if end == "side":
-            heading = angle + random.choice((-0.5, 0.5)) * np.pi
-            distance = math.sqrt((DISH_RADIUS - gap - 0.5 * width) ** 2 - 0.25 * length**2)
-            tail = distance * outward - 0.5 * length * unit_vector(heading)
-        elif end == "tip":
-            heading = angle + random.uniform(-0.8, 0.8)
-            tail = (DISH_RADIUS - gap) * outward - length * unit_vector(heading)
-        else:
-            heading = angle + np.pi + random.uniform(-0.8, 0.8)
-            tail = (DISH_RADIUS - gap - 0.5 * width) * outward
-        needle = Needle(tail, heading, 0.0, length, width)
-        inward = math.atan2(*-tail[::-1]) + random.normal(0.0, 0.4)
-        line = winding_line(random, tail, inward if end == "tail" else heading + np.pi + random.normal(0.0, 0.3), 0.012)
-        if is_inside(line[arc_lengths(line) > 3e-3]) and _is_clear(needle, line) and not _crosses_itself(line):
-            return Case(needle, line, lighting=random_lighting(random), labels={"gap": gap})
-    raise RuntimeError("no thread fits into the dish")
+    angle, gap = random.uniform(-np.pi, np.pi), random.uniform(0.0, 0.4e-3)
+    outward = unit_vector(angle)
+    if end == "side":
+        heading = angle + random.choice((-0.5, 0.5)) * np.pi
+        distance = math.sqrt((DISH_RADIUS - gap - 0.5 * width) ** 2 - 0.25 * length**2)
+        tail = distance * outward - 0.5 * length * unit_vector(heading)
+    elif end == "tip":
+        heading = angle + random.uniform(-0.8, 0.8)
+        tail = (DISH_RADIUS - gap) * outward - length * unit_vector(heading)
+    else:
+        heading = angle + np.pi + random.uniform(-0.8, 0.8)
+        tail = (DISH_RADIUS - gap - 0.5 * width) * outward
+    needle = Needle(tail, heading, 0.0, length, width)
+    inward = math.atan2(*-tail[::-1]) + random.normal(0.0, 0.4)
+    line = winding_line(random, tail, inward if end == "tail" else heading + np.pi + random.normal(0.0, 0.3), 0.012)
+    if is_inside(line[arc_lengths(line) > 3e-3]) and _is_clear(needle, line) and not _crosses_itself(line):
+        return Case(needle, line, lighting=random_lighting(random), labels={"gap": gap})
+    return None
 
 
 def _image_width(columns: int, random: Random) -> Case:
@@ -237,28 +245,28 @@ def _thread(colour: str, width_px: float, random: Random) -> Case:
     return replace(usual_case(random), size=size, thread_px=width_px, thread_bgr=COLOURS[colour])
 
 
-def _covered(width: float, random: Random) -> Case:
+@tried
+def _covered(width: float, random: Random) -> Case | None:
     """Return a thread over which a post stands or an instrument lies, as wide as given [m]."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random, thread=0.028)
-        lengths = arc_lengths(case.thread)
-        middle = random.uniform(3e-3 + 0.5 * width, 22e-3 - 0.5 * width)
-        index = int(np.searchsorted(lengths, middle))
-        at, along = case.thread[index], case.thread[index + 1] - case.thread[index - 1]
-        colour = COVER_BGR[int(random.integers(len(COVER_BGR)))]
-        turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
-        round_one = at + 0.5 * width * np.column_stack([np.cos(turns), np.sin(turns)])
-        if random.random() < 0.5:
-            outline, how = round_one, "post"
-        else:
-            across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-            across *= math.copysign(1.0, float(across @ at))  # towards the nearer wall
-            outline, how = straight_strip(at - 2e-3 * across, across, 0.06, width), "instrument"
-        cover = Cover(outline, colour, 1.0)
-        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if depth_inside(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
-            return replace(case, hidden_by=(cover,), labels={"how": how})
-    raise RuntimeError("no cover stays off the needle")
+    case = usual_case(random, thread=0.028)
+    lengths = arc_lengths(case.thread)
+    middle = random.uniform(3e-3 + 0.5 * width, 22e-3 - 0.5 * width)
+    index = int(np.searchsorted(lengths, middle))
+    at, along = case.thread[index], case.thread[index + 1] - case.thread[index - 1]
+    colour = COVER_BGR[int(random.integers(len(COVER_BGR)))]
+    turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    round_one = at + 0.5 * width * np.column_stack([np.cos(turns), np.sin(turns)])
+    if random.random() < 0.5:
+        outline, how = round_one, "post"
+    else:
+        across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+        across *= math.copysign(1.0, float(across @ at))  # towards the nearer wall
+        outline, how = straight_strip(at - 2e-3 * across, across, 0.06, width), "instrument"
+    cover = Cover(outline, colour, 1.0)
+    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+    if depth_inside(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
+        return replace(case, hidden_by=(cover,), labels={"how": how})
+    return None
 
 
 def straight_strip(end: Points, way: Points, length: float, width: float) -> Points:
@@ -273,44 +281,15 @@ def depth_inside(outline: Points, points: Points) -> float:
     return max(cv2.pointPolygonTest(ring, (float(x), float(y)), True) for x, y in points * 1e6) * 1e-6
 
 
-def _second_needle(random: Random, *, glare: bool = False) -> Case:
-    """Return a frame with a needle that has no thread; with glare, the lamp is reflected on the other."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random)
-        other = random_needle(random)
-        axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
-        if case.needle.distances(axis).min() > 2e-3 and min(other.distances(case.thread[::4])) > 1.2e-3:
-            break
-    return _in_glare(case, other, random) if glare else replace(case, beside=(other,))
-
-
-def _decoy_at_thread(random: Random) -> Case:
-    """Return a needle in glare, and one without a thread whose tail the thread of the other passes closely."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random)
-        index = int(np.searchsorted(arc_lengths(case.thread), random.uniform(4e-3, 15e-3)))
-        along = case.thread[index + 1] - case.thread[index - 1]
-        away = math.atan2(along[1], along[0]) + random.choice((-0.5, 0.5)) * np.pi
-        tail = case.thread[index] + random.uniform(0.3e-3, 1.2e-3) * unit_vector(away)
-        other = Needle(tail, away + random.uniform(-0.9, 0.9), float(random.choice(CURVATURES)), 0.007, 0.0004)
-        axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
-        gap = float(np.linalg.norm(case.thread - tail, axis=1).min())
-        if (
-            is_inside(axis)
-            and case.needle.distances(axis).min() > 2e-3
-            and other.distances(case.thread).min() > 0.9 * gap
-        ):
-            return _in_glare(case, other, random)
-    raise RuntimeError("no second needle fits beside the thread")
-
-
-def _in_glare(case: Case, other: Needle, random: Random) -> Case:
-    """Return a frame in which the lamp is reflected on the needle, and another needle lies beside it."""
-    at, _ = case.needle.axis(np.array([random.uniform(0.0, 1.0)]))
-    turns = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
-    axes = random.uniform(0.5e-3, 1.5e-3, 2)
-    spot = at + axes * np.column_stack([np.cos(turns), np.sin(turns)])
-    return replace(case, beside=(other,), hidden_by=(Cover(spot, (262.0, 262.0, 262.0), 2.0),))
+@tried
+def _second_needle(random: Random) -> Case | None:
+    """Return a frame with a second needle, which has no thread."""
+    case = usual_case(random)
+    other = random_needle(random)
+    axis, _ = other.axis(np.linspace(0.0, 1.0, 20))
+    if case.needle.distances(axis).min() > 2e-3 and min(other.distances(case.thread[::4])) > 1.2e-3:
+        return replace(case, beside=(other,))
+    return None
 
 
 def _tilted(degrees: float, random: Random) -> Case:
@@ -330,73 +309,48 @@ def _blunt_rod(random: Random) -> Case:
     return replace(usual_case(random), rod=True)
 
 
-def _drawn_path(random: Random) -> Case:
-    """Return a frame into which a program has drawn the way that the needle shall go."""
-    bgr = ((60, 180, 60), (200, 90, 40), (40, 40, 200))[int(random.integers(3))]
-    start = random.uniform(-0.01, 0.01, 2)
-    line = winding_line(random, start, random.uniform(-np.pi, np.pi), 0.012, 200.0)
-    return replace(usual_case(random), finish=(drawn_path(line, bgr, int(random.integers(1, 4))),))
-
-
 def _distorted(told: bool, random: Random) -> Case:
     strength, case = random.uniform(-0.06, 0.06), usual_case(random)
     lens = lens_with(strength, case.size) if told else None
     return replace(case, finish=(distorted(strength),), lens=lens)
 
 
-def _cut_dish(least: float, greatest: float, random: Random) -> Case:
+@tried
+def _cut_dish(least: float, greatest: float, random: Random) -> Case | None:
     """Return a dish of which the frame shows a part, with all of needle and thread."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random)
-        shift = (
-            random.uniform(least, greatest)
-            * DISH_RADIUS
-            / SCALE
-            * unit_vector(random.uniform(-np.pi, np.pi))
-            * (1.6, 1.0)
-        )
-        moved = replace(case, shift=(float(shift[0]), float(shift[1])))
-        ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
-        at = moved.view.to_pixels(np.vstack([ends, case.thread]))
-        if at.min() > 25.0 and (at < np.array(moved.size) - 25.0).all():
-            return moved
-    raise RuntimeError("no needle fits into the part of the dish")
+    case = usual_case(random)
+    shift = (
+        random.uniform(least, greatest) * DISH_RADIUS / SCALE * unit_vector(random.uniform(-np.pi, np.pi)) * (1.6, 1.0)
+    )
+    moved = replace(case, shift=(float(shift[0]), float(shift[1])))
+    ends = case.needle.axis(np.linspace(0.0, 1.0, 9))[0]
+    at = moved.view.to_pixels(np.vstack([ends, case.thread]))
+    if at.min() > 25.0 and (at < np.array(moved.size) - 25.0).all():
+        return moved
+    return None
 
 
-def _hand(random: Random) -> Case:
+@tried
+def _hand(random: Random) -> Case | None:
     """Return a finger that comes in from the border and keeps off the needle."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random)
-        angle, width = random.uniform(-np.pi, np.pi), random.uniform(8e-3, 16e-3)
-        turns = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
-        inwards = -unit_vector(angle)
-        across = np.array([-inwards[1], inwards[0]])
-        end = -random.uniform(3e-3, 14e-3) * inwards
-        cap = end + 0.5 * width * (np.cos(turns)[:, None] * inwards + np.sin(turns)[:, None] * across)
-        back = end - 0.1 * inwards
-        outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
-        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if depth_inside(outline, axis) < -1.5e-3:
-            return replace(case, hidden_by=(Cover(outline, SKIN_BGR, 2.5),))
-    raise RuntimeError("no finger stays off the needle")
+    case = usual_case(random)
+    angle, width = random.uniform(-np.pi, np.pi), random.uniform(8e-3, 16e-3)
+    turns = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
+    inwards = -unit_vector(angle)
+    across = np.array([-inwards[1], inwards[0]])
+    end = -random.uniform(3e-3, 14e-3) * inwards
+    cap = end + 0.5 * width * (np.cos(turns)[:, None] * inwards + np.sin(turns)[:, None] * across)
+    back = end - 0.1 * inwards
+    outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
+    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+    if depth_inside(outline, axis) < -1.5e-3:
+        return replace(case, hidden_by=(Cover(outline, SKIN_BGR, 2.5),))
+    return None
 
 
 def _length_off(share: float, random: Random) -> Case:
     """Return the usual frame, and a length of the needle that is set wrong by a share."""
     return replace(usual_case(random), length_error=share * random.choice((-1.0, 1.0)))
-
-
-def _rod_in_path(random: Random) -> Case:
-    """Return a rod without a thread, of a length known to 10 %, in a frame into which its way is drawn."""
-    length = random.uniform(3e-3, 10e-3)
-    needle = replace(random_needle(random, length), curvature=0.0)
-    centre, _ = needle.axis(np.array([random.uniform(0.1, 0.9)]))
-    angle = random.uniform(-np.pi, np.pi)
-    line = winding_line(random, centre[0] - 6e-3 * unit_vector(angle), angle, 0.012, 100.0)
-    bgr = tuple(int(value) for value in random.integers(40, 220, 3))
-    drawn = drawn_path(line, (bgr[0], bgr[1], bgr[2]), int(random.integers(1, 4)))
-    error = random.uniform(-0.1, 0.1)
-    return Case(needle, NO_THREAD, lighting=random_lighting(random), rod=True, finish=(drawn,), length_error=error)
 
 
 def _suture_needle(random: Random) -> Case:
@@ -411,16 +365,156 @@ def _suture_needle(random: Random) -> Case:
     raise RuntimeError("no thread fits into the dish")
 
 
-def _instrument_beside(random: Random) -> Case:
+@tried
+def _instrument_beside(random: Random) -> Case | None:
     """Return a frame with a dark instrument as wide as the needle, but longer, that lies in the dish."""
-    for _ in range(MAX_TRIES):
-        case = usual_case(random)
-        length, angle = random.uniform(1.4, 3.0) * case.needle.length, random.uniform(-np.pi, np.pi)
-        outline = straight_strip(random.uniform(-0.012, 0.012, 2), unit_vector(angle), length, case.needle.width)
-        axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-        if depth_inside(outline, np.vstack([axis, case.thread])) < -1.2e-3 and is_inside(outline):
-            return replace(case, hidden_by=(Cover(outline, STEEL_BGR, 0.3),))
-    raise RuntimeError("no instrument stays off the needle")
+    case = usual_case(random)
+    length, angle = random.uniform(1.4, 3.0) * case.needle.length, random.uniform(-np.pi, np.pi)
+    outline = straight_strip(random.uniform(-0.012, 0.012, 2), unit_vector(angle), length, case.needle.width)
+    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+    if depth_inside(outline, np.vstack([axis, case.thread])) < -1.2e-3 and is_inside(outline):
+        return replace(case, hidden_by=(Cover(outline, STEEL_BGR, 0.3),))
+    return None
+
+
+OFF_NEEDLE = 1.2e-3  # m; of a cover from the needle and the thread's beginning
+TURNS = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+INSTRUMENT_BGR = (120.0, 118.0, 115.0)
+
+
+def _post(at: Points, width: float) -> Points:
+    return at + 0.5 * width * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
+
+
+def _off_needle(case: Case, *outlines: Points) -> bool:
+    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
+    keep = np.vstack([axis, case.thread[:20]])
+    return all(depth_inside(outline, keep) < -OFF_NEEDLE for outline in outlines)
+
+
+def _colour(random: Random) -> tuple[float, float, float]:
+    return COVER_BGR[int(random.integers(len(COVER_BGR)))]
+
+
+@tried
+def _two_covers(random: Random) -> Case | None:
+    """Return a thread below two posts."""
+    case = usual_case(random, thread=0.028)
+    widths, middles = random.uniform(2e-3, 5e-3, 2), (random.uniform(5e-3, 10e-3), random.uniform(16e-3, 22e-3))
+    posts = [_post(points_at(case.thread, np.array([at]))[0], w) for at, w in zip(middles, widths, strict=True)]
+    apart = np.linalg.norm(posts[0].mean(axis=0) - posts[1].mean(axis=0)) - 0.5 * widths.sum()
+    if apart > 1e-3 and _off_needle(case, *posts):
+        return replace(case, hidden_by=tuple(Cover(post, _colour(random), 1.0) for post in posts))
+    return None
+
+
+@tried
+def _cover_end(random: Random) -> Case | None:
+    """Return a thread whose free end lies below a post."""
+    case = usual_case(random, thread=0.024)
+    width = random.uniform(1.5e-3, 6e-3)
+    at = case.thread[-1] + random.uniform(0.0, 0.3) * width * unit_vector(random.uniform(-np.pi, np.pi))
+    post = _post(at, width)
+    if _off_needle(case, post):
+        return replace(case, hidden_by=(Cover(post, _colour(random), 1.0),))
+    return None
+
+
+@tried
+def _cover_crossing(random: Random) -> Case | None:
+    """Return a thread with a loop, whose crossing lies below a post."""
+    case = thread_with_loop(random)
+    line = case.thread
+    apart = np.linalg.norm(line[:, None] - line[None], axis=2)
+    apart[np.abs(np.subtract.outer(np.arange(len(line)), np.arange(len(line)))) < 60] = 1.0
+    first, _ = np.unravel_index(int(np.argmin(apart)), apart.shape)
+    post = _post(line[first], random.uniform(1.5e-3, 2.5e-3))
+    if _off_needle(case, post):
+        return replace(case, hidden_by=(Cover(post, _colour(random), 1.0),))
+    return None
+
+
+@tried
+def _glare_thread(random: Random) -> Case | None:
+    """Return a thread a part of which the lamp's reflection outshines."""
+    case = usual_case(random, thread=0.024)
+    at = points_at(case.thread, np.array([random.uniform(5e-3, 19e-3)]))[0]
+    axes, turn = random.uniform(0.5e-3, 2e-3, 2), random.uniform(0.0, np.pi)
+    spot = axes * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
+    spot = at + spot @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    if _off_needle(case, spot):
+        return replace(case, hidden_by=(Cover(spot, (262.0, 262.0, 262.0), 2.0),))
+    return None
+
+
+@tried
+def _hand_instrument(random: Random) -> Case | None:
+    """Return an instrument that a hand holds over the thread."""
+    case = usual_case(random, thread=0.026)
+    at = points_at(case.thread, np.array([random.uniform(6e-3, 20e-3)]))[0]
+    outward = at / max(float(np.hypot(*at)), 1e-6)
+    way = math.cos(lean := random.uniform(-0.8, 0.8)) * outward + math.sin(lean) * np.array([-outward[1], outward[0]])
+    instrument = straight_strip(at - 2e-3 * way, way, 0.06, random.uniform(1.5e-3, 3e-3))
+    hand = straight_strip(at + random.uniform(6e-3, 10e-3) * way, way, 0.06, random.uniform(8e-3, 14e-3))
+    if _off_needle(case, instrument, hand):
+        return replace(case, hidden_by=(Cover(instrument, INSTRUMENT_BGR, 1.0), Cover(hand, SKIN_BGR, 2.5)))
+    return None
+
+
+STEEP, SHALLOW = (30.0, 90.0), (10.0, 30.0)  # degrees; at which the other thread crosses the needle's
+CROSSING_AT = (3e-3, 15e-3)  # m; of the thread's arc length
+LENGTHS = (12e-3, 22e-3)  # m; of the other thread
+CLEARANCE = 1.2e-3  # m; of the other thread from the needle
+BENDS = 200.0  # 1/m; of the other thread, at most
+BESIDE = (0.6e-3, 2.0e-3)  # m; from a thread to one that comes near without a crossing
+
+
+def _apart(one: Points, other: Points) -> np.ndarray:
+    return np.asarray(np.linalg.norm(one[:, None] - other[None], axis=2))
+
+
+@tried
+def _crossed(low: float, high: float, random: Random) -> Case | None:
+    """Return the usual frame with another thread that crosses the needle's once, at an angle of some degrees."""
+    case = usual_case(random)
+    at = int(np.searchsorted(arc_lengths(case.thread), random.uniform(*CROSSING_AT)))
+    along = case.thread[at + 1] - case.thread[at - 1]
+    angle = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
+    way, place = math.atan2(along[1], along[0]) + angle, case.thread[at]
+    halves = [winding_line(random, place, way + turn, 0.5 * random.uniform(*LENGTHS), BENDS) for turn in (math.pi, 0)]
+    other = np.vstack([halves[0][::-1], halves[1][1:]])
+    apart = _apart(other[::4], case.thread[::4])
+    near = np.flatnonzero((apart.min(axis=1) < 0.5e-3) & (np.abs(4 * np.arange(len(other[::4])) - len(halves[0])) > 4))
+    # Nowhere near but where it crosses: as long as two lines at that angle are.
+    reach = 0.8e-3 / math.sin(abs(angle))
+    again = np.abs(arc_lengths(other)[::4][near] - arc_lengths(halves[0])[-1]) > reach
+    if is_inside(other) and not again.any() and case.needle.distances(other[::4]).min() > CLEARANCE:
+        return _with(case, other, {"angle": math.degrees(angle)})
+    return None
+
+
+@tried
+def _beside(random: Random) -> Case | None:
+    """Return the usual frame with another thread that runs beside the needle's for a while and does not touch it."""
+    case = usual_case(random)
+    at = int(np.searchsorted(arc_lengths(case.thread), random.uniform(*CROSSING_AT)))
+    along = case.thread[at + 1] - case.thread[at - 1]
+    direction = math.atan2(along[1], along[0])
+    side = random.choice((-1.0, 1.0)) * random.uniform(*BESIDE)
+    place = case.thread[at] + side * unit_vector(direction + 0.5 * math.pi)
+    halves = [
+        winding_line(random, place, direction + turn, 0.5 * random.uniform(*LENGTHS), BENDS) for turn in (math.pi, 0)
+    ]
+    other = np.vstack([halves[0][::-1], halves[1][1:]])
+    clear = _apart(other[::4], case.thread[::4]).min() > 0.9 * BESIDE[0]
+    if clear and is_inside(other) and case.needle.distances(other[::4]).min() > CLEARANCE:
+        return _with(case, other, {"distance": abs(side)})
+    return None
+
+
+def _with(case: Case, other: Points, labels: dict[str, float]) -> Case:
+    width = case.thread_px * case.view.metres_per_pixel
+    return replace(case, hidden_by=(drawn_thread(other, width, case.thread_bgr),), labels=labels)
 
 
 def _classes() -> dict[str, MakeCase]:
@@ -434,12 +528,10 @@ def _classes() -> dict[str, MakeCase]:
     for colour in COLOURS:
         classes |= {f"thread_{colour}_{width:g}px": partial(_thread, colour, width) for width in WIDTHS_PX}
     classes |= {f"cover_{width:g}mm": partial(_covered, 1e-3 * width) for width in COVERS}
-    classes |= {"second_needle": _second_needle, "decoy_needle": partial(_second_needle, glare=True)}
-    classes |= {"decoy_at_thread": _decoy_at_thread}
+    classes |= {"second_needle": _second_needle}
     classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
     classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
     classes |= {
-        "drawn_path": _drawn_path,
         "distortion": partial(_distorted, True),
         "cut_dish": partial(_cut_dish, 0.1, 0.55),
         "hand": _hand,
@@ -447,8 +539,12 @@ def _classes() -> dict[str, MakeCase]:
     classes |= {"cut_dish_far": partial(_cut_dish, 0.55, 0.9)}
     classes |= {"distortion_untold": partial(_distorted, False)}
     classes |= {f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)}
-    classes |= {"rod_in_path": _rod_in_path, "suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
+    classes |= {"suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
+    classes |= {"two_covers": _two_covers, "cover_end": _cover_end, "cover_crossing": _cover_crossing}
+    classes |= {"glare_thread": _glare_thread, "hand_instrument": _hand_instrument}
+    classes |= {"second_thread": partial(_crossed, *STEEP), "second_thread_shallow": partial(_crossed, *SHALLOW)}
+    classes |= {"second_thread_beside": _beside}
     return classes
 
 
-BASIC_CLASSES = _classes()
+CLASSES = _classes()

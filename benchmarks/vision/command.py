@@ -7,7 +7,6 @@ is reversed. 20 frames of each class take ten minutes.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from typing import Any
 
 import cv2
@@ -15,11 +14,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.vision.classes import CLASSES
+from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
-from benchmarks.vision.rod_video import FRAMES, measure_rod_videos
-from benchmarks.vision.ropes import ROPES, rope_row
 from magnetosuture_thread.cli.arguments import count_argument, whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.errors import ConfigurationError
@@ -40,9 +37,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--photographs", action="store_true", help="only the dish, in drawn photographs of dishes as people take them"
     )
     parser.add_argument(
-        "--rod-videos", action="store_true", help="only drawn videos of a blunt rod in a dish without a dark rim"
-    )
-    parser.add_argument(
         "--save", nargs=3, metavar=("CLASS", "INDEX", "FILE"), help="only write one frame of a class as a PNG file"
     )
 
@@ -51,29 +45,18 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     """Measure; return the figures and whether no pose was reversed."""
     if options.photographs:
         return _photographs(options, console)
-    if options.rod_videos:
-        return _rod_videos(options, console)
     if options.save:
         name, index, file = options.save
         return _save(name, index, file, options.seed), True
     names = [name for name in CLASSES if name.startswith(tuple(options.classes))]
-    ropes = [name for name in ROPES if name.startswith(tuple(options.classes))]
-    if not names and not ropes:
-        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}, ropes")
+    if not names:
+        raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
-    if rows:
-        console.print(table(rows))
-        console.print(table_of_pieces(rows))
-    rope_rows = [rope_row(name, options.count, options.seed) for name in ropes]
-    for row in rope_rows:
-        make_log(console)(
-            f"{row.name}: 90 % of the rope followed in {row.covered_90:.0%} of the pictures, "
-            f"{row.covered:.1%} in the mean; {row.wrong:.1%} of what was followed is not on it; {row.median_ms:.1f} ms"
-        )
+    console.print(table(rows))
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
-    return {**figures, "ropes": [asdict(row) for row in rope_rows], "total": total}, total["reversed"] == 0
+    return {**figures, "total": total}, total["reversed"] == 0
 
 
 def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
@@ -93,16 +76,6 @@ def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[st
     return figures, right >= 0.9 * count
 
 
-def _rod_videos(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
-    """Track a rod in videos; return the figures, and whether nine tenths of the frames are right and none is wrong."""
-    figures = measure_rod_videos(options.count, options.seed)
-    make_log(console)(
-        f"{options.count} videos of {FRAMES} frames: dish right in {figures.dish}, rod in {figures.needle}, "
-        f"both in {figures.both} of {figures.frames}; a rod elsewhere in {figures.wrong}; {figures.median_ms:.1f} ms"
-    )
-    return asdict(figures), figures.both >= 0.9 * figures.frames and not figures.wrong
-
-
 def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
     """Write a frame; return what is known of it."""
     if name not in CLASSES:
@@ -114,56 +87,32 @@ def _save(name: str, index: str, file: str, seed: int) -> dict[str, Any]:
     return {"tail": needle.tail.tolist(), "heading": needle.heading, "thread": case.thread.tolist(), **case.labels}
 
 
+CAPTION = """unkn: heading unknown by its covariance; wrong: tail off by 2 px or heading by 5 degrees; rev: by 90; >cov:
+by more than the covariance says; px, deg: RMS of the others; line: visible thread that is followed from the tail; pcs:
+that is on pieces; off: share of pieces where no thread is; mis: pieces of a place that is wrong; all: frames said to
+show all of the thread; free: ends said to be its own; not: of these, that are not; dev: RMS of errors over their
+standard deviation"""
+COLUMNS = "pose,unkn,wrong,rev,>cov,px,deg,line,pcs,off,mis,all,not,free,not,dev,ms"
+
+
 def table(rows: list[Row]) -> Table:
     """Return the rows as a table."""
     title = f"the tracker on rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    result = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=CAPTION, caption_justify="left")
     result.add_column("class", no_wrap=True)
-    for name in ("pose", "unkn", "wrong", "rev", ">cov", "px", "deg", "ms"):
+    for name in COLUMNS.split(","):
         result.add_column(name, justify="right", no_wrap=True)
     for row in rows:
-        counts = (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)
         result.add_row(
             row.name,
-            *map(str, counts),
-            _number(row.tail_px, ".2f"),
-            _number(row.angle_deg, ".2f"),
+            *map(str, (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)),
+            *(_number(value, ".2f") for value in (row.tail_px, row.angle_deg)),
+            *(_number(value, ".0%") for value in (row.covered, row.pieces)),
+            _number(row.wrong_pieces, ".1%"),
+            *map(str, (row.misplaced, row.complete, row.incomplete, row.free, row.not_free)),
+            _number(row.normalised, ".1f"),
             f"{row.median_ms:.1f}",
         )
-    result.caption = (
-        "unkn: heading unknown by its covariance; wrong: tail off by 2 px or "
-        "heading by 5 degrees; rev: by 90; >cov: by more than the covariance "
-        "says; px, deg: RMS of the others"
-    )
-    result.caption_justify = "left"
-    return result
-
-
-def table_of_pieces(rows: list[Row]) -> Table:
-    """Return what is said of the thread as a table."""
-    title = f"the thread in rendered frames, {rows[0].frames} of each class"
-    result = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    result.add_column("class", no_wrap=True)
-    for name in ("line", "pcs", "off", "?", "wrg", "all", "not", "free", "not", "dev"):
-        result.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        counts = (row.unplaced, row.misplaced, row.complete, row.incomplete, row.free, row.not_free)
-        result.add_row(
-            row.name,
-            f"{row.covered:.0%}",
-            f"{row.pieces:.0%}",
-            "" if row.wrong_pieces is None else f"{row.wrong_pieces:.1%}",
-            *map(str, counts),
-            _number(row.normalised, ".1f"),
-        )
-    result.caption = (
-        "line: visible thread that is followed from the tail; pcs: that is on "
-        "pieces; off: share of pieces where no thread is; ?: pieces of unknown "
-        "place; wrg: of a place that is wrong; all: frames said to show all of "
-        "the thread; free: ends said to be its own; not: of these, that are not; "
-        "dev: RMS of errors over their standard deviation"
-    )
-    result.caption_justify = "left"
     return result
 
 

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.rig.camera.dish_camera import (
+from magnetosuture_thread.rig.camera import (
     GLEAM_BGR,
     MENISCUS,
     STEEL_BGR,
+    CameraScene,
     Cover,
     DishCamera,
+    Lighting,
     encode_jpeg,
 )
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
 from magnetosuture_thread.vision.lens import Lens
 
 Image = NDArray[np.uint8]
@@ -245,13 +246,3 @@ def lens_with(strength: float, size: tuple[int, int]) -> Lens:
 def dark_field(image: Image, view: DishView) -> Image:
     """Return the picture with light from the side: needle, thread and rim are bright on a dark floor."""
     return np.asarray(cv2.convertScaleAbs(255 - image, alpha=1.1, beta=4.0), dtype=np.uint8)
-
-
-def drawn_path(line: Points, bgr: tuple[int, int, int], thickness: int) -> Finish:
-    """Return what draws a line over the picture, as programs do that show where the needle shall go."""
-
-    def finish(image: Image, view: DishView) -> Image:
-        at = np.round(view.to_pixels(line) * 16.0).astype(np.int32)
-        return np.asarray(cv2.polylines(image, [at], False, bgr, thickness, cv2.LINE_AA, 4), dtype=np.uint8)
-
-    return finish

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.vision.classes import CLASSES
+from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS, Case, Image, dense, render
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene
@@ -41,9 +41,7 @@ class PieceErrors:
         covered: length of the visible thread that lies on a piece [m].
         length: of all pieces [m].
         wrong: of it, where no thread is [m].
-        pieces: number of them.
-        placed: of these, with a known place along the thread.
-        misplaced: of these, whose interval or direction is wrong.
+        misplaced: number of those whose interval or direction is wrong.
         complete: whether all of the thread is claimed to be seen.
         incomplete: whether it is not, though claimed.
         free: number of ends that are claimed to be the thread's.
@@ -55,8 +53,6 @@ class PieceErrors:
     covered: float = 0.0
     length: float = 0.0
     wrong: float = 0.0
-    pieces: int = 0
-    placed: int = 0
     misplaced: int = 0
     complete: bool = False
     incomplete: bool = False
@@ -128,15 +124,13 @@ class Row:
         wrong_line: share of the published centreline where no thread is; None if none was published.
         pieces: share of the visible thread that lies on pieces, over all frames.
         wrong_pieces: share of the pieces' length where no thread is; None without pieces.
-        unplaced: number of pieces whose place along the thread isn't known.
-        misplaced: number of those whose place is said to be known and is wrong.
+        misplaced: number of pieces whose place along the thread is said to be known and is wrong.
         complete: frames of which is said that they show all of the thread.
         incomplete: of these, that don't.
         free: ends of which is said that they are the thread's.
         not_free: of these, that are not.
         normalised: root mean square of points' distances from the thread over their standard deviation; 1 is honest.
         median_ms: CPU time of a frame.
-        max_ms: the longest.
         reasons: why there was no pose, with their counts.
     """
 
@@ -154,7 +148,6 @@ class Row:
     wrong_line: float | None
     pieces: float
     wrong_pieces: float | None
-    unplaced: int
     misplaced: int
     complete: int
     incomplete: int
@@ -162,7 +155,6 @@ class Row:
     not_free: int
     normalised: float | None
     median_ms: float
-    max_ms: float
     reasons: dict[str, int]
 
 
@@ -262,8 +254,6 @@ def compare_pieces(
         covered=covered,
         length=length,
         wrong=wrong,
-        pieces=len(lines),
-        placed=sum(math.isfinite(piece.arc_length[0]) for piece in observation.pieces),
         misplaced=misplaced,
         complete=observation.complete,
         incomplete=observation.complete and (last > WRONG_END or shown * total < total - WRONG_END),
@@ -323,7 +313,6 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
         wrong_line=sum(each.wrong for each in every) / line if line else None,
         pieces=sum(each.covered for each in pieces) / visible if visible else 0.0,
         wrong_pieces=sum(each.wrong for each in pieces) / length if length else None,
-        unplaced=sum(each.pieces - each.placed for each in pieces),
         misplaced=sum(each.misplaced for each in pieces),
         complete=sum(each.complete for each in pieces),
         incomplete=sum(each.incomplete for each in pieces),
@@ -331,7 +320,6 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
         not_free=sum(each.not_free for each in pieces),
         normalised=math.sqrt(sum(each.normalised for each in pieces) / points) if points else None,
         median_ms=float(np.median(times)),
-        max_ms=max(times),
         reasons=dict(Counter(_short(each.reason) for each in every if not each.found).most_common()),
     )
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.vision.look import FoundDish, see_dish
+from magnetosuture_thread.vision.dish.watch import FoundDish, see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 Image = NDArray[np.uint8]
@@ -157,9 +157,8 @@ def _dish(
     floor: str,
     height: float,
     lid: bool,
-    plain: bool = False,
 ) -> None:
-    """Draw a dish with its shadow, its floor, what grows and is written on it unless it is plain, its wall and lid."""
+    """Draw a dish with its shadow, its floor, what grows and is written on it, its wall and lid."""
     x, y = camera.plane(0.0)
     x, y = x - at[0], y - at[1]
     away, around = np.hypot(x, y), np.arctan2(y, x)
@@ -173,8 +172,7 @@ def _dish(
     else:
         tone = np.asarray(colour, np.float32) * (1.0 + 0.06 * _texture(random, x, y, 1.0, 1.0)[..., None])
     picture += (opacity if colour else 1.0) * inside[..., None] * (tone - picture)
-    if not plain:
-        _draw_use(random, picture, camera, at, (x, y))
+    _draw_use(random, picture, camera, at, (x, y))
     bright = random.uniform(25.0, 90.0)
     sign = -1.0 if random.random() < 0.5 else 1.0
     modulation = 0.65 + 0.35 * np.cos(around - random.uniform(-np.pi, np.pi))
@@ -207,9 +205,6 @@ def photograph(
     dishes: int = 1,
     hand: bool = False,
     exposure: float = 1.0,
-    rows: int = 0,
-    radius: tuple[float, float] = (0.22, 0.46),
-    draw: Callable[[Plane, Callable[[NDArray[np.float64]], NDArray[np.float64]]], None] | None = None,
 ) -> Photograph:
     """Draw a photograph.
 
@@ -222,18 +217,14 @@ def photograph(
         dishes: how many there are.
         hand: whether fingers hold it.
         exposure: 1 is well exposed.
-        rows: of the picture; 0: drawn at random.
-        radius: least and greatest, of the dish, as shares of the picture's shorter side.
-        draw: draws into the dish, on whose floor nothing else is then, by what turns points (x, y, z) in radii of the
-            dish into pixels.
     """
     ground = ground or str(random.choice(GROUNDS))
     floor = floor or str(random.choice(list(FLOORS)))
-    rows = rows or int(random.choice((240, 320, 480, 600, 768, 1080, 1440)))
+    rows = int(random.choice((240, 320, 480, 600, 768, 1080, 1440)))
     width = int(rows * random.choice((1.0, 1.333, 1.5, 1.778)))
     size = (rows, width) if random.random() < 0.2 else (width, rows)
     distance = random.uniform(5.0, 10.0)
-    radius_px = random.uniform(*radius) * min(size) / (1.4 if dishes > 1 else 1.0)
+    radius_px = random.uniform(0.22, 0.46) * min(size) / (1.4 if dishes > 1 else 1.0)
     angle, about = math.radians(random.uniform(*tilt)), random.uniform(-np.pi, np.pi)
     turn = cv2.Rodrigues(angle * np.array([math.cos(about), math.sin(about), 0.0]))[0]
     middle = np.array(size) * 0.5
@@ -260,9 +251,7 @@ def photograph(
             height,
             lid=False,
         )
-    _dish(random, picture, camera, (0.0, 0.0), floor, height, bool(random.random() < 0.5), plain=draw is not None)
-    if draw is not None:
-        draw(picture, camera.pixels)
+    _dish(random, picture, camera, (0.0, 0.0), floor, height, bool(random.random() < 0.5))
     if hand:
         for _ in range(int(random.integers(1, 4))):
             direction = random.uniform(-np.pi, np.pi)

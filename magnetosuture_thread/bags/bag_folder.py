@@ -24,29 +24,6 @@ COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
 
 
 @dataclass(frozen=True)
-class BagFiles:
-    """The files of a bag.
-
-    Attributes:
-        files: in the order in which they were recorded.
-        missing: names of those that are listed in metadata.yaml and do not exist.
-        notes: notes of our writer in metadata.yaml.
-        unlisted: names of those that are there and not listed in metadata.yaml, so that they are not read.
-        packed: whether each message was packed by the recorder; None where no metadata.yaml says so.
-        doubt: why metadata.yaml is not used, in one line; empty where it is, or there is none.
-        custom_data: entries of others in metadata.yaml.
-    """
-
-    files: list[Path]
-    missing: list[str]
-    notes: dict[str, str]
-    unlisted: list[str] = field(default_factory=list)
-    packed: bool | None = None
-    doubt: str = ""
-    custom_data: dict[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Metadata:
     """What metadata.yaml says.
 
@@ -63,6 +40,23 @@ class Metadata:
     packed: bool | None = None
     doubt: str = ""
     custom_data: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The files of a bag.
+
+    Attributes:
+        files: in the order in which they were recorded.
+        missing: names of those that are listed in metadata.yaml and do not exist.
+        unlisted: names of those that are there and not listed in metadata.yaml, so that they are not read.
+        metadata: what metadata.yaml says.
+    """
+
+    files: list[Path]
+    missing: list[str] = field(default_factory=list)
+    unlisted: list[str] = field(default_factory=list)
+    metadata: Metadata = field(default_factory=Metadata)
 
 
 def find_bag_files(path: Path) -> BagFiles:
@@ -87,9 +81,9 @@ def find_bag_files(path: Path) -> BagFiles:
         if path.name.endswith(COMPRESSED_SUFFIXES):
             raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {path.name}")
         beside = read_metadata(path.parent)
-        return BagFiles([path], [], {}, packed=beside.packed if path.name in beside.names else None)
+        return BagFiles([path], metadata=Metadata(packed=beside.packed if path.name in beside.names else None))
     metadata = read_metadata(path)
-    names, notes = metadata.names, metadata.notes
+    names = metadata.names
     present = {file.name: file for file in files}
     if listed := [present[name] for name in names if name in present]:
         missing = [name for name in names if name not in present]
@@ -99,7 +93,7 @@ def find_bag_files(path: Path) -> BagFiles:
             for file in inside
             if file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) and file.name not in {*names, *packs}
         ]
-        return BagFiles(listed, missing, notes, unlisted, metadata.packed, custom_data=metadata.custom_data)
+        return BagFiles(listed, missing, unlisted, metadata)
     compressed = [file for file in inside if file.name.endswith(COMPRESSED_SUFFIXES)]
     if compressed and not files:
         raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0].name}")
@@ -108,8 +102,7 @@ def find_bag_files(path: Path) -> BagFiles:
     if len(files) > 1 and not _is_split(files):
         kind = files[0].suffix if len({file.suffix for file in files}) == 1 else ".mcap and .db3"
         raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
-    custom = metadata.custom_data
-    return BagFiles(files, [], notes, packed=metadata.packed, doubt=metadata.doubt, custom_data=custom)
+    return BagFiles(files, metadata=metadata)
 
 
 def _by_number(path: Path) -> tuple[str, int, str]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magnetosuture_thread.bags.message_types import MESSAGES
-from magnetosuture_thread.messages.building import ADD, LINE_STRIP
+from magnetosuture_thread.messages.markers import ADD, LINE_STRIP
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

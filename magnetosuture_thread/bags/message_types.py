@@ -53,11 +53,7 @@ def _zero(kind: Any) -> Any:
     return [_zero((inner, element)) for _ in range(count)]
 
 
-def _numbers(kind: str, values: Any) -> Any:
-    return np.asarray(values, dtype=kind)
-
-
-MESSAGES = MessageBuilder(make, _numbers)
+MESSAGES = MessageBuilder(make)
 """Builds messages of the bags' type store."""
 
 

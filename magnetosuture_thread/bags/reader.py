@@ -100,8 +100,8 @@ class Bag:
         notes: notes of our writer.
         damage: what is corrupt and lost; None if the bag is intact. Its text is one line.
         unchecked: why damage may not have been noticed, in one line; empty if it would have been.
-        unverified: why even what is read may be wrong, in one line; empty if checksums vouch for it, or nothing speaks
-            against it. A bag keeps this for good: what `bag repair` makes of it says so in its notes.
+        unverified: why even what is read may be wrong, in one line; empty if nothing speaks against it. An earlier
+            version salvaged such bags from damaged ones without checksums; their notes say so for good.
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
         decoders: of its messages; all its definitions are parsed within one budget.
@@ -120,22 +120,22 @@ class Bag:
         self.decoders = DecoderCache()
         found = find_bag_files(path)
         self._storages, problems = _open(found.files, progress)
+        metadata = found.metadata
         missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
         lost = [DamageReport((region,), 0, region.end, None) for region in (*missing, *problems)]
         self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
-        self._packed = found.packed
+        self._packed = metadata.packed
         self.unchecked = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
-        own = next((storage.unverified for storage in self._storages if storage.unverified), "")
         unlisted = [f"{name} is not read: {METADATA_FILE} does not list it" for name in found.unlisted]
-        self.remarks = [*unlisted, *([found.doubt] if found.doubt else [])]
+        self.remarks = [*unlisted, *([metadata.doubt] if metadata.doubt else [])]
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
         self.profile = next((storage.profile for storage in self._storages if storage.profile), ROS2_PROFILE)
         self.library = next((storage.library for storage in self._storages if storage.library), "")
-        self.custom_data = found.custom_data
-        self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
+        self.custom_data = metadata.custom_data
+        self.notes = next((storage.notes for storage in self._storages if storage.notes), metadata.notes)
         # Of a damaged file the notes may be lost; each chunk has the marks once more.
         marks = marks_of(self.connections()) | self.notes
-        self.unverified = own or marks.get(UNVERIFIED_NOTE, "")
+        self.unverified = marks.get(UNVERIFIED_NOTE, "")
         self.unchecked = self.unchecked or marks.get(UNCHECKED_NOTE, "")
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")

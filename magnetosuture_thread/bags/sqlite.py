@@ -1,7 +1,8 @@
 """Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums.
 
 A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes. Only
-plain tables are read, each row once, within a number of steps that depends on the size of the file.
+plain tables are read, within a number of steps that depends on the size of the file. A damaged one is refused: nothing
+tells its altered messages from the others.
 """
 
 from __future__ import annotations
@@ -9,31 +10,21 @@ from __future__ import annotations
 import os
 import sqlite3
 import stat
-from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
 from mcap.records import Attachment, Metadata
 
-from magnetosuture_thread.bags.storage import (
-    ROS2_PROFILE,
-    Connection,
-    CorruptRegion,
-    DamageReport,
-    MessageDefinition,
-    StoredMessage,
-    pluralize,
-)
+from magnetosuture_thread.bags.storage import ROS2_PROFILE, Connection, DamageReport, MessageDefinition, StoredMessage
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import is_url
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
-UNVERIFIED = "damaged, and without checksums (sqlite3): any message that is read may be wrong"
 _ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a damaged name
 _MAGIC = b"SQLite format 3\0"
 _SIDECARS = ("-wal", "-journal", "-shm")
@@ -48,7 +39,6 @@ _COLUMNS = {
 # The last three are written anew: versions, and a copy of metadata.yaml.
 _OWN_TABLES = (*_COLUMNS, "message_definitions", "schema", "metadata", "sqlite_sequence")
 _MAX_ROW_ID = (1 << 63) - 1
-_MAX_GAPS = 2000  # unreadable places after which the rest of a database is given up
 _LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
 _MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
@@ -88,27 +78,25 @@ class SqliteFile:
         self.profile, self.library = ROS2_PROFILE, ""
         self.connections: dict[int, Connection] = {}
         self.counts: dict[int, int] = {}
-        self._rows: list[tuple[int, int]] | None = None  # time and id of each readable row, if not all are readable
-        lost: int | None = None
+        self.damage: DamageReport | None = None
         try:
             with closing(self._connect()) as database:
-                problem = _problem(database)
+                if (found := str(database.execute("PRAGMA quick_check(1)").fetchone()[0])) != "ok":
+                    raise self._damaged(found)
                 self._check_tables(database)
                 self.connections = _connections(database)
-                if problem:
-                    self._salvage(database)
-                else:
-                    lost = self._count_messages(database)
+                if lost := self._count_messages(database):
+                    raise self._damaged(f"{lost} rows without a valid time, topic or data")
+        except sqlite3.DatabaseError as error:
+            raise self._damaged(_reason_of(error)) from None
         except _ERRORS as error:
             raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         progress(size)
-        if lost:
-            problem = f"{pluralize(lost, 'row')} without a valid time, topic or data"
-        elif problem:
-            problem = f"the database is malformed ({problem})"
-        self.damage = DamageReport((CorruptRegion(path.name, 0, size, problem),), 0, 0, lost) if problem else None
-        self.unverified = UNVERIFIED if problem else ""
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
+
+    def _damaged(self, problem: str) -> BagError:
+        words = " ".join(problem.split())
+        return BagError(self.path, f"is damaged ({words}), and has no checksums (sqlite3): nothing of it is used")
 
     def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
@@ -119,32 +107,21 @@ class SqliteFile:
         wanted = sorted(set(connections) & set(self.counts))
         try:
             with closing(self._connect()) as database:
-                if self._rows is None:
-                    marks = ",".join("?" * len(wanted))
-                    query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
-                    between = f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
-                    limits = (max(start, -_MAX_ROW_ID), min(end, _MAX_ROW_ID))
-                    rows = database.execute(query + between, (*wanted, *limits))
-                    yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
-                    return
-                query = "SELECT timestamp, topic_id, data FROM messages WHERE id = ?"
-                for time, number in self._rows:
-                    if start <= time <= end:
-                        row = database.execute(query, (number,)).fetchone()
-                        if row is not None and row[0] == time and row[1] in wanted and isinstance(row[2], bytes):
-                            yield StoredMessage(time, self.connections[row[1]], row[2])
+                marks = ",".join("?" * len(wanted))
+                query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
+                between = f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
+                limits = (max(start, -_MAX_ROW_ID), min(end, _MAX_ROW_ID))
+                rows = database.execute(query + between, (*wanted, *limits))
+                yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
         except _ERRORS as error:
             raise BagError(self.path, f"cannot be read any more: {_reason_of(error)}") from None
 
     def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
         """Yield nothing: the format has no attachments. Tables that rosbag2 does not write are counted."""
-        names = list[str]()
-        with suppress(*_ERRORS), closing(self._connect()) as database:  # of a damaged one as many as can be read
+        with closing(self._connect()) as database:
             for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'"):
-                names.append(str(name))
-        for name in names:
-            if name not in _OWN_TABLES:
-                dropped[f"table {shortened(name)} of the database"] += 1
+                if name not in _OWN_TABLES:
+                    dropped[f"table {shortened(str(name))} of the database"] += 1
         return iter(())
 
     def _connect(self) -> sqlite3.Connection:
@@ -192,18 +169,6 @@ class SqliteFile:
         (total,) = database.execute("SELECT COUNT(*) FROM messages").fetchone()
         return int(total) - sum(int(row[1]) for row in found)
 
-    def _salvage(self, database: sqlite3.Connection) -> None:
-        """Find the readable rows of a malformed database."""
-        times, numbers, counts = array("q"), array("q"), Counter[int]()
-        for number, topic, time in _readable_rows(database):
-            if topic in self.connections:
-                times.append(time)
-                numbers.append(number)
-                counts[topic] += 1
-        self.counts = dict(counts)
-        self._rows = sorted(zip(times, numbers, strict=True))
-        self.start, self.end = (self._rows[0][0], self._rows[-1][0]) if self._rows else (0, 0)
-
 
 def _decode_text(data: bytes) -> str | None:
     """Return a text; None if it is not valid UTF-8."""
@@ -218,15 +183,6 @@ def _reason_of(error: Exception) -> str:
     if "interrupted" in str(error):
         return "reading it takes more steps than a recording of its size does"
     return " ".join(str(error).split())
-
-
-def _problem(database: sqlite3.Connection) -> str:
-    """Return what is malformed; empty if nothing is."""
-    try:
-        found = str(database.execute("PRAGMA quick_check(1)").fetchone()[0])
-    except _ERRORS as error:
-        return _reason_of(error)
-    return "" if found == "ok" else " ".join(found.split())
 
 
 def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
@@ -250,29 +206,3 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
             metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
             connections[number] = Connection(topic, definitions.get(kind, MessageDefinition(kind)), form, metadata)
     return connections
-
-
-def _readable_rows(database: sqlite3.Connection) -> Iterator[tuple[int, int, int]]:
-    """Yield id, topic and time of each row that is fully readable, by rising id: each once.
-
-    In a broken tree, ids may fall, as where a page is its own child. What follows such an id is skipped like a page
-    that cannot be read.
-    """
-    last, stride, gaps = 0, 0, 0
-    query = f"SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? AND {_IS_VALID} ORDER BY id"
-    while last < _MAX_ROW_ID and gaps < _MAX_GAPS:
-        try:
-            for number, topic, time, data in database.execute(query, (last,)):
-                if not isinstance(number, int) or number <= last:
-                    raise sqlite3.DatabaseError("ids that do not rise")
-                last, stride = number, 0
-                if isinstance(data, bytes) and isinstance(topic, int) and isinstance(time, int) and time >= 0:
-                    yield number, topic, time
-            return
-        except _ERRORS as error:
-            if "interrupted" in str(error):
-                return  # The budget of steps is spent.
-            gaps += 1
-        # Skip row by row past the unreadable ones, then in growing steps.
-        stride = max(1, min(2 * stride, _MAX_ROW_ID // 4))
-        last += stride

@@ -159,8 +159,6 @@ class BagStorage(Protocol):
         notes: notes of our writer.
         damage: what is corrupt and lost; None if nothing is.
         unchecked: why damage may not have been noticed, in one line; empty if it would have been.
-        unverified: why even the messages that are read may be wrong, in one line; empty if checksums vouch for them,
-            or nothing speaks against them.
         facts: properties of the file for a person, for example chunks and compression.
         profile: which conventions the file follows, as mcap names them.
         library: that wrote it; empty where the format does not say.
@@ -174,7 +172,6 @@ class BagStorage(Protocol):
     notes: dict[str, str]
     damage: DamageReport | None
     unchecked: str
-    unverified: str
     facts: dict[str, str]
     profile: str
     library: str

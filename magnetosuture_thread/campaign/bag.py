@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.campaign.loop import Measurement, Vector
 from magnetosuture_thread.coils.bridge import BridgeOutput
@@ -27,17 +26,19 @@ from magnetosuture_thread.interface import (
     SCENE,
     THREAD_OBSERVATION,
 )
-from magnetosuture_thread.messages.cdr import time_of
-from magnetosuture_thread.messages.packing import (
-    packed_estimate,
-    packed_margins,
-    packed_observation,
-    packed_path,
-    packed_pose,
-    packed_prediction,
+from magnetosuture_thread.messages.outputs import (
+    Outputs,
+    camera_outputs,
+    estimate_outputs,
+    ground_truth_outputs,
+    pose_outputs,
+    prediction_outputs,
+    thread_outputs,
 )
+from magnetosuture_thread.messages.packing import packed_currents, packed_filter_state, packed_twist
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.model.session import PredictionResult
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 
@@ -68,7 +69,7 @@ class RunBag:
         for channel in (SCENE, *frames, *GROUND_TRUTH, *OF_TRACKER, *OF_MODEL, *OF_BRIDGE):
             self._bag.add_topic(channel.recorded, channel.type_name)
         begin = _nanoseconds(start)
-        self._bag.write_message(SCENE.recorded, begin, MESSAGES.scene_message(begin, setup.scene))
+        self._bag.write(SCENE.recorded, begin, packed_scene(begin, setup.scene))
         self._view = setup.rig.view(setup.scene)
         self._command = 0  # stamp of the last [ns]
 
@@ -84,39 +85,21 @@ class RunBag:
 
     def on_frame(self, now: float, frame: RigFrame) -> None:
         """Write a frame, if it was rendered, and the ground truth."""
-        stamp = _nanoseconds(now)
+        stamp, rig = _nanoseconds(now), self._rig
         if frame.image is not None:
-            image = MESSAGES.compressed_image(stamp, encode_jpeg(frame.image, self._rig.jpeg_quality))
-            self._bag.write_message(COMPRESSED_IMAGE.recorded, stamp, image)
-            size = (self._rig.camera_width, self._rig.camera_height)
-            information = MESSAGES.camera_info(stamp, size, self._view, self._rig.camera_distance)
-            self._bag.write_message(CAMERA_INFO.recorded, stamp, information)
-        placed = MESSAGES.placed(stamp, frame.tail, frame.heading)
-        self._bag.write_message(GROUND_TRUTH_NEEDLE.recorded, stamp, placed)
-        self._bag.write(GROUND_TRUTH_THREAD.recorded, stamp, packed_path(time_of(stamp), frame.thread))
-        pull = MESSAGES.wrench_message(stamp, frame.pull, frame.moment)
-        self._bag.write_message(GROUND_TRUTH_PULL.recorded, stamp, pull)
+            jpeg, size = encode_jpeg(frame.image, rig.jpeg_quality), (rig.camera_width, rig.camera_height)
+            self._write(stamp, camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
+        self._write(stamp, ground_truth_outputs(stamp, frame))
 
     def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
         """Write what was measured, predicted and estimated in a frame, and the command that came of it."""
-        time, stamp = _nanoseconds(now), result.stamp
-        when, observation = time_of(stamp), measured.observation
-        self._bag.write(
-            NEEDLE_POSE.recorded, time, packed_pose(when, measured.tail, measured.heading, measured.covariance)
-        )
+        time, stamp, observation = _nanoseconds(now), result.stamp, measured.observation
+        self._write(time, pose_outputs(stamp, measured.tail, measured.heading, measured.covariance))
         if observation is not None:
-            self._bag.write(THREAD_OBSERVATION.recorded, time, packed_observation(when, observation))
-            if (centreline := observation.from_tail) is not None:
-                self._bag.write(MEASURED_THREAD.recorded, time, packed_path(when, centreline))
-        if result.prediction is not None:
-            self._bag.write(PREDICTED_THREAD.recorded, time, packed_prediction(when, result.prediction, self._material))
-        if result.estimate is not None:
-            self._bag.write(ESTIMATED_THREAD.recorded, time, packed_estimate(when, result.estimate))
-        margins, of_estimate = result.margins, result.estimate is not None
-        reason = "" if margins is not None else result.reason
-        packed = packed_margins(when, margins, reason, result.scene_version, of_estimate=of_estimate)
-        self._bag.write(MARGINS.recorded, time, packed)
-        self._bag.write_message(NEEDLE_COMMAND.recorded, time, MESSAGES.twist_message(time, commanded))
+            self._write(time, thread_outputs(stamp, observation, observation.from_tail))
+        self._write(time, prediction_outputs(result, self._material))
+        self._write(time, estimate_outputs(result))
+        self._bag.write(NEEDLE_COMMAND.recorded, time, packed_twist(time, commanded))
         self._command = time
 
     def on_bridge(self, now: float, output: BridgeOutput) -> None:
@@ -124,8 +107,12 @@ class RunBag:
         time = _nanoseconds(now)
         if not (output.publish and self._command):
             return
-        self._bag.write_message(CURRENTS.recorded, time, MESSAGES.currents_message(time, self._command, output))
-        self._bag.write_message(FILTER_STATE.recorded, time, MESSAGES.filter_message(self._command, output))
+        self._bag.write(CURRENTS.recorded, time, packed_currents(time, self._command, output))
+        self._bag.write(FILTER_STATE.recorded, time, packed_filter_state(self._command, output))
+
+    def _write(self, time: int, outputs: Outputs) -> None:
+        for channel, data in outputs:
+            self._bag.write(channel.recorded, time, data)
 
 
 def _nanoseconds(time: float) -> int:

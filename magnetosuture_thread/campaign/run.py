@@ -1,37 +1,268 @@
-"""One run of a procedure in the closed loop, and what came of it."""
+"""One run of a procedure in the closed loop: what its seed varies, its figures, and whether it succeeded."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from magnetosuture_thread.campaign.extremes import RunExtremes, RunInstant
-from magnetosuture_thread.campaign.limits import RunFigures
 from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
-from magnetosuture_thread.campaign.variation import Variation
-from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.forecast import make_forecaster
-from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.executor import (
+    ENDED,
+    UNLIMITED,
+    PendingPath,
     ProcedureExecutor,
     ProcedureState,
     ThreadCondition,
+    plan_now,
 )
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.pending import PendingPath, plan_now
-from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
-from magnetosuture_thread.planning.predictive import FORECAST_STEP, PredictiveController
-from magnetosuture_thread.planning.procedure import Procedure, Wrap
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
+from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
 from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.safety.packed_scene import measure, pack_scene
+from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s; of a run
-TRACKING, PREDICTIVE = LOCAL_CONTROLLERS = ("tracking", "predictive")
 PLANNING_TIME = 0.2  # s; in which a path is planned: 0.01 in the open, 0.5 through a gap and around a shape
+# What a run must keep to succeed, besides its goals.
+KEEP_OUT_TOLERANCE = 5e-6  # m
+PENETRATION_TOLERANCE = 1e-6  # m
+MAX_REST = 3.0  # s
+MAX_TIME_RATIO = 1.5
+REST_WAY = 5e-5  # m; of the tip, that a needle covers if it does not rest
+LAST_TIME, LAST_INSTANTS = 4.0, 6  # s that the last instants of a failed run cover, and how many they are
+# What a seed varies: shares, or m and rad.
+START_OFFSET, START_TURN = 1e-3, 0.15
+CURVATURE, VISCOSITY, STIFFNESS, COILS, LOST_FRAMES = 0.3, 0.3, 0.5, 0.05, 0.05
+MAX_FRICTION = 0.3
+MAX_DRAWS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Variation:
+    """The truth of one run.
+
+    Attributes:
+        seed: that it is drawn by.
+        setup: with the rig's settings as they are in truth; those of the nodes are as before.
+        coil_gains: by which each coil is stronger than the bridge believes, shape (m,).
+        losses: share of the frames that get lost.
+    """
+
+    seed: int
+    setup: Setup
+    coil_gains: NDArray[np.float64]
+    losses: float = LOST_FRAMES
+
+
+def vary(setup: Setup, seed: int) -> Variation:
+    """Return the truth of the run with a seed.
+
+    Uniformly drawn: the start within 1 mm and 0.15 rad, the thread's start curvature by 30 %, the viscosity by 30 % (of
+    needle and thread alike), the bending stiffness by 50 %, each coil by 5 %, the thread's friction from 0 to 0.3. A
+    start in the wall or a shape is drawn anew.
+
+    Raises:
+        ConfigurationError: no start is free, of needle and thread.
+    """
+    random = np.random.default_rng([seed, 0])
+    rig, scene = setup.rig, setup.scene
+
+    def factor(share: float) -> float:
+        return float(1.0 + share * random.uniform(-1.0, 1.0))
+
+    liquid = factor(VISCOSITY)
+    changed = replace(
+        rig,
+        seed=seed,
+        viscosity=rig.viscosity * liquid,
+        thread_drag_across=rig.thread_drag_across * liquid,
+        thread_drag_along=rig.thread_drag_along * liquid,
+        thread_bending_stiffness=rig.thread_bending_stiffness * factor(STIFFNESS),
+        thread_friction=float(random.uniform(0.0, MAX_FRICTION)),
+    )
+    gains = 1.0 + COILS * random.uniform(-1.0, 1.0, len(rig.coil_angles))
+    x, y, heading = rig.needle_start
+    for _ in range(MAX_DRAWS):
+        dx, dy = START_OFFSET * random.uniform(-1.0, 1.0, 2)
+        start = (
+            x + float(dx),
+            y + float(dy),
+            math.remainder(heading + START_TURN * random.uniform(-1.0, 1.0), math.tau),
+        )
+        curvature = rig.thread_start_curvature * factor(CURVATURE)
+        drawn = replace(changed, needle_start=start, thread_start_curvature=curvature)
+        try:
+            drawn.check_scene(scene)
+        except ConfigurationError:
+            continue
+        return Variation(seed, replace(setup, rig=drawn).with_scene(scene), gains)
+    expected = "a start with room around it"
+    try:
+        rig.check_scene(scene)
+    except ConfigurationError as error:  # what is in the way, with the start as it is
+        expected += f": {error.expectation}"
+    raise ConfigurationError("rig_simulator.needle_start", list(rig.needle_start), expected)
+
+
+@dataclass
+class RunFigures:
+    """What is measured of a run, all of it in the ground truth of the simulation but for the friction.
+
+    Attributes:
+        time_s: from the start of the procedure to its end.
+        ideal_time_s: of the path planned at the start, at the allowed speed, slowed by friction as it was in the run.
+        min_needle_clearance_m: of the needle's axis from wall and shapes.
+        max_thread_penetration_m: of a node of the thread into wall or shapes.
+        longest_rest_s: for which the needle did not move, while the procedure ran.
+        wrap_degrees: that the thread swept at the most about the shape of the first wrap; 0 without one.
+        max_tension_n: peak of the thread.
+        max_friction_nodes: under friction at once, by the model.
+        max_tension_excess_n: of the tension above the limit of the goal that was pursued; negative if it stayed below.
+        max_friction_excess: of the nodes under friction above that goal's limit.
+    """
+
+    time_s: float = 0.0
+    ideal_time_s: float = 0.0
+    min_needle_clearance_m: float = math.inf
+    max_thread_penetration_m: float = 0.0
+    longest_rest_s: float = 0.0
+    wrap_degrees: float = 0.0
+    max_tension_n: float = 0.0
+    max_friction_nodes: int = 0
+    max_tension_excess_n: float = -math.inf
+    max_friction_excess: int = -UNLIMITED
+
+    def beyond_limits(self, keep_out: float) -> dict[str, str]:
+        """Return what a run did not keep: by the name of the figure, what was found and what is allowed.
+
+        A run without a path has no ideal time, and has failed for that.
+
+        Args:
+            keep_out: of the bridge [m].
+        """
+        clearance, allowed = self.min_needle_clearance_m, keep_out - KEEP_OUT_TOLERANCE
+        ratio = MAX_TIME_RATIO * self.ideal_time_s
+        tension, friction = self.max_tension_excess_n, self.max_friction_excess
+        checks = {
+            "min_needle_clearance_m": (
+                clearance < allowed,
+                f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)",
+            ),
+            "max_thread_penetration_m": (
+                self.max_thread_penetration_m > PENETRATION_TOLERANCE,
+                f"a node of the thread {1e6 * self.max_thread_penetration_m:.1f} um in wall or shape",
+            ),
+            "longest_rest_s": (
+                self.longest_rest_s > MAX_REST,
+                f"a rest of {self.longest_rest_s:.1f} s ({MAX_REST:g} allowed)",
+            ),
+            "max_tension_n": (tension > 0.0, f"a tension {1e3 * tension:.3g} mN above the limit of its goal"),
+            "max_friction_nodes": (friction > 0, f"{friction} more nodes under friction than its goal allows"),
+            "time_s": (self.time_s > ratio > 0.0, f"{self.time_s:.0f} s ({ratio:.0f} allowed)"),
+        }
+        return {name: words for name, (is_broken, words) in checks.items() if is_broken}
+
+
+@dataclass(frozen=True)
+class RunInstant:
+    """A frame of a run, as a report shows it.
+
+    Attributes:
+        frame: of the loop.
+        axis: of the needle in truth, shape (k, 2) [m].
+        clearance: of the axis from wall and shapes [m].
+        goal: index of the goal then.
+        path: of the needle's middle as planned then, shape (m, 2) [m]; None without one.
+    """
+
+    frame: LoopFrame
+    axis: Points
+    clearance: float
+    goal: int
+    path: Points | None
+
+
+class RunExtremes:
+    """Keeps the extremes of a run.
+
+    Args:
+        planner: whose needle it is.
+        scene: around it.
+        limits: of each goal.
+        wrap: whose angle is measured; None for none.
+
+    Attributes:
+        figures: of the run so far.
+        closest: the instant with the minimum clearance; None before the first frame.
+    """
+
+    def __init__(
+        self, planner: NeedlePlanner, scene: Scene, limits: Sequence[ProcedureLimits], wrap: Wrap | None
+    ) -> None:
+        self._planner, self._wrap, self._scene, self._limits = planner, wrap, scene, limits
+        self._packed = pack_scene(scene)
+        self.figures = RunFigures()
+        self.closest: RunInstant | None = None
+        self._last: deque[RunInstant] = deque()
+        self._angle = 0.0  # of the needle's chord [rad]
+        self._anchor: tuple[float, float, float, float] | None = None
+
+    def update(self, frame: LoopFrame, running: bool, goal: int, path: Points | None) -> None:
+        """Take a frame.
+
+        Args:
+            frame: of the loop.
+            running: whether the needle is to move.
+            goal: index of the goal.
+            path: of the needle's middle as planned, shape (m, 2) [m]; None without one.
+        """
+        heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
+        middle, angle = self._planner.pose(frame.tail, heading)
+        c, s = math.cos(angle), math.sin(angle)
+        axis = self._planner.body @ np.array([[c, s], [-s, c]]) + middle
+        instant = RunInstant(frame, axis, self._distance(axis), goal, path)
+        found, limits, nodes = self.figures, self._limits[goal], frame.condition.friction_nodes
+        if instant.clearance < found.min_needle_clearance_m:
+            found.min_needle_clearance_m, self.closest = instant.clearance, instant
+        found.max_thread_penetration_m = max(found.max_thread_penetration_m, -self._distance(frame.thread))
+        found.max_tension_n = max(found.max_tension_n, frame.tension)
+        found.max_friction_nodes = max(found.max_friction_nodes, nodes)
+        found.max_tension_excess_n = max(found.max_tension_excess_n, frame.tension - limits.tension)
+        found.max_friction_excess = max(found.max_friction_excess, nodes - limits.friction_nodes)
+        if self._wrap is not None:
+            swept = math.degrees(self._planner.swept_by(self._wrap.around, frame.thread))
+            found.wrap_degrees = max(found.wrap_degrees, abs(swept))
+        # Not wrapped at a half turn, over which noise would be a turn of the needle.
+        self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
+        at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * self._angle)
+        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > REST_WAY:
+            self._anchor = at
+        found.longest_rest_s = max(found.longest_rest_s, frame.time - self._anchor[0])
+        self._last.append(instant)
+        while self._last[0].frame.time < frame.time - LAST_TIME:
+            self._last.popleft()
+
+    def last_instants(self) -> tuple[RunInstant, ...]:
+        """Return instants of the last seconds, evenly spaced, the last frame among them."""
+        count = min(LAST_INSTANTS, len(self._last))
+        return tuple(self._last[round(index)] for index in np.linspace(0, len(self._last) - 1, count))
+
+    def _distance(self, points: Points) -> float:
+        shapes = len(self._packed.shapes)
+        found, normal = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
+        measure(np.ascontiguousarray(points), self._packed, found, normal)
+        wall = self._scene.dish.radius - float(np.hypot(points[:, 0], points[:, 1]).max())
+        return min(wall, float(found.min(initial=math.inf)))
 
 
 @dataclass(frozen=True)
@@ -79,14 +310,8 @@ def check_run(procedure: Procedure, setup: Setup, variation: Variation) -> None:
         PlanningError: there is no way to a goal.
     """
     x, y, angle = variation.setup.rig.needle_start
-    planner = _planner(setup)
+    planner = setup.planner.planner(setup.scene)
     planner.plan_all(procedure, *planner.pose(np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])))
-
-
-def _planner(setup: Setup) -> NeedlePlanner:
-    kinematics, settings = setup.coils.needle().kinematics, setup.coils
-    clearance = settings.keep_out + settings.pose_margin
-    return NeedlePlanner(setup.scene, kinematics, clearance, setup.model.thread_length, settings.coil_angles)
 
 
 def run_procedure(
@@ -95,34 +320,29 @@ def run_procedure(
     variation: Variation,
     *,
     camera: bool = False,
-    follower: bool = False,
-    local: str = TRACKING,
     recorder: LoopRecorder | None = None,
 ) -> RunResult:
-    """Run a procedure, or the path follower of the setup for comparison, until it ends; return what came of it.
+    """Run a procedure until it ends; return what came of it.
 
     Args:
         procedure: to run.
         setup: what the nodes believe.
         variation: the truth.
         camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
-        follower: whether the setup's path follower commands in place of the procedure.
-        local: how the paths of the procedure are followed, one of `LOCAL_CONTROLLERS`.
         recorder: gets what the nodes would publish; None for nobody.
 
     Raises:
         ConfigurationError: the procedure does not fit the scene.
     """
-    planner = _planner(setup)
+    planner = setup.planner.planner(setup.scene)
     planner.check(procedure)
-    predictive = _predictive(setup, planner, variation.seed) if local == PREDICTIVE else None
-    pilot, leader = _Pilot(procedure, planner, predictive), _Follower(setup) if follower else None
+    pilot = _Pilot(procedure, planner)
     executor = pilot.executor
     rig = Rig(variation.setup.rig, setup.scene)
     loop = ClosedLoop(
         setup,
         rig,
-        pilot.compute_command if leader is None else leader.compute_command,
+        pilot.compute_command,
         variation.seed,
         camera=camera,
         losses=variation.losses,
@@ -131,6 +351,7 @@ def run_procedure(
     )
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
+    figures = extremes.figures
     began, planned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
     reason = f"not done after {MAX_TIME:g} s"
     try:
@@ -138,34 +359,20 @@ def run_procedure(
             frame = loop.step()
             if frame is None:
                 continue
-            running = executor.state is ProcedureState.RUNNING or (leader is not None and rig.began < math.inf)
+            running = executor.state is ProcedureState.RUNNING
             extremes.update(frame, running, executor.goal, None if executor.path is None else executor.path.middles)
             if math.isnan(began) and running:
-                began = frame.time
-                planned = _planned_time(executor, frame) if leader is None else leader.ideal_time
+                began, planned = frame.time, _planned_time(executor, frame)
             ahead = max(0.0, executor.travel - before)
             before = executor.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
-            if executor.state in (ProcedureState.DONE, ProcedureState.FAILED):
+            if executor.state in ENDED:
                 reason = executor.reason
-                break
-            if leader is not None and leader.progress >= 1.0:
-                reason = "the path of the follower, which knows no goals, has ended"
                 break
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
-    figures = RunFigures(
-        rig.time - began if math.isfinite(began) else rig.time,
-        planned * (weighted / way if way > 0.0 else 1.0),
-        extremes.clearance,
-        extremes.penetration,
-        extremes.rest,
-        extremes.wrapped,
-        extremes.tension,
-        extremes.friction_nodes,
-        extremes.tension_excess,
-        extremes.friction_excess,
-    )
+    figures.time_s = rig.time - began if math.isfinite(began) else rig.time
+    figures.ideal_time_s = planned * (weighted / way if way > 0.0 else 1.0)
     reached = executor.state is ProcedureState.DONE
     reasons = [*filter(None, [reason]), *figures.beyond_limits(setup.coils.keep_out).values()]
     return RunResult(
@@ -185,15 +392,11 @@ def _planned_time(executor: ProcedureExecutor, frame: LoopFrame) -> float:
     """Return the time of the paths from here to the end at their goals' speeds [s]; 0, and end it, without a way."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
     try:
-        paths = executor.plan(frame.tail, heading)
+        paths = executor.planner.plan_all(executor.procedure, *executor.planner.pose(frame.tail, heading))
     except PlanningError as error:
         executor.abort(str(error))
         return 0.0
-    time, index, procedure = 0.0, 0, executor.procedure
-    for path in paths:  # one for the goals of each chain, whose limits are the same
-        time += path.length / procedure.limits[index].speed
-        index += len(chain(procedure, index))
-    return time
+    return planned_duration(executor.procedure, paths)
 
 
 @dataclass(frozen=True)
@@ -213,8 +416,8 @@ class _PlannedPath:
 class _Pilot:
     """Executes a procedure as the needle planner does: paths are ready `PLANNING_TIME` after they are asked for."""
 
-    def __init__(self, procedure: Procedure, planner: NeedlePlanner, local: PredictiveController | None) -> None:
-        self.executor = ProcedureExecutor(procedure, planner, self._submit, local=local)
+    def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
+        self.executor = ProcedureExecutor(procedure, planner, self._submit)
         self._now = 0.0
 
     def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
@@ -222,33 +425,8 @@ class _Pilot:
         self._now = stamp
         if self.executor.state is ProcedureState.READY and not thread.problem:
             self.executor.start()
-        return self.executor.update(stamp, tail, heading, thread).velocity
+        return self.executor.update(stamp, tail, heading, thread)
 
     def _submit(self, task: Callable[[], BodyPath]) -> PendingPath:
         due = self._now + PLANNING_TIME
         return _PlannedPath(plan_now(task), lambda: self._now >= due - 1e-9)
-
-
-class _Follower:
-    """Commands as the path follower of the setup, up to the end of its path."""
-
-    def __init__(self, setup: Setup) -> None:
-        self._follower, self.progress = setup.follower.follower(), 0.0
-        points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-        self.ideal_time = float(arc_lengths(points)[-1]) / setup.follower.speed
-
-    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
-        """Return the velocity of the tip."""
-        command = self._follower.compute_command(stamp, tail, heading)
-        self.progress = command.progress
-        return command.velocity
-
-
-def _predictive(setup: Setup, planner: NeedlePlanner, seed: int) -> PredictiveController:
-    """Return the predictive controller of what the nodes believe."""
-    safety = setup.coils.safety_filter(setup.scene)
-    # A single worker: runs are what processes are for.
-    options = {"step": FORECAST_STEP, "max_step": FORECAST_STEP, "workers": 1}
-    forecaster = make_forecaster(setup.model, setup.scene, safety, **options)
-    slowed = setup.coils.friction_feedback == "all"
-    return PredictiveController(planner, forecaster, seed=seed, slowed=slowed)

@@ -1,31 +1,33 @@
-"""Allocation of coil currents for a commanded tip velocity, by bounded least squares."""
+"""Coil currents for a velocity of the needle: bounded least squares, certified by the safety filter.
+
+The gain of each coil against its calibration is estimated from the direction in which the needle lies.
+"""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.field import CoilModel
+from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
-from magnetosuture_thread.coils.reflections import solve_by_reflections
-from magnetosuture_thread.safety import NeedleKinematics
+from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
+from magnetosuture_thread.safety.filter import SPEED
 
 Vector = NDArray[np.float64]
 
-# Weights of the least-squares objectives. Drift cannot be avoided everywhere.
-DRIVE_WEIGHT = 1.0
-TURN_WEIGHT = 1.0
+# Weights of the least-squares objectives; that of velocity and drift, which cannot be avoided everywhere, is 1.
 ALIGN_WEIGHT = 0.1
 # Where a pull across the needle is compensated. The aligning field's own gradient pulls across the needle too: at
 # headings close to a coil's axis both cannot be had, and a needle that drifts cannot be steered. In a field against it
 # the needle would turn round: the least field along it is a constraint, by its weight.
 COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT = 0.01, 10.0
 MIN_ALIGNING_SHARE, CONSTRAINT_WEIGHT = 0.4, 100.0
-DRIFT_WEIGHT = 1.0
 CURRENT_WEIGHT = 1e-3
 
 HEADING_ERROR = 0.006  # rad; of a needle's measured pose
@@ -38,6 +40,13 @@ COIL_ERROR = 0.025  # of a coil's field, with its gain estimated
 CORRECTION_TIME = 0.2  # s; within which poses show that the needle is turned from where the field was set for
 MAX_FIELD_ANGLE_SINE = 0.8  # between field and needle; a larger angle turns the needle no faster
 SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above which the command is saturated
+GAIN_DEVIATION = 0.05  # of a calibrated coil
+MAX_CHANGE = 0.2  # of a gain
+DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
+DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and by which a thread turns it from the field
+GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
+MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
+MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 
 
 @dataclass(frozen=True)
@@ -148,7 +157,7 @@ class CoilAllocation:
         gains: by which factor each coil's field differs from its calibration, shape (m,); 1 until something is known.
     """
 
-    def __init__(self, coils: CoilModel, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
+    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, aligning_field: float, max_current: float) -> None:
         # Here, so that it delays no command, and nobody who reads settings alone.
         from scipy.optimize import lsq_linear
 
@@ -227,7 +236,7 @@ class CoilAllocation:
         sideways = min(max_turn_speed, max(-max_turn_speed, sideways))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
-        align_weight, turn_weight = ALIGN_WEIGHT, TURN_WEIGHT * MAX_FIELD_ANGLE_SINE / max_turn_speed
+        align_weight, turn_weight = ALIGN_WEIGHT, MAX_FIELD_ANGLE_SINE / max_turn_speed
         if disturbance is not None:
             align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
@@ -237,23 +246,23 @@ class CoilAllocation:
             growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
             error = HEADING_ERROR * math.exp(growth)
             misaligned = error / HEADING_STEP * (self._drifting(tail, heading, HEADING_STEP) - drifting)
-            effort = np.hypot(effort, DRIFT_WEIGHT / reference_speed * COIL_ERROR * np.hypot(drifting, turned))
+            effort = np.hypot(effort, COIL_ERROR / reference_speed * np.hypot(drifting, turned))
         system = np.vstack(
             [
-                DRIVE_WEIGHT / reference_speed * along,
+                along / reference_speed,
                 turn_weight * to_turn,
                 align_weight / self._field * (e @ mean),
-                DRIFT_WEIGHT / reference_speed * drifting,
-                DRIFT_WEIGHT / reference_speed * misaligned,
+                drifting / reference_speed,
+                misaligned / reference_speed,
                 np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
-        target[0] = DRIVE_WEIGHT / reference_speed * float(velocity @ e)
+        target[0] = float(velocity @ e) / reference_speed
         target[1] = turn_weight * sideways
         target[2] = align_weight
         if disturbance is not None:
-            target[3] = DRIFT_WEIGHT / reference_speed * -disturbance.drift
+            target[3] = -disturbance.drift / reference_speed
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
@@ -282,9 +291,205 @@ class CoilAllocation:
     def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
         """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
         # Most solutions are inside the bounds, where the unconstrained one is optimal.
-        found = solve_by_reflections(system, target)
+        found: Vector = np.linalg.lstsq(system, target, rcond=None)[0].astype(np.float64, copy=False)
         if ((found >= lower) & (found <= upper)).all():
             return found
         # The solver rejects equal bounds; the small gap has no effect.
         bounds = (lower, np.maximum(upper, lower + 1e-9))
         return np.clip(self._solve_bounded(system, target, bounds=bounds, method="bvls").x, lower, upper)
+
+
+class CoilGainEstimator:
+    """Estimates by which factor each coil's field differs from its calibration.
+
+    A needle in a viscous liquid lies along the field within hundredths of a second, so that with the unit vector n
+    across its chord, the currents I and the calibrated field b_i of one ampere in coil i,
+
+        0 = n . sum_i g_i b_i I_i + noise,    of deviation DIRECTION_DEVIATION |B|
+
+    which a Kalman filter with the gains g as its state, 1 with GAIN_DEVIATION at first, takes at each measured pose. A
+    factor on all gains does not show in the direction: their mean stays 1.
+
+    Source: the extended Kalman filter. Deviation: the gains are scaled to their mean after each measurement, their
+    covariance is not. Pure: times come in, in seconds.
+
+    Args:
+        coils: their calibrated field.
+        needle: its kinematics.
+    """
+
+    def __init__(self, coils: LoopCoils, needle: NeedleKinematics) -> None:
+        self._coils, self._needle = coils, needle
+        count = len(coils.names)
+        self.gains = np.ones(count)
+        self._covariance = GAIN_DEVIATION**2 * np.eye(count)
+        self._applied: deque[tuple[float, Vector]] = deque()
+        self._last = -math.inf
+
+    def apply(self, now: float, currents: Vector) -> None:
+        """Register the currents from a time of the stamps' clock on, shape (m,) [A]."""
+        if self._applied and now < self._applied[-1][0]:  # time was set back
+            self._applied.clear()
+            self._last = min(self._last, now)
+        self._applied.append((now, currents))
+
+    def stop(self) -> None:
+        """Register that the currents are zero: nothing holds the needle's direction."""
+        self._applied.clear()
+
+    def update(self, tail: Vector, heading: Vector, stamp: float) -> None:
+        """Take a measured pose.
+
+        Args:
+            tail: shape (2,) [m].
+            heading: unit vector at the tail, shape (2,).
+            stamp: when it was measured [s].
+        """
+        while len(self._applied) > 1 and self._applied[1][0] <= stamp:
+            self._applied.popleft()
+        if not self._applied or self._applied[0][0] > stamp or not self._applied[0][1].any():
+            return
+        e = self._needle.chord_direction(heading)
+        chord = self._needle.chord * e
+        fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * self._applied[0][1]
+        across = fields[1] * e[0] - fields[0] * e[1]
+        deviation = DIRECTION_DEVIATION * float(np.linalg.norm(fields @ self.gains))
+        self._covariance += DRIFT_DEVIATION**2 * min(1.0, max(0.0, stamp - self._last)) * np.eye(len(across))
+        self._last = stamp
+        spread = self._covariance @ across
+        variance = float(across @ spread) + deviation**2
+        residual = -float(across @ self.gains)
+        if residual**2 > GATE**2 * variance:
+            return
+        gains = self.gains + spread * (residual / variance)
+        self.gains = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
+        self._covariance -= np.outer(spread, spread) / variance
+
+
+class CertifiedAllocation:
+    """Allocates currents for a velocity, and reduces them until their motion is certified for the hold time.
+
+    The motion that is certified is that of the currents and of the measured disturbance. Where it is not, as much of
+    the velocity is taken as is, while the currents against the disturbance stay, as far as they are certified without
+    it. Where no currents hold the needle against the disturbance, as on a coil's axis, and that alone is not certified,
+    the velocity is certified by itself: else none would be, not even one along the shape or off the axis. Where nothing
+    is known of a disturbance, all currents are scaled by the certified share.
+
+    A needle cannot turn away from what it lies along, as its other end would come closer. Where a disturbance is
+    measured, the currents therefore take it off sideways by their force across it, see `NeedleSafetyFilter.sidestep`.
+
+    Args:
+        coils: allocate the currents.
+        max_speed: of the needle by the force of the currents, with a slack thread [m/s].
+    """
+
+    def __init__(self, coils: CoilAllocation, max_speed: float) -> None:
+        self._coils = coils
+        self._max_speed = max_speed
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coils' names, in the order of their currents."""
+        return self._coils.names
+
+    def zero(self) -> Allocation:
+        """Return zero currents."""
+        return self._coils.zero()
+
+    def set_gains(self, gains: Vector) -> None:
+        """Set by which factor each coil's field differs from its calibration, shape (m,)."""
+        self._coils.gains = gains
+
+    def chord_direction(self, heading: Vector) -> Vector:
+        """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
+        return self._coils.chord_direction(heading)
+
+    def allocate(
+        self,
+        velocity: Vector,
+        pose: Pose,
+        safety: NeedleSafetyFilter,
+        previous: Allocation,
+        max_change: float,
+        disturbance: MotionDisturbance | None,
+        max_sidestep: float = 0.0,
+    ) -> tuple[Allocation, str]:
+        """Return the currents, and what limits them; empty if nothing does.
+
+        Args:
+            velocity: filtered, of the tip, shape (2,) [m/s].
+            pose: of the needle now.
+            safety: certifies motions.
+            previous: of the last step.
+            max_change: maximum change of each current [A].
+            disturbance: measured, which the currents compensate; None where nothing is measured.
+            max_sidestep: at which the needle may be taken off sideways; never where nothing is measured [m/s].
+        """
+        if disturbance is None:
+            return self._allocate(velocity, pose, safety, previous, max_change, None, 0.0)
+        sidestep = min(max_sidestep, max(-max_sidestep, safety.sidestep(pose.tail, pose.heading)))
+        disturbed = disturbance.velocity(self._coils.chord_direction(pose.heading))
+        best, max_share = (self._coils.zero(), ""), -1.0
+        for step in (sidestep, 0.0) if sidestep else (0.0,):
+            found = self._allocate(velocity, pose, safety, previous, max_change, disturbance, step)
+            motion, drift = found[0].velocity + disturbed, found[0].drift + disturbance.drift
+            share, _ = safety.safe_share(motion, pose.tail, pose.heading, drift)
+            if share > max_share:
+                best, max_share = found, share
+            if share >= MIN_SHARE:
+                break  # else it may be the step that brings the needle too close to something else
+        return best
+
+    def _allocate(
+        self,
+        velocity: Vector,
+        pose: Pose,
+        safety: NeedleSafetyFilter,
+        previous: Allocation,
+        max_change: float,
+        disturbance: MotionDisturbance | None,
+        sidestep: float,
+    ) -> tuple[Allocation, str]:
+        """Return currents for a velocity of the tip, and of the whole needle across its chord; see `allocate`."""
+        disturbed = aside = np.zeros(2)
+        to_compensate = disturbance
+        if disturbance is not None:
+            e = self._coils.chord_direction(pose.heading)
+            disturbed, aside = disturbance.velocity(e), sidestep * np.array([-e[1], e[0]])
+            to_compensate = disturbance._replace(drift=disturbance.drift - sidestep)
+        velocity = velocity + aside - disturbed
+
+        def certified(found: Allocation, added: Vector) -> tuple[float, str]:
+            drift = 0.0 if disturbance is None else found.drift + disturbance.drift
+            return safety.safe_share(found.velocity + added, pose.tail, pose.heading, drift)
+
+        def allocated(target: Vector) -> tuple[Allocation, str]:
+            found = self._coils.allocate(
+                target, pose.tail, pose.heading, previous.currents, max_change, to_compensate, pose.age
+            )
+            speed = self._coils.slack_speed(found, pose.heading)
+            return (found.scaled(self._max_speed / speed), SPEED) if speed > self._max_speed else (found, "")
+
+        target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
+        resting: Allocation | None = None  # against the disturbance alone
+        for _ in range(1 + MAX_CORRECTIONS):
+            found, bound = allocated(target)
+            share, name = certified(found, disturbed)
+            name = name or bound
+            kept, turning = found.scaled(share), found.velocity + disturbed - aside
+            if share < 1.0 and disturbance is not None:
+                resting = resting or allocated(aside - disturbed)[0]
+                if certified(resting, disturbed)[0] < 1.0:
+                    turning, drift = found.velocity - resting.velocity, found.drift - resting.drift
+                    share, name = safety.safe_share(turning, pose.tail, pose.heading, drift)
+                kept = resting.towards(found, share)
+                own, _ = safety.safe_share(kept.velocity, pose.tail, pose.heading, kept.drift)
+                kept = kept.scaled(own)
+            error = math.hypot(*(kept.velocity - velocity))
+            if error < min_error:
+                best, min_error, limiting = kept, error, name
+            if share >= MIN_SHARE:
+                break
+            clear, _ = safety.nearest_clear(turning, pose.tail, pose.heading)
+            target = target - (turning - clear)
+        return best, limiting

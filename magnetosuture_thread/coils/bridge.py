@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.allocation import Allocation
-from magnetosuture_thread.coils.certified_allocation import CertifiedAllocation
+from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
 from magnetosuture_thread.coils.drivers.protocol import DriverState
-from magnetosuture_thread.coils.follow_monitor import FollowMonitor
+from magnetosuture_thread.coils.inputs import (
+    CONSISTENT_POSES,
+    TOPIC,
+    CommandWatchdog,
+    Pose,
+    PoseExtrapolator,
+    PredictionMonitor,
+    StampAges,
+)
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.coils.motion_observer import MotionDisturbance, MotionObserver
-from magnetosuture_thread.coils.pose_extrapolator import CONSISTENT_POSES, TOPIC, Pose, PoseExtrapolator
+from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionDisturbance, MotionObserver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.watchdog import CommandWatchdog, PredictionMonitor, StampAges
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.safety.filter import SPEED, STUCK, FilteredCommand, NeedleSafetyFilter, rest_reason
+from magnetosuture_thread.safety.filter import SPEED, NeedleSafetyFilter, rest_reason
+from magnetosuture_thread.safety.motion import STUCK
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.texts import shortened
 
@@ -78,13 +85,12 @@ class BridgeOutput:
         return "; ".join(self.reasons)
 
 
-@dataclass(frozen=True)
-class _SelectedInput:
+class _SelectedInput(NamedTuple):
     """The input that is followed, or why there is none."""
 
     source: str = ""
     overridden: str = ""
-    velocity: Vector = field(default_factory=lambda: np.zeros(2))
+    velocity: Vector = np.zeros(2)
     problem: str = ""
 
 
@@ -255,7 +261,7 @@ class CoilBridge:
     def final_output(self, reason: str) -> BridgeOutput:
         """Return the zeros with which the bridge ends, for a reason."""
         self._clear()
-        return self._output(_SelectedInput(), (reason,), True, (), 1.0)
+        return self._output(_SelectedInput(), (reason,))
 
     def _step(self, now: float, arrival: float, driver: DriverState) -> BridgeOutput:
         period = 1.0 / self._settings.rate
@@ -263,7 +269,7 @@ class CoilBridge:
         if self.latch.armed and not (driver.ready and driver.losses == self._losses):
             self.latch.trip(f"driver: {driver.problem or 'currents were lost for a moment'}")
         elif self._was_armed and driver.timeout < interval < math.inf:
-            # The needle has gone on and come to rest as nobody knows, which a person must look at.
+            # The needle stopped at an unknown position; an operator must check.
             self.latch.trip(f"the bridge stood still for {interval:.2f} s: the coils stopped by themselves")
         self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
@@ -281,17 +287,15 @@ class CoilBridge:
             reasons = reasons or (self.extrapolator.stale_reason(now, arrival) or NO_POSE,)
             return self._zero_output(now, arrival, selected, reasons, active)
         if self._follow.probe_rate and selected.velocity.any():
-            selected = replace(selected, velocity=self._probe_velocity(pose))
+            selected = selected._replace(velocity=self._probe_velocity(pose))
         if not selected.velocity.any():
             self._follow.end_probe()
             output, self._stopped = replace(self._zero_output(now, arrival, selected, ()), publish=True), None
             return output
-        max_speed = min(
-            self._settings.max_speed, self._settings.speed_without_prediction if no_prediction else math.inf
-        )
-        compensates = self._settings.motion_compensation
+        settings, compensates = self._settings, self._settings.motion_compensation
+        max_speed = min(settings.max_speed, settings.speed_without_prediction if no_prediction else math.inf)
         # The factor is felt by who steers; a needle that drags a real thread on its own is slowed by it already.
-        slowed = selected.source == OPERATOR or self._settings.friction_feedback == "all"
+        slowed = selected.source == OPERATOR or settings.friction_feedback == "all"
         filtered = self._filter.filter(
             selected.velocity,
             pose.tail,
@@ -305,8 +309,8 @@ class CoilBridge:
         )
         active += filtered.active
         if filtered.reason and not compensates:
-            return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered)
-        max_change = self._settings.max_current_slew * elapsed
+            return self._zero_output(now, arrival, selected, (filtered.reason,), active, filtered.slowdown)
+        max_change = settings.max_current_slew * elapsed
         disturbance = self._observer.disturbance(pose.heading) if compensates else None
         sidestep = min(filtered.slowdown * math.hypot(*selected.velocity), max_speed - math.hypot(*filtered.filtered))
         sidestep = max(0.0, sidestep)  # while the needle slows down to another limit it is still faster
@@ -324,7 +328,7 @@ class CoilBridge:
         if (is_stuck and not compensates) or np.abs(allocation.currents).max() < NO_CURRENT:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
-            return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered)
+            return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered.slowdown)
         self._previous, self._velocity, self._stopped = allocation, filtered.filtered, None
         self.extrapolator.apply_velocity(expected, now, arrival, drift)
         n = np.array([-e[1], e[0]])
@@ -336,7 +340,7 @@ class CoilBridge:
         self._follow.register_turn(turn_rate * period)
         if compensates:
             self._gains.apply(now, allocation.currents)
-        return self._output(selected, (), True, active, filtered.slowdown, measured.drift)
+        return self._output(selected, (), active, filtered.slowdown, measured.drift)
 
     def _probe_velocity(self, pose: Pose) -> Vector:
         """Return the tip velocity that turns the needle to see whether it follows, shape (2,) [m/s]."""
@@ -386,39 +390,26 @@ class CoilBridge:
         selected: _SelectedInput,
         reasons: tuple[str, ...],
         active: tuple[str, ...] = (),
-        filtered: FilteredCommand | None = None,
+        slowdown: float = 1.0,
     ) -> BridgeOutput:
         """Return zero currents, without limits on change."""
         self._stopped = arrival if self._stopped is None else self._stopped
         self.rest(now, arrival)
         publish = arrival - self._stopped <= self._settings.zero_hold
-        slowdown = filtered.slowdown if filtered is not None else 1.0
-        return self._output(selected, reasons, publish, active, slowdown)
+        return replace(self._output(selected, reasons, active, slowdown), publish=publish)
 
     def _output(
         self,
         selected: _SelectedInput,
         reasons: tuple[str, ...],
-        publish: bool,
-        active: tuple[str, ...],
-        slowdown: float,
+        active: tuple[str, ...] = (),
+        slowdown: float = 1.0,
         drift: float = 0.0,
     ) -> BridgeOutput:
         """Return the result of a step with the currents and the filtered velocity that it has ended with."""
-        return BridgeOutput(
-            self.coils,
-            self._previous,
-            selected.velocity,
-            self._velocity,
-            reasons,
-            publish,
-            selected.source,
-            selected.overridden,
-            slowdown,
-            active,
-            self.scene_version,
-            drift,
-        )
+        source, overridden, velocity, _ = selected
+        fixed = (self.coils, self._previous, velocity, self._velocity, reasons, True, source, overridden)
+        return BridgeOutput(*fixed, slowdown, active, self.scene_version, drift)
 
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""

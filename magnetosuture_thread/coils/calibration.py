@@ -10,11 +10,11 @@ from typing import Any
 
 import yaml
 
-from magnetosuture_thread.coils.field import FIELD_MODELS, CoilModel, CoilProperties, make_coils
+from magnetosuture_thread.coils.field import CoilProperties
 from magnetosuture_thread.configuration import from_mapping, read_yaml, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
 
-FILE_KIND = "coil calibration"
+MODEL = "loops"  # of the field of a coil
 MIN_COILS = 3  # needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
 REQUIRED_KEYS = ("name", "angle", "distance", "radius", "field_per_current")
@@ -32,23 +32,17 @@ class CoilCalibration:
         name: of the rig.
         date: of the measurement, as text.
         notes: anything else.
-        model: loops or dipoles.
         coils: in the order of their currents.
     """
 
     name: str
     date: str
     notes: str
-    model: str
     coils: tuple[CoilProperties, ...]
-
-    def field(self) -> CoilModel:
-        """Return the field model of the coils."""
-        return make_coils(self.model, self.coils)
 
     def to_yaml(self) -> str:
         """Return the calibration as YAML text."""
-        head = {key: getattr(self, key) for key in (*TEXT_KEYS, "model")}
+        head = {**{key: getattr(self, key) for key in TEXT_KEYS}, "model": MODEL}
         coils = [_rounded(to_mapping(coil)) for coil in self.coils]
         return FILE_HEADER + yaml.dump({**head, "coils": coils}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
@@ -60,21 +54,22 @@ def read_calibration(path: Path) -> CoilCalibration:
         ConfigurationError: the file is unreadable or no YAML, a key is missing or unknown, or a value has the wrong
             type or is out of bounds; with file, key, value and expectation.
     """
-    content, source = read_yaml(path, FILE_KIND), str(path)
+    content, source = read_yaml(path, "coil calibration"), str(path)
     keys = (*TEXT_KEYS, "model", "coils")
     if not isinstance(content, Mapping):
-        raise ConfigurationError(FILE_KIND, content, f"keys {', '.join(keys)}", source)
+        raise ConfigurationError("coil calibration", content, f"keys {', '.join(keys)}", source)
     unknown = next((key for key in content if key not in keys), None)
     if unknown is not None:
         raise ConfigurationError(str(unknown), content[unknown], f"one of {', '.join(keys)}", source)
-    _require_keys(content, ("model", "coils"), "", source)
+    _require_keys(content, ("coils",), "", source)
     texts = {key: content.get(key, "") for key in TEXT_KEYS}
     for key, text in texts.items():
         if not isinstance(text, str):
             raise ConfigurationError(key, text, "text", source)
-    model = content["model"]
-    if not isinstance(model, str) or model not in FIELD_MODELS:
-        raise ConfigurationError("model", model, f"one of {', '.join(FIELD_MODELS)}", source)
+    if content.get("model", MODEL) != MODEL:
+        raise ConfigurationError(
+            "model", content["model"], f"{MODEL}, the only model; calibrate the coils again", source
+        )
     listed = content["coils"]
     if not isinstance(listed, list) or len(listed) < MIN_COILS:
         given = f"{len(listed)} coils" if isinstance(listed, list) else listed
@@ -84,7 +79,7 @@ def read_calibration(path: Path) -> CoilCalibration:
     duplicate = next((name for index, name in enumerate(names) if name in names[:index]), None)
     if duplicate is not None:
         raise ConfigurationError("coils", f"two of the name {duplicate}", "a name of its own for each", source)
-    return CoilCalibration(texts["name"], texts["date"], texts["notes"], model, coils)
+    return CoilCalibration(texts["name"], texts["date"], texts["notes"], coils)
 
 
 def _coil(values: Any, where: str, source: str) -> CoilProperties:

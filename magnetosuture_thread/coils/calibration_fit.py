@@ -1,27 +1,31 @@
-"""Least-squares fit of the coil model to measurements of its field."""
+"""Least-squares fit of the coil model to measurements of its field, which come in a CSV file."""
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from magnetosuture_thread.coils.calibration import MIN_COILS, CoilCalibration
-from magnetosuture_thread.coils.field import FIELD_MODELS, CoilProperties
-from magnetosuture_thread.coils.measurements import ProbeMeasurements
+from magnetosuture_thread.coils.calibration import MIN_COILS, MODEL, CoilCalibration
+from magnetosuture_thread.coils.field import CoilProperties, loop_fields
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.untrusted import MAX_TABLE_BYTES
 
-Array = NDArray[np.float64]
-
+COLUMNS = ("coil", "current", "x", "y", "bx", "by")
+# Values out of these bounds are assumed to have another unit.
+VALUE_BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx": (1.0, "T"), "by": (1.0, "T")}
+MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
 MAX_DISTANCE = 1.0  # m, of a coil
 RADIUS_BOUNDS = (0.002, 0.5)  # m
-DIPOLE_RADIUS = 0.025  # m; placeholder, as a dipole has none
 COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
 START_RATIOS = (1.0, 0.5, 2.0)  # initial distances, relative to that by the field's gradient
 MAX_RELATIVE_RESIDUAL = 0.25  # of the measured field; a larger residual means other coils
@@ -33,6 +37,110 @@ POOR_DEVIATION = {"angle": 0.02, "distance": 0.1, "radius": 0.25, "field_per_cur
 MAX_DEVIATION = {"angle": 0.3, "distance": 1.0, "radius": math.inf, "field_per_current": 0.5}
 
 
+@dataclass(frozen=True, eq=False)
+class ProbeMeasurements:
+    """Readings of a field probe in the dish plane, one coil on at a time.
+
+    Attributes:
+        source: the file.
+        names: of the coils, in the order of their currents.
+        coil: index of the coil that is on, shape (n,).
+        current: in it, shape (n,) [A].
+        points: positions of the probe in the dish frame, shape (n, 2) [m].
+        field: readings along x and y, shape (n, 2) [T].
+        lines: of the file, shape (n,).
+    """
+
+    source: str
+    names: tuple[str, ...]
+    coil: NDArray[np.int64]
+    current: NDArray[np.float64]
+    points: NDArray[np.float64]
+    field: NDArray[np.float64]
+    lines: NDArray[np.int64]
+
+    def location(self, line: int) -> str:
+        """Return file and line number, for an error."""
+        return f"{self.source}, line {line}"
+
+
+def read_measurements(path: Path) -> ProbeMeasurements:
+    """Read measurements from a CSV file with the columns coil, current, x, y, bx, by in any order, in SI units.
+
+    A coil is given by its index, from 0, or as coil_0, and then every index must be there; or by any other
+    name, and then the coils' order is that in which they come. Empty lines and lines that begin with # are
+    ignored.
+
+    Raises:
+        InvalidInputError: the file is unreadable, or a line is invalid; with its number.
+    """
+    try:
+        lines = read_regular(path, MAX_TABLE_BYTES).decode("utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise InvalidInputError(str(path), reason, "a readable CSV file") from None
+    rows = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            rows += [(number, [cell.strip() for cell in cells]) for cells in csv.reader([line])]
+        except csv.Error as error:
+            raise InvalidInputError(f"{path}, line {number}", str(error), "comma-separated values") from None
+    if not rows or sorted(rows[0][1]) != sorted(COLUMNS):
+        where, given = (f"{path}, line {rows[0][0]}", rows[0][1]) if rows else (str(path), "nothing")
+        raise InvalidInputError(where, given, f"the columns {','.join(COLUMNS)}")
+    header = rows.pop(0)[1]
+    if not rows:
+        raise InvalidInputError(str(path), "a header only", "measurements below it")
+    named, numbers = [], []
+    for number, cells in rows:
+        where = f"{path}, line {number}"
+        if len(cells) != len(COLUMNS):
+            raise InvalidInputError(where, f"{len(cells)} values", f"{len(COLUMNS)}: {','.join(header)}")
+        values = dict(zip(header, cells, strict=True))
+        if not values["coil"]:
+            raise InvalidInputError(f"{where}, coil", "nothing", "index or name of the coil that is on")
+        named.append(f"coil_{int(values['coil'])}" if _is_index(values["coil"]) else values["coil"])
+        numbers.append([_number(f"{where}, {column}", values[column], column) for column in COLUMNS[1:]])
+    names, table = _ordered_names(named, path), np.array(numbers)
+    coil = np.array([names.index(name) for name in named], dtype=np.int64)
+    at = np.array([number for number, _ in rows], dtype=np.int64)
+    return ProbeMeasurements(str(path), names, coil, table[:, 0], table[:, 1:3], table[:, 3:], at)
+
+
+def _is_index(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 4
+
+
+def _number(where: str, text: str, column: str) -> float:
+    limit, unit = VALUE_BOUNDS[column]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= limit:
+        raise InvalidInputError(where, text or "nothing", f"a number from {-limit:g} to {limit:g} {unit}")
+    return value
+
+
+def _ordered_names(named: list[str], path: Path) -> tuple[str, ...]:
+    """Return the coils' names in the order of their currents."""
+    names = list(dict.fromkeys(named))
+    if len(names) > MAX_COILS:
+        raise InvalidInputError(f"{path}, coil", f"{len(names)} coils", f"at most {MAX_COILS}")
+    if not all(name.startswith("coil_") and _is_index(name.removeprefix("coil_")) for name in names):
+        return tuple(names)
+    wanted = [f"coil_{k}" for k in range(len(names))]
+    if set(names) != set(wanted):
+        missing = next(name for name in wanted if name not in names)
+        raise InvalidInputError(f"{path}, coil", f"nothing of {missing}", "measurements of every coil, from 0 on")
+    return tuple(wanted)
+
+
+Array = NDArray[np.float64]
+
+
 @dataclass(frozen=True)
 class CalibrationFit:
     """Result of a calibration fit.
@@ -40,7 +148,7 @@ class CalibrationFit:
     Attributes:
         calibration: the coils.
         deviations: standard deviations of angle [rad], distance [m], radius [m] and field per current [T/A]
-            of each coil, shape (m, 4); not a number where the model has no such parameter.
+            of each coil, shape (m, 4).
         poor: names of the poorly determined parameters of each coil.
         background: reading of the probe without currents, shape (2,) [T].
         residual: root mean square of the difference of a component [T].
@@ -67,7 +175,7 @@ class CalibrationFit:
             for coil, row, poor in zip(self.calibration.coils, self.deviations.tolist(), self.poor, strict=True)
         ]
         return {
-            "model": self.calibration.model,
+            "model": MODEL,
             "coils": coils,
             "background": self.background.tolist(),
             "residual": self.residual,
@@ -76,18 +184,17 @@ class CalibrationFit:
         }
 
 
-def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> CalibrationFit:
-    """Fit the coils of a model, and a background, to measurements.
+def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
+    """Fit coils as loops of current, and a background, to measurements.
 
         min  sum | B_0 + I_i b(p_i; angle, distance, radius, field) - B_i |^2
 
-    over four numbers of each coil (three of a dipole) and the background B_0 of earth and probe, which is
+    over four numbers of each coil and the background B_0 of earth and probe, which is
     the same in all. First coil by coil, from several starts and both polarities, then all at once. The
     standard deviations are those of least squares, s^2 (J^T J)^-1, with the scatter s of the residuals.
 
     Args:
         data: readings in the dish.
-        model: loops or dipoles.
 
     Raises:
         InvalidInputError: too few coils or readings, points beyond a coil, unidentifiable
@@ -99,8 +206,8 @@ def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> Calibratio
     size = float(np.sqrt(np.mean(data.field[data.current != 0.0] ** 2)))
     off = data.field[data.current == 0.0]
     background = off.mean(axis=0) if len(off) else np.zeros(2)
-    starts = [_start(data, index, model, background, size) for index in range(len(data.names))]
-    solve = _Problem(data, np.arange(len(data.names)), model, size)
+    starts = [_start(data, index, background, size) for index in range(len(data.names))]
+    solve = _Problem(data, np.arange(len(data.names)), size)
     found = solve.best([np.concatenate([*starts, background / size])], JOINT_TOLERANCE)
     difference = size * found.fun.reshape(-1, 2)
     residual = float(np.sqrt(np.mean(difference**2)))
@@ -108,11 +215,11 @@ def fit_calibration(data: ProbeMeasurements, model: str = "loops") -> Calibratio
         given = f"a field that differs from the model's by {residual / size:.0%}"
         raise InvalidInputError(data.source, given, "one coil on at a time, in the dish frame, in SI units")
     coils = [_coil(data, index, found.x, size, difference) for index in range(len(data.names))]
-    deviations = _deviations(data, coils, model, found.jac, size, residual / size)
+    deviations = _deviations(data, coils, found.jac, size, residual / size)
     distances = np.linalg.norm(difference, axis=1)
     worst = int(np.argmax(distances))
     return CalibrationFit(
-        CoilCalibration("", "", "", model, tuple(coils)),
+        CoilCalibration("", "", "", tuple(coils)),
         deviations,
         tuple(_exceeding(coil, row, POOR_DEVIATION) for coil, row in zip(coils, deviations, strict=True)),
         size * found.x[-2:],
@@ -140,15 +247,14 @@ class _Problem:
     The numbers are, for each coil, angle, log distance, log radius and field / size; then the background / size.
     """
 
-    def __init__(self, data: ProbeMeasurements, coils: NDArray[np.int64], model: str, size: float) -> None:
+    def __init__(self, data: ProbeMeasurements, coils: NDArray[np.int64], size: float) -> None:
         rows = np.flatnonzero(np.isin(data.coil, coils))
         self._of = np.searchsorted(coils, data.coil[rows])
         self._points, self._current = data.points[rows], data.current[rows, None]
-        self._field, self._model = data.field[rows] / size, FIELD_MODELS[model]
+        self._field = data.field[rows] / size
         nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
-        radii = RADIUS_BOUNDS if model == "loops" else (DIPOLE_RADIUS, 1.000001 * DIPOLE_RADIUS)
-        low = [-np.inf, math.log(nearest), math.log(radii[0]), -np.inf]
-        high = [np.inf, math.log(max(MAX_DISTANCE, 2.0 * nearest)), math.log(radii[1]), np.inf]
+        low = [-np.inf, math.log(nearest), math.log(RADIUS_BOUNDS[0]), -np.inf]
+        high = [np.inf, math.log(max(MAX_DISTANCE, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf]
         count = len(coils)
         self._bounds = (np.array(low * count + [-np.inf] * 2), np.array(high * count + [np.inf] * 2))
 
@@ -158,20 +264,9 @@ class _Problem:
         if not background:  # which one coil alone might not tell from its own field
             low, high = low.copy(), high.copy()
             low[-2:], high[-2:] = starts[0][-2:] - 1e-9, starts[0][-2:] + 1e-9
-        found = [
-            least_squares(
-                self._residuals,
-                np.clip(start, low, high),
-                jac="3-point",
-                bounds=(low, high),
-                x_scale="jac",
-                ftol=tolerance,
-                xtol=tolerance,
-                gtol=tolerance,
-                max_nfev=300,
-            )
-            for start in starts
-        ]
+        tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
+        options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
+        found = [least_squares(self._residuals, np.clip(start, low, high), max_nfev=300, **options) for start in starts]
         return min(found, key=lambda solution: float(solution.cost))
 
     def _residuals(self, x: Array) -> Array:
@@ -180,12 +275,12 @@ class _Problem:
         axis = np.column_stack([np.cos(angle), np.sin(angle)])
         across = np.column_stack([-axis[:, 1], axis[:, 0]])
         along, aside = np.sum(self._points * axis, axis=1), np.sum(self._points * across, axis=1)
-        axial, outwards = self._model(along, aside, distance, radius, field)
+        axial, outwards = loop_fields(along, aside, distance, radius, field)
         of_coil = self._current * (axial[:, None] * axis + outwards[:, None] * across)
         return np.asarray((x[-2:] + of_coil - self._field).ravel())
 
 
-def _start(data: ProbeMeasurements, index: int, model: str, background: Array, size: float) -> Array:
+def _start(data: ProbeMeasurements, index: int, background: Array, size: float) -> Array:
     """Return initial parameters of a coil from its own readings, without the background."""
     on = (data.coil == index) & (data.current != 0.0)
     per_current = (data.field[on] - background) / data.current[on, None]
@@ -203,7 +298,7 @@ def _start(data: ProbeMeasurements, index: int, model: str, background: Array, s
         for share in START_RATIOS
         for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
     ]
-    alone = _Problem(data, np.array([index]), model, size)
+    alone = _Problem(data, np.array([index]), size)
     found = alone.best(
         [np.concatenate([start, background / size]) for start in starts], COIL_TOLERANCE, background=False
     )
@@ -231,27 +326,21 @@ def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference
 
 
 def _deviations(
-    data: ProbeMeasurements, coils: list[CoilProperties], model: str, jacobian: Array, size: float, residual: float
+    data: ProbeMeasurements, coils: list[CoilProperties], jacobian: Array, size: float, residual: float
 ) -> Array:
     """Return standard deviations, shape (m, 4); reject unidentifiable parameters."""
-    used = np.ones(jacobian.shape[1], dtype=bool)
-    if model == "dipoles":
-        used[2:-2:4] = False
-    own = jacobian[:, used]
-    scale = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
-    _, values, turned = np.linalg.svd(own / scale, full_matrices=False)
+    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    _, values, turned = np.linalg.svd(jacobian / scale, full_matrices=False)
     labels = [f"{coil.name}.{name}" for coil in coils for name in PARAMETERS] + ["background x", "background y"]
     if values[-1] < MIN_SINGULAR_VALUE * values[0]:
         weights = np.abs(turned[-1])
-        mixed = [label for label, weight in zip(np.array(labels)[used], weights, strict=True) if weight > 0.3]
+        mixed = [label for label, weight in zip(labels, weights, strict=True) if weight > 0.3]
         words = "readings that tell them apart: all over the dish, and some without current"
         raise InvalidInputError(data.source, f"nothing that tells {', '.join(mixed)}", words)
-    freedom = max(1, len(own) - own.shape[1])
-    scatter = residual * math.sqrt(len(own) / freedom)
-    deviations = np.full(len(used), np.nan)
-    deviations[used] = scatter * np.linalg.norm(turned.T / values, axis=1) / scale
-    shaped = deviations[:-2].reshape(-1, 4)
-    shaped = shaped * np.array([[1.0, coil.distance, coil.radius, size] for coil in coils])
+    count, parameters = jacobian.shape
+    scatter = residual * math.sqrt(count / max(1, count - parameters))
+    deviations = scatter * np.linalg.norm(turned.T / values, axis=1) / scale
+    shaped = deviations[:-2].reshape(-1, 4) * np.array([[1.0, coil.distance, coil.radius, size] for coil in coils])
     for coil, row in zip(coils, shaped, strict=True):
         unknown = _exceeding(coil, row, MAX_DEVIATION)
         if unknown:

@@ -12,9 +12,8 @@ import numpy as np
 from magnetosuture_thread.barrier import import_barriers
 from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
-from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.coils.latch import ArmingLatch, RecordedState, StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.stop_record import RecordedState, StopRecord
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,21 +67,6 @@ def coils_around(angles: Sequence[float], distance: float, radius: float, field:
     return tuple(CoilProperties(f"coil_{k}", a, distance, radius, field) for k, a in enumerate(angles))
 
 
-class CoilModel(Protocol):
-    """Field model of several coils.
-
-    Attributes:
-        names: of the coils, in the order of their currents.
-    """
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the coils, in the order of their currents."""
-
-    def per_current(self, point: Vector) -> NDArray[np.float64]:
-        """Return the field at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-
-
 @compiled
 def _elliptic_integrals(p: float) -> tuple[float, float]:
     """Return the complete elliptic integrals K and E of the parameter 1 - p, for 0 < p <= 1.
@@ -141,80 +126,41 @@ def loop_field(along: float, aside: float, distance: float, radius: float, field
 
 
 @compiled
-def dipole_field(along: float, aside: float, distance: float, radius: float, field: float) -> tuple[float, float]:
-    """Return the field of a dipole in the coil's middle, along its axis; see `loop_field` for the arguments.
-
-        B = M (3 (u . r) r - |r|^2 u) / |r|^5,    M = field distance^3 / 2
-
-    with r from the coil's middle and the axis u. The radius has no effect. Near a coil, at less than
-    twice its radius, its field is weaker than a dipole's.
-
-    Source: the field of a magnetic dipole.
-    """
-    z = along - distance
-    square = z**2 + aside**2
-    scale = 0.5 * field * distance**3 / square**2.5
-    return scale * (3.0 * z**2 - square), scale * (3.0 * z * aside)
-
-
-@compiled
-def _each(
-    loops: bool, along: Vector, aside: Vector, distance: Vector, radius: Vector, field: Vector, found: Vector
-) -> None:
-    """Write the field of loops, else dipoles, element by element, shape (2, k); see `loop_field`."""
+def loop_fields(along: Vector, aside: Vector, distance: Vector, radius: Vector, field: Vector) -> NDArray[np.float64]:
+    """Return `loop_field` for each element of arrays of shape (k,), shape (2, k)."""
+    found = np.empty((2, len(along)))
     for k in range(len(along)):
-        if loops:
-            found[0, k], found[1, k] = loop_field(along[k], aside[k], distance[k], radius[k], field[k])
-        else:
-            found[0, k], found[1, k] = dipole_field(along[k], aside[k], distance[k], radius[k], field[k])
-
-
-def _over_arrays(loops: bool) -> Callable[[Vector, Vector, Vector, Vector, Vector], tuple[Vector, Vector]]:
-    def over(along: Vector, aside: Vector, distance: Vector, radius: Vector, field: Vector) -> tuple[Vector, Vector]:
-        found = np.empty((2, len(along)))
-        _each(loops, along, aside, distance, radius, field, found)
-        return found[0], found[1]
-
-    return over
-
-
-FIELD_MODELS = {"loops": _over_arrays(True), "dipoles": _over_arrays(False)}
-"""Over arrays of shape (k,), each with the arguments of `loop_field` and `dipole_field`."""
+        found[0, k], found[1, k] = loop_field(along[k], aside[k], distance[k], radius[k], field[k])
+    return found
 
 
 @compiled
-def _fields(
-    x: float,
-    y: float,
-    axes: NDArray[np.float64],
-    numbers: NDArray[np.float64],
-    loops: bool,
-    found: NDArray[np.float64],
-) -> None:
-    """Write the field at a point for one ampere in each coil, shape (2, m).
+def _fields(x: float, y: float, axes: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the field at a point for one ampere in each coil, shape (2, m).
 
     Args:
         x: of the point [m].
         y: of the point [m].
         axes: unit vectors to the coils, shape (2, m).
         numbers: distance, radius and field at the dish's centre of each coil, shape (3, m).
-        loops: whether the coils are loops, else dipoles.
-        found: written.
     """
+    found = np.empty(axes.shape)
     for k in range(axes.shape[1]):
         ux, uy = axes[0, k], axes[1, k]
-        along, aside = ux * x + uy * y, ux * y - uy * x
-        if loops:
-            b, c = loop_field(along, aside, numbers[0, k], numbers[1, k], numbers[2, k])
-        else:
-            b, c = dipole_field(along, aside, numbers[0, k], numbers[1, k], numbers[2, k])
+        b, c = loop_field(ux * x + uy * y, ux * y - uy * x, numbers[0, k], numbers[1, k], numbers[2, k])
         found[0, k], found[1, k] = b * ux - c * uy, b * uy + c * ux
+    return found
 
 
-class _Coils:
-    """Coils around the dish with one field model."""
+class LoopCoils:
+    """Coils around the dish as loops of current; see `loop_field`.
 
-    MODEL: ClassVar[str] = "loops"
+    Args:
+        coils: their properties.
+
+    Attributes:
+        names: of the coils, in the order of their currents.
+    """
 
     def __init__(self, coils: Sequence[CoilProperties]) -> None:
         self.names = tuple(coil.name for coil in coils)
@@ -224,29 +170,4 @@ class _Coils:
 
     def per_current(self, point: Vector) -> NDArray[np.float64]:
         """Return the field at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-        found = np.empty(self._axes.shape)
-        _fields(float(point[0]), float(point[1]), self._axes, self._numbers, self.MODEL == "loops", found)
-        return found
-
-
-class LoopCoils(_Coils):
-    """Coils as loops of current; see `loop_field`.
-
-    Args:
-        coils: their properties.
-    """
-
-
-class DipoleCoils(_Coils):
-    """Coils as dipoles; see `dipole_field`.
-
-    Args:
-        coils: their properties.
-    """
-
-    MODEL: ClassVar[str] = "dipoles"
-
-
-def make_coils(model: str, coils: Sequence[CoilProperties]) -> CoilModel:
-    """Return coils by the name of their model, loops or dipoles."""
-    return DipoleCoils(coils) if model == "dipoles" else LoopCoils(coils)
+        return np.asarray(_fields(float(point[0]), float(point[1]), self._axes, self._numbers))

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import ClassVar
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
+from magnetosuture_thread.coils.allocation import CoilAllocation, CoilGainEstimator, NeedleMechanics
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
-from magnetosuture_thread.coils.field import CoilModel, CoilProperties, coils_around, make_coils
-from magnetosuture_thread.coils.gain_estimator import CoilGainEstimator
+from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
 from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
@@ -108,9 +107,6 @@ class CoilBridgeSettings(Configuration):
 
     calibration: str = quantity(
         "", "file of the coils' calibration, from the working directory; it replaces the coil parameters"
-    )
-    coil_model: str = quantity(
-        "loops", "field model of a coil: a current loop, or a dipole at its centre", choices=("loops", "dipoles")
     )
     field_per_current: float = quantity(
         1.2e-3, "field of one coil at the dish's centre, for each ampere in it", unit="T/A", minimum=1e-6, maximum=1.0
@@ -226,10 +222,9 @@ class CoilBridgeSettings(Configuration):
         """Return the allocation of velocities to currents."""
         return CoilAllocation(self.coil_field(), self.needle(), self.aligning_field, self.max_current)
 
-    def coil_field(self) -> CoilModel:
+    def coil_field(self) -> LoopCoils:
         """Return the coils' field, as calibrated or by their geometry."""
-        model = self.coil_model if self._calibration is None else self._calibration.model
-        return make_coils(model, self.coils_properties())
+        return LoopCoils(self.coils_properties())
 
     def gain_estimator(self) -> CoilGainEstimator:
         """Return what estimates the coils' gains."""

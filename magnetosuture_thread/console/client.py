@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
+import struct
+from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Any
 
 from aiohttp import WSMsgType, web
 
-from magnetosuture_thread.console import client_messages as messages
 from magnetosuture_thread.console.access import same_token
+from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
 from magnetosuture_thread.console.graph import Graph, Host
-from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
-from magnetosuture_thread.console.outbox import Message, Outbox
+from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController, Velocity
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 
@@ -24,14 +26,77 @@ MAX_LATE_TIME = 1.0  # after which a page whose messages are all late must recon
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
 MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without the token is disconnected
 MAX_RECEIPT_CHARS = 100
-ACKNOWLEDGE, VISIBILITY = '"acknowledge"', '"visibility"'  # all that such a page has to say
 MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connection is closed
-EMERGENCY_STOP, DISARM = messages.BridgeAction("stop"), messages.BridgeAction("disarm")
-MAX_PENDING_REQUESTS = 4  # of one page, besides emergency stops
-UNLEASED_ACTIONS = ("stop", "disarm")  # allowed for every page with the token, with or without control
-UNLEASED_PROCEDURE_ACTIONS = ("pause", "abort")  # the same
+MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
+MAX_UNACKNOWLEDGED = 2  # states in flight, and frames
+MAX_REPLIES = 64
+FRAME_HEADER = struct.Struct(">Q")  # number of a camera frame, before its bytes
+EMERGENCY_STOP = ClientMessage("bridge_action", {"action": "stop"})
+# Allowed for every page with the token, with or without control.
+UNLEASED = ("stop", "disarm", "pause procedure", "abort procedure")
+WITHOUT_STOP = ("record", "arm")  # requests that end no jog
 
+Message = str | bytes
 Reply = Callable[[str, str], None]
+
+
+class Outbox:
+    """Queue of the messages to one page: replies in order, of states and camera frames only the latest.
+
+    A page acknowledges each state and frame. At most `MAX_UNACKNOWLEDGED` of a kind are in flight, so a slow page
+    receives fewer of them, and none of them late.
+    """
+
+    def __init__(self) -> None:
+        self._replies: deque[str] = deque(maxlen=MAX_REPLIES)
+        self._latest: dict[str, Message] = {}
+        self._in_flight = {"state": 0, "frame": 0}
+
+    def reply(self, text: str) -> None:
+        """Queue a reply; the oldest of too many is dropped."""
+        self._replies.append(text)
+
+    def put(self, kind: str, message: Message) -> None:
+        """Set the latest `state` or `frame`; it replaces one that was not sent."""
+        self._latest[kind] = message
+
+    def acknowledge(self, kind: str) -> bool:
+        """Register that the page received a `state` or `frame`; return whether one was in flight."""
+        was_in_flight = self._in_flight[kind] > 0
+        self._in_flight[kind] -= was_in_flight
+        return was_in_flight
+
+    def next(self) -> Message | None:
+        """Return the next message to send, None while there is none or the page is behind."""
+        if self._replies:
+            return self._replies.popleft()
+        for kind in ("state", "frame"):
+            if kind in self._latest and self._in_flight[kind] < MAX_UNACKNOWLEDGED:
+                self._in_flight[kind] += 1
+                return self._latest.pop(kind)
+        return None
+
+
+def encode_state(graph: dict[str, Any], host: dict[str, Any], lease: dict[str, Any]) -> str:
+    """Encode the state of graph, host and lease as JSON; numbers that are not finite become null."""
+    state = {"type": "state", "graph": graph, "host": host, "lease": lease}
+    try:
+        return json.dumps(state, allow_nan=False, separators=(",", ":"))
+    except ValueError:
+        return json.dumps(_finite(state), allow_nan=False, separators=(",", ":"))
+
+
+def encode_frame(number: int, image: bytes) -> bytes:
+    """Encode a camera frame: its number in 8 bytes, big endian, then the image."""
+    return FRAME_HEADER.pack(number) + image
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class RequestHandler:
@@ -47,7 +112,7 @@ class RequestHandler:
         self._graph, self._host, self._jog = graph, host, jog
         self._pending: dict[asyncio.Task[None], int] = {}
 
-    def start(self, client: int, message: messages.ClientMessage, operator: str, reply: Reply) -> None:
+    def start(self, client: int, message: ClientMessage, operator: str, reply: Reply) -> None:
         """Start a request of a page with the token.
 
         Args:
@@ -59,16 +124,12 @@ class RequestHandler:
         Raises:
             InvalidInputError: the request needs control, or too many are pending.
         """
-        unleased = isinstance(message, messages.BridgeAction) and message.action in UNLEASED_ACTIONS
-        if isinstance(message, messages.ProcedureRequest):
-            unleased = message.action in UNLEASED_PROCEDURE_ACTIONS
+        name, unleased = message.request, message.request in UNLEASED
         if not unleased and client != self._jog.holder:
-            raise InvalidInputError(_name(message), "a page without control", "one with control: take control first")
+            raise InvalidInputError(name, "a page without control", "one with control: take control first")
         if not unleased and list(self._pending.values()).count(client) >= MAX_PENDING_REQUESTS:
-            raise InvalidInputError(
-                _name(message), f"{MAX_PENDING_REQUESTS} pending requests", "a reply to one of them first"
-            )
-        if not isinstance(message, messages.RecordBag) and message != messages.BridgeAction("arm"):
+            raise InvalidInputError(name, f"{MAX_PENDING_REQUESTS} pending requests", "a reply to one of them first")
+        if name not in WITHOUT_STOP:
             self._jog.stop()
         task = asyncio.create_task(self._execute(message, operator, reply))
         self._pending[task] = client
@@ -81,31 +142,26 @@ class RequestHandler:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _execute(self, message: messages.ClientMessage, operator: str, reply: Reply) -> None:
+    async def _execute(self, message: ClientMessage, operator: str, reply: Reply) -> None:
         try:
             refusal = await self._request(message, operator)
         except MagnetosutureError as error:
             refusal = str(error)
-        reply(_name(message), refusal)
+        reply(message.request, refusal)
 
-    def _request(self, message: messages.ClientMessage, operator: str) -> Awaitable[str]:
-        if isinstance(message, messages.BridgeAction):
-            return self._graph.execute_action(message.action)
-        if isinstance(message, messages.ProcedureRequest):
-            return self._graph.execute_procedure(message.action, message.procedure, message.hold_to_run)
-        if isinstance(message, messages.SelectSetup):
-            return self._host.select_setup(message.setup)
-        if isinstance(message, messages.Pause):
-            return self._host.set_paused(message.paused)
-        if isinstance(message, messages.RecordBag):
-            return self._host.set_recording(message.recording, operator)
-        raise InvalidInputError("message", _name(message), "a request")
-
-
-def _name(message: messages.ClientMessage) -> str:
-    if isinstance(message, messages.ProcedureRequest):
-        return f"{message.action} procedure"
-    return message.action if isinstance(message, messages.BridgeAction) else message.TYPE
+    def _request(self, message: ClientMessage, operator: str) -> Awaitable[str]:
+        values = message.values
+        if message.type == "bridge_action":
+            return self._graph.execute_action(values["action"])
+        if message.type == "procedure":
+            return self._graph.execute_procedure(values["action"], values["procedure"], values["hold_to_run"])
+        if message.type == "select_setup":
+            return self._host.select_setup(values["setup"])
+        if message.type == "pause":
+            return self._host.set_paused(values["paused"])
+        if message.type == "record":
+            return self._host.set_recording(values["recording"], operator)
+        raise InvalidInputError("message", message.type, "a request")
 
 
 class Client:
@@ -172,7 +228,8 @@ class Client:
             if self._jog.holder == self.number:
                 self._jog.release_control(self.number)
                 # Nobody is there who would see what the needle does.
-                self._requests.start(self.number, DISARM, "nobody", lambda name, refusal: None)
+                disarm = ClientMessage("bridge_action", {"action": "disarm"})
+                self._requests.start(self.number, disarm, "nobody", lambda name, refusal: None)
             if sending is not None:
                 sending.cancel()
                 await asyncio.gather(sending, return_exceptions=True)
@@ -187,27 +244,27 @@ class Client:
             parsed = self._read(message.type, message.data)
         except (asyncio.TimeoutError, InvalidInputError):
             parsed = None
-        if not isinstance(parsed, messages.Hello):
+        if parsed is None or parsed.type != "hello":
             await self._socket.close(code=1008, message=b"expected hello first")
             return False
-        self._can_command = self.has_token = same_token(parsed.token, self._token)
+        self._can_command = self.has_token = same_token(token := parsed.values["token"], self._token)
         # Programs other than browsers name no origin.
-        self.is_script = parsed.automated is not False or not self._request.headers.get("Origin")
+        self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
         settings = self._settings
         self._reply(
             "welcome",
             client=self.number,
             can_command=self._can_command,
-            refusal="the token is wrong" if parsed.token and not self._can_command else "",
+            refusal="the token is wrong" if token and not self._can_command else "",
             speed=settings.speed,
             max_speed=settings.max_speed,
         )
         return True
 
-    def _read(self, kind: WSMsgType, data: Any) -> messages.ClientMessage:
+    def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
         if kind is not WSMsgType.TEXT:
             raise InvalidInputError("message", kind.name.lower(), "text")
-        return messages.parse_client_message(data, self._settings.max_speed)
+        return parse_client_message(data, self._settings.max_speed)
 
     async def _on_ping(self, kind: WSMsgType, data: bytes) -> None:
         """Answer a ping, and count it like any message: no page sends one, but other programs may."""
@@ -226,8 +283,8 @@ class Client:
             parsed = self._read(kind, data)
             if exceeded and parsed != EMERGENCY_STOP:
                 raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
-            if isinstance(parsed, messages.Acknowledge):
-                self._outbox.acknowledge(parsed.kind)
+            if parsed.type == "acknowledge":
+                self._outbox.acknowledge(parsed.values["kind"])
                 self._wake.set()
             else:
                 await self._dispatch(parsed, now)
@@ -240,32 +297,32 @@ class Client:
     async def _on_watcher_message(self, kind: WSMsgType, data: Any) -> None:
         """Handle a message of a page without the token: receipts count, all else is not even parsed."""
         text = data[:MAX_RECEIPT_CHARS] if kind is WSMsgType.TEXT else ""
-        if ACKNOWLEDGE in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
+        if '"acknowledge"' in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
             self._wake.set()
             return
         self._count_message(asyncio.get_running_loop().time())
         if self._message_count > MAX_WATCHER_RATE:
             self._abort()  # at once, without the formalities of closing
-        elif VISIBILITY not in text:
+        elif '"visibility"' not in text:
             expected = "the one in the console's address: this page only watches"
             self._reply("error", text=str(InvalidInputError("token", "none", expected)))
 
-    async def _dispatch(self, message: messages.ClientMessage, now: float) -> None:
-        if isinstance(message, messages.Jog):
-            await self._on_jog(message, now)
-        elif isinstance(message, messages.HoldProcedure):
-            if self._in_time(message.sent, now) and self._jog.holder == self.number:
+    async def _dispatch(self, message: ClientMessage, now: float) -> None:
+        values = message.values
+        if message.type == "jog":
+            await self._on_jog(values["velocity"], values["sent"], now)
+        elif message.type == "hold":
+            if self._in_time(values["sent"], now) and self._jog.holder == self.number:
                 self._hold()
-        elif isinstance(message, messages.EndJog):
+        elif message.type == "end_jog":
             self._jog.end_jog(self.number)
-        elif isinstance(message, messages.AcquireControl):
-            refusal = self._jog.acquire_control(self.number)
-            self._reply("result", request=message.TYPE, refusal=refusal)
-        elif isinstance(message, messages.ReleaseControl):
+        elif message.type == "acquire_control":
+            self._reply("result", request=message.type, refusal=self._jog.acquire_control(self.number))
+        elif message.type == "release_control":
             self._jog.release_control(self.number)
-        elif isinstance(message, messages.Visibility):
-            self._jog.set_visible(self.number, message.visible)
-        elif not isinstance(message, (messages.Hello, messages.Acknowledge)):
+        elif message.type == "visibility":
+            self._jog.set_visible(self.number, values["visible"])
+        elif message.type != "hello":
             self._requests.start(
                 self.number,
                 message,
@@ -273,9 +330,9 @@ class Client:
                 lambda name, refusal: self._reply("result", request=name, refusal=refusal),
             )
 
-    async def _on_jog(self, message: messages.Jog, now: float) -> None:
-        if self._in_time(message.sent, now):
-            if not self._jog.jog(self.number, message.velocity):
+    async def _on_jog(self, velocity: Velocity, sent: float, now: float) -> None:
+        if self._in_time(sent, now):
+            if not self._jog.jog(self.number, velocity):
                 self._reply("error", text="jog: this page does not have control; take control first")
             return
         self._jog.interrupt(self.number)

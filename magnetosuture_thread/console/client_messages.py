@@ -4,184 +4,34 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from dataclasses import fields as dataclass_fields
-from typing import Any, ClassVar, NoReturn, cast
+from typing import Any, NoReturn
 
-from magnetosuture_thread.console.jog_controller import Velocity
 from magnetosuture_thread.errors import InvalidInputError
 
 MAX_MESSAGE_CHARS = 4096
 MAX_SHOWN_CHARS = 60  # of an invalid value in the error
 
 
-def _text() -> Any:
-    return field(metadata={"valid": lambda value: isinstance(value, str), "expected": "a text"})
-
-
-def _switch() -> Any:
-    return field(metadata={"valid": lambda value: isinstance(value, bool), "expected": "true or false"})
-
-
-def _choice(*choices: str) -> Any:
-    return field(metadata={"valid": lambda value: value in choices, "expected": "one of " + ", ".join(choices)})
-
-
+@dataclass(frozen=True)
 class ClientMessage:
-    """Base class of the messages.
+    """A valid message.
 
     Attributes:
-        TYPE: value of the field `type`.
+        type: one of `FIELDS`.
+        values: of its fields by name; of a jog, `velocity` [m/s] in place of direction and speed.
     """
 
-    TYPE: ClassVar[str]
+    type: str
+    values: Mapping[str, Any] = field(default_factory=dict)
 
-    @classmethod
-    def parse(cls, fields: dict[str, Any], max_speed: float) -> ClientMessage:
-        """Return the message of these fields; see `parse_client_message`."""
-        values = {own.name: (fields.get(own.name), own.metadata) for own in dataclass_fields(cast(Any, cls))}
-        for name, (value, metadata) in values.items():
-            if not metadata["valid"](value):
-                raise _refusal(name, value, metadata["expected"])
-        return cls(**{name: value for name, (value, _) in values.items()})
-
-
-@dataclass(frozen=True)
-class Hello(ClientMessage):
-    """First message of a page.
-
-    Attributes:
-        token: empty for a page that only watches.
-        automated: whether a script drives the browser, as this says of itself; None if it is no browser.
-    """
-
-    TYPE = "hello"
-    token: str = _text()
-    automated: bool | None = field(
-        default=None,
-        metadata={"valid": lambda value: value is None or isinstance(value, bool), "expected": "true, false or null"},
-    )
-
-
-@dataclass(frozen=True)
-class Jog(ClientMessage):
-    """Jog command while a direction is held.
-
-    Attributes:
-        velocity: commanded velocity [m/s].
-        sent: time of sending by the page's clock [s].
-    """
-
-    TYPE = "jog"
-    velocity: Velocity
-    sent: float
-
-    @classmethod
-    def parse(cls, fields: dict[str, Any], max_speed: float) -> Jog:
-        """Return the message of these fields; see `parse_client_message`."""
-        return cls(_velocity(fields, max_speed), _finite("sent", fields.get("sent")))
-
-
-@dataclass(frozen=True)
-class EndJog(ClientMessage):
-    """End of a jog: nothing is held any more."""
-
-    TYPE = "end_jog"
-
-
-@dataclass(frozen=True)
-class Acknowledge(ClientMessage):
-    """Receipt of a state or a camera frame; the next may be sent."""
-
-    TYPE = "acknowledge"
-    kind: str = _choice("state", "frame")
-
-
-@dataclass(frozen=True)
-class Visibility(ClientMessage):
-    """Whether the page is visible or hidden."""
-
-    TYPE = "visibility"
-    visible: bool = _switch()
-
-
-@dataclass(frozen=True)
-class AcquireControl(ClientMessage):
-    """Request for the control lease."""
-
-    TYPE = "acquire_control"
-
-
-@dataclass(frozen=True)
-class ReleaseControl(ClientMessage):
-    """Release of the control lease."""
-
-    TYPE = "release_control"
-
-
-@dataclass(frozen=True)
-class BridgeAction(ClientMessage):
-    """Request to the coil bridge: arm, disarm, stop or reset."""
-
-    TYPE = "bridge_action"
-    action: str = _choice("arm", "disarm", "stop", "reset")
-
-
-@dataclass(frozen=True)
-class SelectSetup(ClientMessage):
-    """Request to run another setup."""
-
-    TYPE = "select_setup"
-    setup: str = _text()
-
-
-@dataclass(frozen=True)
-class Pause(ClientMessage):
-    """Request to pause or resume time."""
-
-    TYPE = "pause"
-    paused: bool = _switch()
-
-
-@dataclass(frozen=True)
-class RecordBag(ClientMessage):
-    """Request to start or end a recording."""
-
-    TYPE = "record"
-    recording: bool = _switch()
-
-
-@dataclass(frozen=True)
-class ProcedureRequest(ClientMessage):
-    """Request to the needle planner: plan a procedure, begin or resume it, pause it, or give it up.
-
-    Attributes:
-        action: what is requested.
-        procedure: its name, for a plan; empty else.
-        hold_to_run: for a plan, whether the needle moves only while the page is held.
-    """
-
-    TYPE = "procedure"
-    action: str = _choice("plan", "resume", "pause", "abort")
-    procedure: str = _text()
-    hold_to_run: bool = _switch()
-
-
-@dataclass(frozen=True)
-class HoldProcedure(ClientMessage):
-    """The page is held, so that the needle may go on.
-
-    Attributes:
-        sent: time of sending by the page's clock [s].
-    """
-
-    TYPE = "hold"
-    sent: float
-
-    @classmethod
-    def parse(cls, fields: dict[str, Any], max_speed: float) -> HoldProcedure:
-        """Return the message of these fields; see `parse_client_message`."""
-        return cls(_finite("sent", fields.get("sent")))
+    @property
+    def request(self) -> str:
+        """Name under which the answer is reported."""
+        if self.type == "procedure":
+            return f"{self.values['action']} procedure"
+        return str(self.values["action"]) if self.type == "bridge_action" else self.type
 
 
 def parse_client_message(text: str, max_speed: float) -> ClientMessage:
@@ -198,9 +48,16 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     """
     fields = _object(text)
     kind = fields.pop("type", None)
-    if not isinstance(kind, str) or kind not in _TYPES:
-        raise _refusal("type", kind, f"one of {', '.join(_TYPES)}")
-    return _TYPES[kind].parse(fields, max_speed)
+    if not isinstance(kind, str) or kind not in FIELDS:
+        raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
+    values = {name: read(name, fields.get(name)) for name, read in FIELDS[kind].items()}
+    if kind == "jog":
+        (x, y), speed = values.pop("direction"), values.pop("speed")
+        largest = max(abs(x), abs(y), 1.0)  # avoids overflow of the squares
+        x, y = x / largest, y / largest
+        factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
+        values["velocity"] = (x * factor, y * factor)
+    return ClientMessage(kind, values)
 
 
 def _refusal(name: str, value: object, expectation: str) -> InvalidInputError:
@@ -225,7 +82,25 @@ def _object(text: str) -> dict[str, Any]:
     return content
 
 
-def _finite(name: str, value: object) -> float:
+def _of_type(kind: type, expectation: str) -> Callable[[str, Any], Any]:
+    def read(name: str, value: Any) -> Any:
+        if not isinstance(value, kind):
+            raise _refusal(name, value, expectation)
+        return value
+
+    return read
+
+
+def _choice(*choices: Any) -> Callable[[str, Any], Any]:
+    def read(name: str, value: Any) -> Any:
+        if not any(value is choice or (isinstance(value, str) and value == choice) for choice in choices):
+            raise _refusal(name, value, "one of " + ", ".join(json.dumps(choice).strip('"') for choice in choices))
+        return value
+
+    return read
+
+
+def _finite(name: str, value: Any) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         try:
             number = float(value)
@@ -236,17 +111,40 @@ def _finite(name: str, value: object) -> float:
     raise _refusal(name, type(value).__name__ if isinstance(value, int) else value, "a finite number")
 
 
-def _velocity(fields: dict[str, Any], max_speed: float) -> Velocity:
-    direction, speed = fields.get("direction"), _finite("speed", fields.get("speed"))
-    if not isinstance(direction, list) or len(direction) != 2:
-        raise _refusal("direction", direction, "a list of two numbers")
-    x, y = _finite("direction", direction[0]), _finite("direction", direction[1])
+def _speed(name: str, value: Any) -> float:
+    speed = _finite(name, value)
     if speed < 0.0:
-        raise _refusal("speed", speed, "at least 0 m/s")
-    largest = max(abs(x), abs(y), 1.0)  # avoids overflow of the squares
-    x, y = x / largest, y / largest
-    factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
-    return x * factor, y * factor
+        raise _refusal(name, speed, "at least 0 m/s")
+    return speed
 
 
-_TYPES: dict[str, type[ClientMessage]] = {kind.TYPE: kind for kind in ClientMessage.__subclasses__()}
+def _direction(name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise _refusal(name, value, "a list of two numbers")
+    return _finite(name, value[0]), _finite(name, value[1])
+
+
+_text, _switch = _of_type(str, "a text"), _of_type(bool, "true or false")
+
+# What each type of message holds. `sent` is the time of sending by the page's clock [s]. In a greeting, `token` is
+# empty for a page that only watches, and `automated` tells whether a script drives the browser, null for no browser.
+# `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
+FIELDS: dict[str, dict[str, Callable[[str, Any], Any]]] = {
+    "hello": {"token": _text, "automated": _choice(True, False, None)},
+    "jog": {"speed": _speed, "direction": _direction, "sent": _finite},
+    "end_jog": {},
+    "acknowledge": {"kind": _choice("state", "frame")},
+    "visibility": {"visible": _switch},
+    "acquire_control": {},
+    "release_control": {},
+    "bridge_action": {"action": _choice("arm", "disarm", "stop", "reset")},
+    "select_setup": {"setup": _text},
+    "pause": {"paused": _switch},
+    "record": {"recording": _switch},
+    "procedure": {
+        "action": _choice("plan", "resume", "pause", "abort"),
+        "procedure": _text,
+        "hold_to_run": _switch,
+    },
+    "hold": {"sent": _finite},
+}

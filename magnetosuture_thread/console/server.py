@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import gc
-from collections.abc import Awaitable, Callable
+import signal
+import ssl
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
 from importlib.resources import files
 from weakref import WeakSet
 
@@ -20,12 +23,10 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.client import Client, RequestHandler
+from magnetosuture_thread.console.client import Client, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import JogController
-from magnetosuture_thread.console.outbox import encode_frame, encode_state
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.console.tls import server_context
 from magnetosuture_thread.errors import ConfigurationError
 
 MAX_CLIENTS = 16  # with the token
@@ -219,6 +220,35 @@ class ConsoleServer:
         return encode_state(graph, self._host.state(), lease)
 
 
+async def serve_until(
+    ends: Iterable[signal.Signals],
+    server: ConsoleServer,
+    watch: Callable[[], Awaitable[None]],
+    period: float,
+    report: Callable[[str], None],
+) -> None:
+    """Serve the page until this process gets a signal to end; the needle is stopped first.
+
+    Args:
+        ends: the signals.
+        server: of the page.
+        watch: called once in each period; what it raises ends the serving too.
+        period: [s].
+        report: called with the URL of the page.
+    """
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    for which in ends:
+        loop.add_signal_handler(which, ended.set)
+    report(await server.start())
+    try:
+        while not ended.is_set():
+            await watch()
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(ended.wait(), period)
+    finally:
+        await server.stop()
+
+
 def _answer(status: int, text: str) -> web.Response:
     return web.Response(status=status, text=text, headers=HEADERS)
 
@@ -275,3 +305,26 @@ def page_files() -> dict[str, tuple[str, bytes]]:
             result[f"/{entry.name}"] = kind, entry.read_bytes()
     result["/"] = result.pop("/index.html")
     return result
+
+
+def server_context(settings: ConsoleSettings) -> ssl.SSLContext | None:
+    """Return the TLS context of a server, version 1.2 or later; None where the settings name no certificate.
+
+    Raises:
+        ConfigurationError: certificate or key cannot be read, do not belong together, or the key has a password.
+    """
+    if not settings.certificate:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        # Without this password OpenSSL would ask at the terminal.
+        context.load_cert_chain(settings.certificate, settings.private_key or None, password=lambda: b"")
+    except (OSError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigurationError(
+            f"{ConsoleSettings.GROUP}.certificate",
+            settings.certificate,
+            f"a PEM file with a certificate, and its key without a password in it or in private_key ({reason})",
+        ) from None
+    return context

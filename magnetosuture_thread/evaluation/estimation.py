@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from magnetosuture_thread.evaluation.frames import Array, FrameResult, TimeSeries
-from magnetosuture_thread.evaluation.silence import SILENT_PERIODS
+from magnetosuture_thread.evaluation.frames import SILENT_PERIODS, Array, FrameResult, TimeSeries
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.model.estimator import Disturbance, SlowParameter
 from magnetosuture_thread.model.estimator.stiffness import STIFFNESS_OVER_DRAG

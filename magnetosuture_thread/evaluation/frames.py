@@ -1,4 +1,4 @@
-"""Frames of a run, measured and predicted, and what is kept of them: columns, worst frames."""
+"""Frames of a run, measured and predicted, and what is kept of them: columns, error map, worst frames."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ WORST_FRAMES, WORST_ESTIMATES = 5, 2
 MIN_DISTANCE = 1.0  # s; between two of the worst frames
 MARGIN = "margin_"  # columns of margins, by the barrier's name
 BIN = 0.5  # s; of each bin the worst frame is kept
+SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
+MAP_COLUMNS = 300
 
 
 def _no_points() -> Points:
@@ -162,29 +165,25 @@ class FrameResult:
             recorded: the prediction of the same frame that the bag holds.
             obstacles: in force.
         """
-        kept = None
-        if estimate is not None:
-            kept = EstimatedThread.of(estimate)
-        elif estimated:
-            kept = EstimatedThread(prediction.positions)
+        kept = EstimatedThread.of(estimate) if estimate is not None else None
         forces = prediction.forces
         return cls(
-            observation.stamp,
-            prediction.positions,
-            float(np.maximum.reduce(np.abs(prediction.strain), initial=0.0)),
-            prediction.residual,
-            step_time,
-            math.nan if forces is None else forces.peak_tension,
-            np.empty(0) if forces is None else np.asarray(forces.needle_force),
-            margins,
-            margins is not None and bool(margins.in_contact),
-            observation.measured,
-            observation.ground_truth,
-            observation.tail,
-            math.atan2(observation.heading[1], observation.heading[0]),
-            obstacles,
-            recorded,
-            estimate=kept,
+            stamp=observation.stamp,
+            vertices=prediction.positions,
+            strain=float(np.maximum.reduce(np.abs(prediction.strain), initial=0.0)),
+            residual=prediction.residual,
+            step_time=step_time,
+            tension=math.nan if forces is None else forces.peak_tension,
+            pull=np.empty(0) if forces is None else np.asarray(forces.needle_force),
+            margins=margins,
+            in_contact=margins is not None and bool(margins.in_contact),
+            measured=observation.measured,
+            ground_truth=observation.ground_truth,
+            tail=observation.tail,
+            heading=math.atan2(observation.heading[1], observation.heading[0]),
+            obstacles=obstacles,
+            recorded=recorded,
+            estimate=EstimatedThread(prediction.positions) if kept is None and estimated else kept,
             observation=observation.observation,
             true_pull=observation.true_pull,
         )
@@ -195,9 +194,11 @@ class FrameResult:
 
     def columns(self) -> dict[str, float]:
         """Return the figures of the frame that need no other curve, by their columns' names."""
-        row = {"strain": self.strain, "residual": self.residual, "step_time": self.step_time}
-        row["tension"] = self.tension
-        row |= {name: math.hypot(*force) for name, force in self._pulls().items() if len(force) == 2}
+        row = {"strain": self.strain, "residual": self.residual, "step_time": self.step_time, "tension": self.tension}
+        forces = {"pull": self.pull, "true_pull": self.true_pull}
+        if len(self.pull) == len(self.true_pull):
+            forces["pull_error"] = self.pull - self.true_pull
+        row |= {name: math.hypot(*force) for name, force in forces.items() if len(force) == 2}
         if self.margins is not None:
             row |= {f"{MARGIN}{least.barrier}": float(least.clearance[0]) for least in self.margins.minima}
         if self.estimate is not None:
@@ -206,32 +207,11 @@ class FrameResult:
             row["innovation_squared"] = float(known.mean()) if len(known) else math.nan
         return row
 
-    def _pulls(self) -> dict[str, Array]:
-        """Return pull, true pull and how far they are apart, by their columns' names; those without length are none."""
-        both = len(self.pull) == len(self.true_pull)
-        return {
-            "pull": self.pull,
-            "true_pull": self.true_pull,
-            "pull_error": self.pull - self.true_pull if both else np.empty(0),
-        }
-
     @property
     def clearance(self) -> Array:
         """Minimum clearance of an obstacle or the wall for each node, shape (n + 1,) [m]; inf where none is near."""
         count = len(self.vertices)
         return np.full(count, np.inf) if self.margins is None else node_clearance(self.margins, count)
-
-
-def estimated_nodes(frames: Sequence[FrameResult]) -> Array:
-    """Return the estimated nodes of frames whose predictions have one number of nodes, shape (b, n + 1, 2) [m].
-
-    nan where a frame has no estimate, or one of another number of nodes.
-    """
-    nodes = np.full((len(frames), len(frames[0].vertices), 2), np.nan)
-    for row, frame in zip(nodes, frames, strict=True):
-        if frame.estimate is not None and frame.estimate.vertices.shape == row.shape:
-            row[:] = frame.estimate.vertices
-    return nodes
 
 
 class TimeSeries:
@@ -310,31 +290,25 @@ class WorstFrames:
 
     Args:
         count: of frames to find.
-        apart: least time between two of them [s].
+        apart: minimum time between two of them [s].
         of: whose errors are added, `prediction` or `estimate`.
     """
 
     def __init__(self, count: int = WORST_FRAMES, apart: float = MIN_DISTANCE, of: str = "prediction") -> None:
-        self._count = count
-        self._of = of
-        self._apart = apart
+        self._count, self._apart, self._of = count, apart, of
         # A frame takes out the bins within `apart` of it, on both sides: no more of the worst bins are needed.
         self._enough = count * (2 * math.ceil(apart / BIN) + 3)
         self._bins: dict[int, WorstFrame] = {}
 
     def add(self, time: float, error: float, frame: FrameResult) -> None:
         """Add one frame; one without an error is passed over."""
-        if not math.isfinite(error):
-            return
         bin_ = math.floor(time / BIN)
         held = self._bins.get(bin_)
-        if held is not None and held.error >= error:
+        if not math.isfinite(error) or (held is not None and held.error >= error):
             return
         self._bins[bin_] = WorstFrame(time, error, frame, self._of)
-        if len(self._bins) > 2 * self._enough:
-            kept = sorted(self._bins.items(), key=lambda item: -item[1].error)[: self._enough]
-            # The bin that is being filled stays: its worst frame may be still to come.
-            self._bins = dict(kept) | {bin_: self._bins[bin_]}
+        if len(self._bins) > self._enough + 1:  # the bin that is being filled stays
+            del self._bins[min(self._bins.keys() - {bin_}, key=lambda other: self._bins[other].error)]
 
     def found(self) -> list[WorstFrame]:
         """Return the worst frames, the worst first."""
@@ -342,6 +316,75 @@ class WorstFrames:
         for worst in sorted(self._bins.values(), key=lambda worst: (-worst.error, worst.time)):
             if all(abs(worst.time - other.time) >= self._apart for other in chosen):
                 chosen.append(worst)
-            if len(chosen) == self._count:
-                break
-        return chosen
+        return chosen[: self._count]
+
+
+def with_gaps(times: Array, values: Array) -> tuple[Array, Array]:
+    """Return times and columns of values with a nan at both ends of each long gap, so that nothing is drawn over it.
+
+    Args:
+        times: shape (m,) [s].
+        values: shape (..., m).
+    """
+    if len(times) < 3:
+        return times, values
+    steps = np.diff(times)
+    usual = float(np.median(steps))
+    gaps = np.flatnonzero(steps > SILENT_PERIODS * usual) + 1
+    ends = np.column_stack([times[gaps - 1] + usual, times[gaps] - usual]).ravel()
+    at = np.repeat(gaps, 2)
+    return np.insert(times, at, ends), np.insert(values, at, np.nan, axis=-1)
+
+
+class ErrorGrid(NamedTuple):
+    """The greatest error by time and arc length.
+
+    Attributes:
+        times: of each column [s].
+        lengths: arc length of each row, from the needle's tail on [m].
+        errors: shape (rows, columns) [% of the thread's length]; nan where nothing is known.
+    """
+
+    times: Array
+    lengths: Array
+    errors: Array
+
+
+class ErrorMap:
+    """Accumulates the error along the thread: when it is full, neighbouring columns become one, with the greater error.
+
+    Args:
+        length: of the thread [m].
+        columns: of the map.
+    """
+
+    def __init__(self, length: float, columns: int = MAP_COLUMNS) -> None:
+        self._length, self._limit = length, 2 * columns
+        self._frames = 1  # of a column
+        self._filled = 0  # frames in the last column
+        self._times: list[float] = []
+        self._columns: list[Array] = []
+
+    def add(self, time: float, errors: Array) -> None:
+        """Add the errors of one frame's nodes, in % of the length."""
+        if not np.isfinite(errors).any():
+            return
+        if self._columns and self._filled < self._frames:
+            self._columns[-1] = np.fmax(self._columns[-1], errors)
+            self._filled += 1
+            return
+        if len(self._columns) == self._limit:
+            self._columns = [np.fmax(a, b) for a, b in zip(self._columns[::2], self._columns[1::2], strict=True)]
+            self._times = self._times[::2]
+            self._frames *= 2
+        self._times.append(time)
+        self._columns.append(errors)
+        self._filled = 1
+
+    def grid(self) -> ErrorGrid | None:
+        """Return the map, empty in each long gap; None if there is nothing."""
+        if not self._columns:
+            return None
+        times, errors = with_gaps(np.array(self._times), np.column_stack(self._columns))
+        rows = errors.shape[0]
+        return ErrorGrid(times, self._length * np.arange(1, rows + 1) / rows, errors)

@@ -10,8 +10,6 @@ import numpy as np
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.errors import GraphError, InvalidInputError
-from magnetosuture_thread.evaluation.currents import CurrentDifference
-from magnetosuture_thread.evaluation.currents import CurrentSeries as CurrentSeries
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
 from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
@@ -21,6 +19,7 @@ from magnetosuture_thread.messages.reading import margins_of, nanoseconds, plana
 from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.thread_observation import ThreadObservation
 
+CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
 TRACKED = 1  # as in the message TrackerState
 WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
 WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
@@ -37,6 +36,68 @@ OF_FRAMES = {
         interface.GROUND_TRUTH_PULL,
     )
 }
+
+
+@dataclass(frozen=True)
+class CurrentDifference:
+    """How far the currents of a replay are from the recorded ones, at the times of the replay's.
+
+    In places the coils can give the same velocity in two ways, far apart, and change from one to the other
+    within a hundredth of a second: the greatest differences are of such moments.
+
+    Attributes:
+        compared: how many replayed currents have a recorded one beside them.
+        difference: of a coil, median [A].
+        p99: 99th percentile [A].
+        greatest: [A].
+        recorded: root of the mean square of the recorded currents, to judge the difference by [A].
+        stopped_apart: share of the compared of which one is a stop and the other is not.
+    """
+
+    compared: int
+    difference: float
+    p99: float
+    greatest: float
+    recorded: float
+    stopped_apart: float
+
+
+class CurrentSeries:
+    """Currents over time, from messages in any order of arrival."""
+
+    def __init__(self) -> None:
+        self._received: dict[int, tuple[Array, bool]] = {}
+
+    def add(self, message: Any) -> None:
+        """Add a message CoilCurrents, of ROS or of the bags' type store."""
+        stamp = nanoseconds(message.header.stamp)
+        self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
+
+    def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
+        """Compare with what was recorded; None where nothing can be."""
+        theirs = np.array(sorted(recorded._received))
+        apart, sizes, stops = [], [], []
+        for stamp, (currents, stopped) in sorted(self._received.items()):
+            index = int(np.searchsorted(theirs, stamp, side="right")) - 1
+            if index < 0 or stamp - theirs[index] > CURRENT_VALID * 1e9:
+                continue
+            other, other_stopped = recorded._received[int(theirs[index])]
+            if other.shape != currents.shape:
+                continue
+            apart.append(currents - other)
+            sizes.append(other)
+            stops.append(stopped != other_stopped)
+        if not apart:
+            return None
+        difference = np.abs(np.array(apart))
+        return CurrentDifference(
+            compared=len(difference),
+            difference=float(np.median(difference)),
+            p99=float(np.percentile(difference, 99)),
+            greatest=float(difference.max()),
+            recorded=float(np.sqrt(np.mean(np.array(sizes) ** 2))),
+            stopped_apart=float(np.mean(stops)),
+        )
 
 
 class GraphCollector:
@@ -108,7 +169,6 @@ class GraphCollector:
         metrics = RunMetrics(self._length, start)
         for frame in self.frames() if frames is None else frames:
             metrics.add(frame)
-        metrics.compare()
         return metrics
 
 

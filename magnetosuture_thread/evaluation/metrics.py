@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.barrier import BUILT_IN
-from magnetosuture_thread.evaluation import pull
-from magnetosuture_thread.evaluation.error_map import ErrorMap
 from magnetosuture_thread.evaluation.estimation import (
     ESTIMATE_COLUMNS,
     DisturbanceLog,
@@ -23,26 +21,28 @@ from magnetosuture_thread.evaluation.estimation import (
 from magnetosuture_thread.evaluation.frames import (
     MARGIN,
     MIN_DISTANCE,
+    SILENT_PERIODS,
     WORST_ESTIMATES,
     Array,
+    ErrorMap,
     FrameResult,
     Observation,
     TimeSeries,
     WorstFrame,
     WorstFrames,
-    estimated_nodes,
 )
-from magnetosuture_thread.evaluation.silence import SensorSilence as SensorSilence
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
 from magnetosuture_thread.model.estimator import SlowParameter
+from magnetosuture_thread.model.margins import Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
+COLUMNS = ("strain", "residual", "step_time", "tension", "pull", "true_pull", "pull_error", "seen_share")
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
-BATCH = 128  # frames that are compared together
 MAX_REASONS = 12  # kept, why the needle was not found
+CLOCK_TOLERANCE = 1.0  # s; stamps farther outside of the bag are of another clock
 
 
 @dataclass(frozen=True)
@@ -116,25 +116,16 @@ def target_points(curves: Sequence[Points], length: float, segments: int) -> tup
         X, shape (b, n, 2) [m], nan past the end of a curve by more than 0.1 % of L; and the curves' lengths, shape
         (b,) [m]. A node that is less past the end counts as at the end.
     """
-    known = np.array([len(curve) > 1 and bool(np.isfinite(curve).all()) for curve in curves], dtype=bool)
     points, lengths = np.full((len(curves), segments, 2), np.nan), np.zeros(len(curves))
-    there = np.flatnonzero(known)
-    if not len(there):
-        return points, lengths
-    # All curves are laid one behind the other, so that one interpolation serves them all.
-    shown = [curve for curve, is_known in zip(curves, known.tolist(), strict=True) if is_known]
-    counts, vertices = np.array([len(curve) for curve in shown]), np.concatenate(shown)
-    last = np.cumsum(counts) - 1
-    steps = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
-    steps[last[:-1]] = length  # a gap between one curve and the next
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
-    begins, ends = arc[last - counts + 1], arc[last]
-    lengths[there] = ends - begins
     at = length * np.arange(1, segments + 1) / segments
-    wanted = np.minimum(begins[:, None] + at, ends[:, None])
-    within = at <= lengths[there, None] + END_TOLERANCE * length
-    for axis in (0, 1):
-        points[there, :, axis] = np.where(within, np.interp(wanted, arc, vertices[:, axis]), np.nan)
+    for index, curve in enumerate(curves):
+        if len(curve) < 2 or not np.isfinite(curve).all():
+            continue
+        arc = arc_lengths(curve)
+        lengths[index] = arc[-1]
+        known = at <= arc[-1] + END_TOLERANCE * length
+        for axis in (0, 1):
+            points[index, known, axis] = np.interp(at[known], arc, curve[:, axis])
     return points, lengths
 
 
@@ -162,34 +153,68 @@ def mean_over_nodes(errors: Array, known: NDArray[np.bool_]) -> Array:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def prediction_errors(vertices: Points, curves: Sequence[Points], length: float) -> tuple[Array, Array, Array]:
-    """Return how far predictions are from threads, in % of the thread's length.
+def prediction_error_percent(vertices: Points, curve: Points, length: float) -> float:
+    """Return how far a prediction is from a thread, in % of the thread's length.
 
         error = mean over i = 1 ... n of e_i,    e_i as in `node_errors`
 
-    Nodes past the end of a curve, where the camera lost the thread, are left out.
+    Nodes past the end of the curve, where the camera lost the thread, are left out.
 
     Args:
-        vertices: predicted nodes of each frame, shape (b, n + 1, 2) [m].
-        curves: where the thread was in each, shape (m, 2) [m].
+        vertices: predicted nodes, shape (n + 1, 2) [m].
+        curve: where the thread was, shape (m, 2) [m].
         length: L [m].
 
     Returns:
-        The errors, shape (b,), nan where less than half of a thread is known; e_i, shape (b, n); and the known part
-        of each thread, 0 to 1, shape (b,).
+        The error; nan where less than half of the thread is known.
 
     Source: reference set, "How a prediction is scored". Deviation: none where the curve is whole.
     """
-    targets, lengths = target_points(curves, length, vertices.shape[1] - 1)
-    errors = node_errors(vertices, targets, length)
-    mean = mean_over_nodes(errors, np.isfinite(targets[..., 0]))
-    mean = np.where(lengths >= MIN_KNOWN_SHARE * length, mean, np.nan)
-    return mean, errors, np.minimum(1.0, lengths / length)
+    targets, lengths = target_points([curve], length, len(vertices) - 1)
+    return _mean_error(node_errors(vertices, targets[0], length), targets[0], float(lengths[0]) / length)
 
 
-def prediction_error_percent(vertices: Points, curve: Points, length: float) -> float:
-    """Return how far one prediction is from a thread; see `prediction_errors`."""
-    return float(prediction_errors(vertices[None], [curve], length)[0][0])
+def _mean_error(errors: Array, targets: Array, share: float) -> float:
+    """Return the mean error of the nodes that have a target; nan where too small a share of the length is known."""
+    return float(mean_over_nodes(errors, np.isfinite(targets[:, 0]))) if share >= MIN_KNOWN_SHARE else math.nan
+
+
+@dataclass(frozen=True)
+class SensorSilence:
+    """Time without frames, or recorded poses: gaps of more than `SILENT_PERIODS` usual intervals.
+
+    Attributes:
+        gaps: how many.
+        total: of all gaps [s].
+        max_gap: the longest gap [s].
+        at: when the longest gap begins, since the bag's start [s]; nan for none.
+    """
+
+    gaps: int = 0
+    total: float = 0.0
+    max_gap: float = 0.0
+    at: float = math.nan
+
+    @classmethod
+    def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
+        """Return the gaps between frames, and before the first and after the last, where they are of one clock.
+
+        Args:
+            times: of the frames, since the bag's start [s].
+            begin: of what is evaluated [s].
+            end: of it [s].
+        """
+        times = np.sort(times)
+        if len(times) < 2:  # no interval is usual
+            return cls(1, end - begin, end - begin, begin) if end > begin else cls()
+        within = begin - CLOCK_TOLERANCE <= times[0] and times[-1] <= end + CLOCK_TOLERANCE
+        edges = np.concatenate([[begin], times, [end]]) if within else times
+        steps = np.diff(edges)
+        gaps = steps[steps > SILENT_PERIODS * float(np.median(np.diff(times)))]
+        if not len(gaps):
+            return cls()
+        longest = int(np.argmax(steps))
+        return cls(len(gaps), float(gaps.sum()), float(steps[longest]), float(edges[longest]))
 
 
 @dataclass(frozen=True)
@@ -233,6 +258,7 @@ class RunMetrics:
         contact_frames: those in which the thread touches an obstacle or the wall.
         disturbances: that the estimate reported.
         learned: slow parameters of the last estimate that has any.
+        series: columns of all frames with a prediction, by time.
     """
 
     def __init__(
@@ -240,11 +266,10 @@ class RunMetrics:
     ) -> None:
         self.targets = tuple(target for target in TARGETS if target in targets)
         errors = [f"error_{target}" for target in self.targets]
-        of_bag = [f"recorded_{name}" for name in errors] if recorded else []
+        kinds = ["", "estimate_", "max_node_", "max_node_estimate_", *(["recorded_"] if recorded else [])]
         margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
-        others = ["strain", "residual", "step_time", "tension", *pull.COLUMNS, "seen_share", *ESTIMATE_COLUMNS]
-        of_estimate = [f"{kind}_{name}" for kind in ("estimate", "max_node", "max_node_estimate") for name in errors]
-        self._series = TimeSeries([*errors, *of_estimate, *of_bag, *margins, *others])
+        names = [f"{kind}{name}" for kind in kinds for name in errors]
+        self.series = TimeSeries([*names, *margins, *COLUMNS, *ESTIMATE_COLUMNS])
         self.observed = TimeSeries(["processing"])
         self.tracked = self.contact_frames = 0
         self.lost: list[list[float]] = []
@@ -256,7 +281,6 @@ class RunMetrics:
         self._worst = {(kind, target): WorstFrames(of=kind) for kind in KINDS for target in self.targets}
         self.disturbances = DisturbanceLog()
         self.learned: tuple[SlowParameter, ...] = ()
-        self._fresh: list[FrameResult] = []
         self._first: FrameResult | None = None
 
     def observe(self, observation: Observation) -> None:
@@ -274,31 +298,55 @@ class RunMetrics:
         self._found = observation.found
 
     def add(self, frame: FrameResult) -> None:
-        """Add the prediction of a frame; its errors are set when they are computed."""
+        """Add the prediction of a frame, and set its errors."""
+        time = self._time(frame.stamp)
+        self._first = self._first or frame
         if frame.margins is not None:
-            for row in frame.margins.minima:
-                held, value = self._minimum.get(row.barrier), frame.margins[row.barrier].minimum
-                if held is None or row.clearance[0] < held.clearance:
-                    place = int(row.node[0]), int(row.obstacle[0]), self._time(frame.stamp)
-                    value = value if held is None else min(value, held.value)
-                    self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), value, *place)
-                elif value < held.value:
-                    self._minimum[row.barrier] = replace(held, value=value)
             self.contact_frames += frame.in_contact
-        self.disturbances.add(self._time(frame.stamp), frame)
+            self._lower(time, frame.margins)
+        self.disturbances.add(time, frame)
         if frame.estimate is not None and frame.estimate.learned:
             self.learned = frame.estimate.learned
-        if self._fresh and len(frame.vertices) != len(self._fresh[0].vertices):  # the model's segments have changed
-            self.compare()
-        self._fresh.append(frame)
-        if len(self._fresh) >= BATCH:
-            self.compare()
+        columns = frame.columns() | {"hidden": hidden_part(frame, self._length)} | self._compare(time, frame)
+        self.series.add(time, columns)
 
-    @property
-    def series(self) -> TimeSeries:
-        """Columns of all frames with a prediction, by time."""
-        self.compare()
-        return self._series
+    def _lower(self, time: float, margins: Margins) -> None:
+        """Lower the minimum of each barrier to that of a frame."""
+        for row in margins.minima:
+            held, value = self._minimum.get(row.barrier), margins[row.barrier].minimum
+            if held is None or row.clearance[0] < held.clearance:
+                value = value if held is None else min(value, held.value)
+                place = int(row.node[0]), int(row.obstacle[0]), time
+                self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), value, *place)
+            elif value < held.value:
+                self._minimum[row.barrier] = replace(held, value=value)
+
+    def _compare(self, time: float, frame: FrameResult) -> dict[str, float]:
+        """Return the columns of a frame's errors."""
+        row: dict[str, float] = {}
+        threads = {"prediction": frame.vertices}
+        if frame.estimate is not None and frame.estimate.vertices.shape == frame.vertices.shape:
+            threads["estimate"] = frame.estimate.vertices
+        for target in TARGETS:
+            curve = frame.target_curve(target)
+            points, lengths = target_points([curve], self._length, len(frame.vertices) - 1)
+            share = float(lengths[0]) / self._length
+            if target == "seen":
+                row["seen_share"] = min(1.0, share)
+            if target not in self.targets:
+                continue
+            for kind, vertices in threads.items():
+                errors = node_errors(vertices, points[0], self._length)
+                mean, column = _mean_error(errors, points[0], share), f"{KINDS[kind]}error_{target}"
+                row[column] = mean
+                if math.isfinite(mean):
+                    row[f"max_node_{column}"] = float(np.nanmax(errors))
+                    self._maps[kind, target].add(time, errors)
+                    self._worst[kind, target].add(time, mean, frame)
+            frame.errors[target] = row[f"error_{target}"]
+            if frame.recorded is not None:
+                row[f"recorded_error_{target}"] = prediction_error_percent(frame.recorded, curve, self._length)
+        return row
 
     @property
     def minimum_margins(self) -> dict[str, MinimumMargin]:
@@ -332,7 +380,6 @@ class RunMetrics:
     @property
     def worst_measured(self) -> FrameResult | None:
         """The frame farthest from what was measured; where nothing was, from the truth, else the first one."""
-        self.compare()
         worst = [each for target in reversed(self.targets) for each in self._worst["prediction", target].found()[:1]]
         return worst[0].frame if worst else self._first
 
@@ -362,35 +409,16 @@ class RunMetrics:
         """Return the mean of a column; nan if there is none."""
         return float(np.nanmean(self.series.column(column))) if self.series.has(column) else math.nan
 
-    def compare(self) -> None:
-        """Compare the frames that have come with their targets, and keep of them only numbers."""
-        frames, self._fresh = self._fresh, []
-        if not frames:
-            return
-        self._first = self._first or frames[0]
-        threads = {"prediction": np.stack([frame.vertices for frame in frames]), "estimate": estimated_nodes(frames)}
-        rows = [frame.columns() | {"hidden": hidden_part(frame, self._length)} for frame in frames]
-        for target in TARGETS:
-            curves = [frame.target_curve(target) for frame in frames]
-            compared = {kind: prediction_errors(nodes, curves, self._length) for kind, nodes in threads.items()}
-            for index, (frame, row) in enumerate(zip(frames, rows, strict=True)):
-                if target == "seen":
-                    row["seen_share"] = float(compared["prediction"][2][index])
-                if target not in self.targets:
-                    continue
-                for kind, (means, errors, _) in compared.items():
-                    mean, time, column = float(means[index]), self._time(frame.stamp), f"{KINDS[kind]}error_{target}"
-                    row[column] = mean
-                    if math.isfinite(mean):
-                        row[f"max_node_{column}"] = float(np.nanmax(errors[index]))
-                        self._maps[kind, target].add(time, errors[index].copy())
-                        self._worst[kind, target].add(time, mean, frame)
-                frame.errors[target] = row[f"error_{target}"]
-                if frame.recorded is not None:
-                    error = prediction_error_percent(frame.recorded, curves[index], self._length)
-                    row[f"recorded_error_{target}"] = error
-        for frame, row in zip(frames, rows, strict=True):
-            self._series.add(self._time(frame.stamp), row)
+    @property
+    def pull_error_percent(self) -> float:
+        """Root mean square of the predicted pull upon the needle less the true one, in % of the true pull's peak.
+
+        Over the frames with both; nan where there are none, or where nothing pulls.
+        """
+        peak = self.maximum("true_pull")
+        if not (self.series.has("pull_error") and peak > 0.0):
+            return math.nan
+        return 100.0 * float(np.sqrt(np.nanmean(self.series.column("pull_error") ** 2))) / peak
 
     def _time(self, stamp: int) -> float:
         return (stamp - self._start) * 1e-9

@@ -1,31 +1,36 @@
-"""Plots of replayed bags and evaluated trajectories, and what all plots share: colours, axes, threads in a frame."""
+"""Plots and pictures of worst frames, evaluated trajectories and scenes; and colours, axes and scale of all plots."""
 
 from __future__ import annotations
 
+import base64
+import io
+import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import matplotlib
 import numpy as np
-from matplotlib import patheffects
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
+from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation import colours
-from magnetosuture_thread.evaluation.estimation import Consistency
-from magnetosuture_thread.evaluation.frames import FrameResult, TimeSeries
+from magnetosuture_thread.evaluation.frames import FrameResult, WorstFrame
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
+from magnetosuture_thread.evaluation.metrics import node_errors, target_points
 from magnetosuture_thread.evaluation.reference_scores import CaseResult
-from magnetosuture_thread.evaluation.scene_plot import shape_patch
+from magnetosuture_thread.evaluation.report.figures import AGAINST, format_number
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.margins import SOLID
+from magnetosuture_thread.scene import KINDS, Scene
 from magnetosuture_thread.texts import printable
 
 INK, FAINT = colours.INK.light, "#7b8794"
@@ -33,83 +38,159 @@ SEEN, TRUTH = colours.MEASURED.light, colours.GROUND_TRUTH.light
 PREDICTED, ESTIMATED = colours.PREDICTED.light, colours.ESTIMATED.light
 WIDE = {"color": SEEN, "alpha": 0.35, "solid_capstyle": "round"}  # where a thread was, beside what is predicted
 OBSTACLE = "#e9d8d3"
-MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", ["#c8102e", "#f28c28", "#1f9d55"])
-FULL_CLEARANCE_MM = 1.0
-CLOSE_UP = 2e-3  # m; half of the side of what is magnified
+KIND_COLOURS = {
+    "tissue": ("#f0b9b4", "#b8665f"),
+    "instrument": ("#b9c6d2", "#56697a"),
+    "wall": ("#cbbfa9", "#6f624c"),
+}  # of a shape in a scene: face and edge
+BAD = "#c8102e"
+MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])
+FULL_CLEARANCE_MM = 1.0  # from which on a node is green
 INSTANTS = 6  # of a trajectory
-BARS = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3)  # m
+CLOSE_UP = 0.08  # of the thread's length: half of the side of what is magnified
+BARS = (0.1e-3, 0.2e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # m; lengths of a scale bar
+PLAN_PIXELS, PLAN_SHARE = 620, 0.94  # side of a drawn dish, and the share of it that the dish takes
+JPEG_QUALITY = 84
+SCENE_SIDE, SCENE_TITLE, SCENE_BORDER = 7.0, 0.45, 0.06  # in, in, of the dish's diameter around it
 
 
-def draw_summary(
-    path: Path,
-    frame: NDArray[np.uint8],
-    view: DishView,
-    chosen: FrameResult,
-    at: float,
-    series: TimeSeries,
-    obstacles: Sequence[Obstacle],
-    summary: ReplaySummary,
-) -> None:
-    """Draw the summary and write it as PNG.
+class Photo(NamedTuple):
+    """A camera frame and where the dish is in it.
+
+    Attributes:
+        image: BGR or grey.
+        view: of the dish.
+    """
+
+    image: NDArray[np.uint8]
+    view: DishView
+
+
+@dataclass(frozen=True)
+class ReportPicture:
+    """A picture of one of the worst frames.
+
+    Attributes:
+        worst: what is shown.
+        source: the picture as a data URI.
+        alt_text: what it shows, in words.
+        is_plan: whether it is a plan and no camera frame.
+    """
+
+    worst: WorstFrame
+    source: str
+    alt_text: str
+    is_plan: bool
+
+
+def draw_summary(path: Path, photo: Photo, chosen: FrameResult, at: float, summary: ReplaySummary) -> None:
+    """Write the picture of a replay (.png): the dish and a close-up of a frame, with the threads in it.
 
     Args:
         path: of the picture.
-        frame: BGR or grey camera image of the chosen frame.
-        view: where the dish is in it.
+        photo: camera image of the chosen frame.
         chosen: the frame to show.
         at: its time since the bag's start [s].
-        series: of all predicted frames.
-        obstacles: discs and polygons [m].
-        summary: the figures.
+        summary: the figures, for the title.
     """
-    figure = Figure(figsize=(14.0, 7.2), dpi=110, facecolor="white")
-    scene = figure.add_axes((0.015, 0.115, 0.44, 0.775))
-    nodes = _draw_frame(scene, frame, view, chosen, obstacles)
-    _draw_close_up(scene, frame, view, chosen, obstacles)
-    _draw_colours(figure, nodes, chosen)
-    words = f"frame at {at:.2f} s, where the prediction is farthest from the measured thread"
-    figure.text(0.015, 0.905, words, fontsize=9.5, color=INK)
-    consistency = Consistency.of(series)
-    panels = (
-        [_draw_error, _draw_clearance, _draw_strain]
-        if consistency is None
-        else [_draw_error, _draw_consistency, _draw_clearance, _draw_strain]
+    found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
+    title = f"{Path(summary.bag).name}, setup {summary.setup}: {summary.tracked} of {summary.frames} {found}"
+    if summary.simulated:
+        title += f"; simulated: {summary.simulated}"
+    words = (
+        f"frame at {at:.2f} s, where the prediction is farthest from the measured thread. Wide: measured; magenta: "
+        "predicted; teal: estimated; dashed: ground truth; nodes: red at an obstacle to green 1 mm away"
     )
-    layout = {"left": 0.51, "right": 0.985, "top": 0.87, "bottom": 0.085, "hspace": 0.38}
-    plots = figure.subplots(len(panels), 1, sharex=True, gridspec_kw=layout)
-    for axes, draw in zip(plots, panels, strict=True):
-        draw(axes, series)
-    for axes in plots:
-        axes.axvline(at, color=FAINT, linewidth=0.9, linestyle=(0, (2, 2)), zorder=0)
-        tidy(axes)
-    plots[-1].set_xlim(series.times[0], series.times[-1])
-    plots[-1].set_xlabel("time since the bag's start [s]", color=INK)
-    title = printable(_title(summary))  # with names from outside, and no mathematics in them
-    figure.text(0.015, 0.938, title, fontsize=12, color=INK, linespacing=1.4, parse_math=False)
+    figure = Figure(figsize=(14.0, 7.6), dpi=110, facecolor="white")
+    nearest = int(np.argmin(chosen.clearance)) if np.isfinite(chosen.clearance).any() else len(chosen.vertices) - 1
+    _draw_dish_and_close_up(figure, photo, chosen, chosen.vertices[nearest], 2e-3, height=0.9)
+    # With names from outside, and no mathematics in them.
+    figure.text(0.01, 0.96, printable(title), fontsize=12, color=INK, parse_math=False)
+    figure.text(0.01, 0.92, words, fontsize=9.5, color=INK)
     figure.savefig(path)
 
 
-def _title(summary: ReplaySummary) -> str:
-    found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
-    words = f"{Path(summary.bag).name}, setup {summary.setup}: {summary.tracked} of {summary.frames} {found}"
-    if summary.simulated:
-        words += "\nsimulated: " + summary.simulated
-    return words
+def draw_worst_frame(
+    worst: WorstFrame,
+    photo: Photo | None,
+    *,
+    target: str,
+    length: float,
+    dish_diameter: float,
+    simulated: bool = False,
+) -> ReportPicture:
+    """Draw one of the worst frames: the whole dish, and close by where prediction or estimate is farthest off.
+
+    Args:
+        worst: what to show.
+        photo: the camera's frame; without one a plan is drawn.
+        target: what the prediction is compared with, `truth` or `seen`.
+        length: of the thread [m].
+        dish_diameter: [m]
+        simulated: whether the frame is rendered.
+    """
+    shown, frame = photo or draw_plan(dish_diameter), worst.frame
+    targets = target_points([frame.target_curve(target)], length, len(frame.vertices) - 1)[0][0]
+    vertices = frame.vertices if worst.of == "prediction" or frame.estimate is None else frame.estimate.vertices
+    errors = node_errors(vertices, targets, length)
+    node = int(np.nanargmax(errors)) + 1
+    greatest = 0.01 * float(np.nanmax(errors)) * length
+    ends = np.vstack([vertices[node], targets[node - 1]])
+    figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
+    half = max(CLOSE_UP * length, 0.75 * greatest)
+    scene, close = _draw_dish_and_close_up(figure, shown, frame, ends.mean(axis=0), half)
+    close.plot(*shown.view.to_pixels(ends).T, color=BAD, linewidth=1.6)
+    if simulated:
+        box = {"facecolor": "#fff3d6", "alpha": 0.85, "edgecolor": "none", "pad": 2.5}
+        scene.text(0.02, 0.98, "simulated", transform=scene.transAxes, color="#5c4300", fontsize=11, va="top", bbox=box)
+    kind = "Plan of the dish" if photo is None else "Simulated camera frame" if simulated else "Camera frame"
+    words = (
+        f"{kind} at {worst.time:.2f} s with {_threads_of(frame)}, and a close-up of node {node} of the {worst.of}, "
+        f"which is {format_number(1e3 * greatest)} mm from {AGAINST[target]}; "
+        f"error of the {worst.of} {format_number(worst.error)} % of the length."
+    )
+    stream = io.BytesIO()
+    figure.savefig(stream, format="jpeg", pil_kwargs={"quality": JPEG_QUALITY, "optimize": True})
+    source = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
+    return ReportPicture(worst, source, words, photo is None)
 
 
-def _draw_frame(
-    axes: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
-) -> PathCollection:
-    """Draw the dish, filling the axes, and return the thread's nodes."""
-    nodes = draw_threads(axes, frame, view, chosen, obstacles, magnified=1.0)
-    if len(chosen.tail):
-        _draw_heading(axes, view, chosen)
-    height, width = frame.shape[:2]
-    middle, half = view.to_pixels(np.zeros(2)), 0.5 * min(height, width)
-    axes.set_xlim(max(-0.5, middle[0] - half), min(width - 0.5, middle[0] + half))
-    axes.set_ylim(height - 0.5, -0.5)
-    draw_scale_bar(axes, view, 0.15)
-    return nodes
+def _draw_dish_and_close_up(
+    figure: Figure, photo: Photo, frame: FrameResult, middle: Points, half: float, height: float = 1.0
+) -> tuple[Axes, Axes]:
+    """Draw the whole dish to the left and a square about a point to the right, with half of its side in metres."""
+    view, (rows, columns) = photo.view, photo.image.shape[:2]
+    scene, close = (figure.add_axes((left, 0.0, 0.4985, height)) for left in (0.0, 0.5015))
+    for axes, magnified in ((scene, 1.0), (close, 1.8)):
+        axes.set_facecolor("#d5d9dd")
+        draw_threads(axes, photo.image, view, frame, frame.obstacles, magnified)
+    half_side = 0.5 * min(rows, columns)
+    edge = half_side - 0.5
+    look_at(scene, np.clip(view.to_pixels(np.zeros(2)), edge, [columns - 1.0 - edge, rows - 1.0 - edge]), half_side)
+    at, reach = view.to_pixels(middle), half / view.metres_per_pixel
+    look_at(close, at, reach)
+    box: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.0, "linestyle": (0, (3, 2))}
+    scene.add_patch(Rectangle((at[0] - reach, at[1] - reach), 2.0 * reach, 2.0 * reach, **box))
+    for axes, share in ((scene, 0.25), (close, 0.4)):
+        draw_scale_bar(axes, view.metres_per_pixel, share)
+    return scene, close
+
+
+def _threads_of(frame: FrameResult) -> str:
+    names = ["predicted"]
+    names += ["estimated"] if frame.estimate is not None else []
+    names += ["measured"] if len(frame.measured) > 1 else []
+    names += ["true"] if len(frame.ground_truth) > 1 else []
+    return f"{', '.join(names[:-1])} and {names[-1]} thread" if len(names) > 1 else "predicted thread"
+
+
+def draw_plan(dish_diameter: float) -> Photo:
+    """Return a drawn dish, where no camera saw the real one."""
+    middle = 0.5 * (PLAN_PIXELS - 1.0)
+    view = DishView((middle, middle), dish_diameter / (PLAN_SHARE * PLAN_PIXELS))
+    v, u = np.mgrid[:PLAN_PIXELS, :PLAN_PIXELS]
+    inside = np.hypot(u - middle, v - middle) < 0.5 * PLAN_SHARE * PLAN_PIXELS
+    return Photo(np.where(inside, 244, 200).astype(np.uint8), view)
 
 
 def draw_threads(
@@ -163,126 +244,29 @@ def draw_threads(
     )
 
 
-def _draw_close_up(
-    scene: Axes, frame: NDArray[np.uint8], view: DishView, chosen: FrameResult, obstacles: Sequence[Obstacle]
-) -> None:
-    """Draw the workspace of the node nearest to an obstacle, or of the thread's end, magnified."""
-    vertices = view.to_pixels(chosen.vertices)
-    clearance = chosen.clearance
-    nearest = int(np.argmin(clearance)) if np.isfinite(clearance).any() else len(vertices) - 1
-    centre, half = vertices[nearest], CLOSE_UP / view.metres_per_pixel
-    # Into the corner of the picture that is farthest from the thread.
-    left, right = scene.get_xlim()
-    bottom, top = scene.get_ylim()
-    everything = np.vstack([vertices, view.to_pixels(chosen.tail[None])])
-    corners = [(x, y) for x in (0.0, 0.62) for y in (0.0, 0.62)]
-    middles = [np.array([left + (x + 0.19) * (right - left), bottom + (y + 0.19) * (top - bottom)]) for x, y in corners]
-    room = [np.linalg.norm(everything - middle, axis=1).min() for middle in middles]
-    x, y = corners[int(np.argmax(room))]
-    x, y = (at + (0.01 if at == 0.0 else -0.01) for at in (x, y))
-    inset = scene.inset_axes((x, y, 0.38, 0.38))
-    draw_threads(inset, frame, view, chosen, obstacles, magnified=1.8)
-    look_at(inset, centre, half)
-    for side in inset.spines.values():
-        side.set_visible(True)
-        side.set_color(INK)
-        side.set_linewidth(0.8)
-    box = (centre[0] - half, centre[1] - half, 2.0 * half, 2.0 * half)
-    scene.indicate_inset(box, inset, edgecolor=INK, alpha=0.7, linewidth=0.7)
-
-
-def _draw_colours(figure: Figure, nodes: PathCollection, chosen: FrameResult) -> None:
-    """Draw the key: what each line is, and the colours of the margin."""
-    axes = figure.add_axes((0.015, 0.035, 0.24, 0.06))
-    lines: list[tuple[str, dict[str, Any]]] = [("predicted", {"color": PREDICTED, "linewidth": 2.2})]
-    if chosen.estimate is not None:
-        lines.append(("estimated", {"color": ESTIMATED, "linewidth": 1.6}))
-    if len(chosen.measured) > 1:
-        lines.append(("measured by the camera", {"color": SEEN, "linewidth": 5.0, "alpha": 0.45}))
-    if len(chosen.ground_truth) > 1:
-        lines.append(("ground truth", {"color": TRUTH, "linewidth": 1.3, "linestyle": (0, (4, 2.5))}))
-    handles = [Line2D([], [], label=name, **style) for name, style in lines]
-    axes.legend(handles=handles, loc="center left", ncols=2, fontsize=8.5, frameon=False, borderpad=0.0)
-    axes.set_axis_off()
-    bar = figure.colorbar(nodes, cax=figure.add_axes((0.285, 0.062, 0.17, 0.014)), orientation="horizontal")
-    bar.set_label("nodes, by distance from the obstacles [mm]", fontsize=8.5, color=INK)
-    bar.ax.tick_params(labelsize=8, colors=INK, length=2)
-    bar.outline.set_visible(False)
-
-
-def _draw_heading(axes: Axes, view: DishView, chosen: FrameResult) -> None:
-    tail = view.to_pixels(chosen.tail)
-    ahead = 34.0 * np.array([np.cos(chosen.heading), -np.sin(chosen.heading)])
-    outline = [patheffects.withStroke(linewidth=3.0, foreground="white")]
-    style: dict[str, Any] = {"arrowstyle": "-|>", "color": INK, "linewidth": 1.3, "path_effects": outline}
-    axes.annotate("", xy=tuple(tail + ahead), xytext=tuple(tail), arrowprops=style)
-
-
 def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
     """Show a square of a picture, by its middle and half of its side [px]."""
     axes.set_xlim(centre[0] - half, centre[0] + half)
     axes.set_ylim(centre[1] + half, centre[1] - half)
 
 
-def draw_scale_bar(axes: Axes, view: DishView, share: float) -> None:
-    """Draw a scale bar of a round length, at most a share of the picture's width."""
+def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
+    """Draw a scale bar of a round length, at most a share of the picture's width.
+
+    Args:
+        axes: to draw in, with limits.
+        metres: that a unit of the axes is long [m].
+        share: of the width.
+    """
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
-    fitting = [bar for bar in BARS if bar / view.metres_per_pixel <= share * (right - left)]
-    bar = fitting[-1] if fitting else BARS[0]
+    bar = max((bar for bar in BARS if bar / metres <= share * (right - left)), default=BARS[0])
     x, y = left + 0.04 * (right - left), low + 0.04 * (high - low)
-    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color="white", linewidth=6.0, solid_capstyle="butt")
-    axes.plot([x, x + bar / view.metres_per_pixel], [y, y], color=INK, linewidth=3.0, solid_capstyle="butt")
+    for colour, width in (("white", 6.0), (INK, 3.0)):
+        axes.plot([x, x + bar / metres], [y, y], color=colour, linewidth=width, solid_capstyle="butt", zorder=5)
     box = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
-    axes.text(
-        x, y + 0.015 * (high - low), f"{1e3 * bar:g} mm", color=INK, fontsize=11, ha="left", va="bottom", bbox=box
-    )
-
-
-def _draw_error(axes: Axes, series: TimeSeries) -> None:
-    for kind, column, colour in (("prediction", "error", PREDICTED), ("estimate", "estimate_error", ESTIMATED)):
-        for target, name, dashes in (("truth", "ground truth", "-"), ("seen", "measured centreline", ":")):
-            if series.has(f"{column}_{target}"):
-                errors, label = series.column(f"{column}_{target}"), f"{kind}, against the {name}"
-                axes.plot(series.times, errors, color=colour, linewidth=1.4, linestyle=dashes, label=label)
-    axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])  # room for the legend
-    axes.set_title("error [% of the thread's length]", fontsize=9.5, color=INK, loc="left")
-    if axes.get_lines():
-        axes.legend(loc="upper right", fontsize=8.5, frameon=False, ncols=2)
-
-
-def _draw_consistency(axes: Axes, series: TimeSeries) -> None:
-    found = Consistency.of(series)
-    title = "normalised innovation squared, its mean in windows, and the 95 % band of such means"
-    axes.set_title(title, fontsize=9.5, color=INK, loc="left")
-    squared = series.column("innovation_squared")
-    axes.plot(series.times, squared, ".", color=FAINT, markersize=2.0, alpha=0.5)
-    if found is None:
-        return
-    axes.set_ylim(0.0, max(2.5, float(np.nanpercentile(squared, 98))))
-    for begin, end, mean, low, high in zip(found.begins, found.ends, found.means, found.low, found.high, strict=True):
-        axes.fill_between([begin, end], low, high, color=ESTIMATED, alpha=0.3, linewidth=0)
-        axes.plot([begin, end], [mean, mean], color=INK, linewidth=1.8)
-
-
-def _draw_clearance(axes: Axes, series: TimeSeries) -> None:
-    clearance = 1e3 * np.fmin.reduce([series.column(f"margin_{kind}") for kind in SOLID])
-    axes.set_title("minimum clearance from an obstacle [mm]", fontsize=9.5, color=INK, loc="left")
-    if not np.isfinite(clearance).any():
-        axes.text(0.5, 0.5, "no obstacle near the thread", transform=axes.transAxes, ha="center", color=FAINT)
-        return
-    axes.plot(series.times, clearance, color="#1f9d55", linewidth=1.4)
-    top = max(1.05 * float(np.nanmax(clearance)), 1e-3)
-    axes.set_ylim(-0.06 * top, top)
-    axes.axhspan(-0.06 * top, 0.0, color="#c8102e", alpha=0.15, linewidth=0)
-
-
-def _draw_strain(axes: Axes, series: TimeSeries) -> None:
-    values = np.maximum(100.0 * series.column("strain"), 1e-7)
-    axes.set_yscale("log")
-    axes.set_ylim(values.min() / 3.0, values.max() * 3.0)
-    axes.plot(series.times, values, color=INK, linewidth=1.2)
-    axes.set_title("maximum stretch or compression of a segment [%]", fontsize=9.5, color=INK, loc="left")
+    y += 0.015 * (high - low)
+    axes.text(x, y, f"{1e3 * bar:g} mm", color=INK, fontsize=11, ha="left", va="bottom", bbox=box)
 
 
 def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
@@ -362,3 +346,58 @@ def tidy(axes: Axes) -> None:
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(FAINT)
+
+
+def plot_scene(path: Path, scene: Scene, name: str) -> None:
+    """Draw a scene into a file, PNG or SVG by its ending: dish, shapes in the colours of their kinds, names and scale.
+
+    Args:
+        path: to write.
+        scene: to draw.
+        name: of the scene, for the title.
+    """
+    # The same scene gives the same bytes; in SVG, text stays text.
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": scene.version}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph")  # of a name in a script that the font does not have
+        figure = Figure(figsize=(SCENE_SIDE, SCENE_SIDE + SCENE_TITLE), dpi=150)
+        FigureCanvasAgg(figure)
+        _draw_scene(figure.add_axes((0.0, 0.0, 1.0, SCENE_SIDE / (SCENE_SIDE + SCENE_TITLE))), scene)
+        dish = f"dish of {1e3 * scene.dish.diameter:g} mm, {1e3 * scene.dish.depth:g} mm deep"
+        style: dict[str, Any] = {"color": INK, "parse_math": False}
+        figure.text(0.03, 0.972, name, fontsize=14, va="top", weight="bold", **style)
+        figure.text(0.97, 0.968, f"{dish}, version {scene.version}", fontsize=9, va="top", ha="right", **style)
+        figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+def _draw_scene(axes: Axes, scene: Scene) -> None:
+    radius, reach = 1e3 * scene.dish.radius, 1e3 * (0.5 + SCENE_BORDER) * scene.dish.diameter
+    axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#f4f1ec", edgecolor="#8f877b", linewidth=2.5, zorder=0))
+    axes.plot([0.0], [0.0], "+", color=FAINT, markersize=9.0, markeredgewidth=0.8, zorder=1)
+    axes.set_aspect("equal")
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_axis_off()
+    ground = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
+    text: dict[str, Any] = {"bbox": ground, "ha": "center", "fontsize": 9.5, "color": INK, "parse_math": False}
+    for shape in scene.shapes:
+        face, edge = KIND_COLOURS[shape.kind]
+        axes.add_patch(shape_patch(shape.geometry, facecolor=face, edgecolor=edge, linewidth=1.0, zorder=2, alpha=0.9))
+        left, bottom, right, top = (1e3 * value for value in shape.solid.bounds)
+        x, y = (1e3 * value for value in shape.label_point)
+        name = axes.text(x, y, shape.name, va="center", zorder=5, **text)
+        room = axes.transData.inverted().transform_bbox(name.get_window_extent())
+        if room.width > right - left or room.height > top - bottom:  # does not fit into the shape: above it
+            name.set(position=(0.5 * (left + right), top + 0.01 * radius), verticalalignment="bottom")
+    draw_scale_bar(axes, 1e-3, 0.2)
+    there = [kind for kind in KINDS if any(shape.kind == kind for shape in scene.shapes)]
+    if there:
+        faces = [Patch(facecolor=KIND_COLOURS[kind][0], edgecolor=KIND_COLOURS[kind][1], label=kind) for kind in there]
+        axes.legend(handles=faces, loc="lower right", fontsize=9, frameon=False, labelcolor=INK)
+
+
+def shape_patch(geometry: Disc | Polygon, **style: Any) -> Circle | PathPatch:
+    """Return a shape as a patch in millimetres, its holes left open."""
+    if isinstance(geometry, Disc):
+        return Circle((1e3 * geometry.centre[0], 1e3 * geometry.centre[1]), 1e3 * geometry.radius, **style)
+    rings = [Outline(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in geometry.rings]
+    return PathPatch(Outline.make_compound_path(*rings), **style)

@@ -1,10 +1,7 @@
-"""Forecast: where needle and thread will be while a command is held, or a sequence of commands is followed."""
+"""Forecast: where needle and thread will be while a command is held."""
 
-from magnetosuture_thread.forecast.drag import NeedleDrag
-from magnetosuture_thread.forecast.forecast import Forecast, ForecastContact, ForecastMargin
-from magnetosuture_thread.forecast.forecaster import ThreadForecaster
-from magnetosuture_thread.forecast.making import make_forecaster
-from magnetosuture_thread.forecast.start import ForecastStart
+from magnetosuture_thread.forecast.forecast import Forecast, ForecastContact, ForecastMargin, ForecastStart
+from magnetosuture_thread.forecast.forecaster import NeedleDrag, ThreadForecaster, make_forecaster
 
 __all__ = [
     "Forecast",

@@ -1,17 +1,97 @@
-"""The result of a forecast."""
+"""Where a forecast starts, and its result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.forecast.rollout_data import KINDS, NEEDLE_MARGIN, NO_CONTACT, OBSTACLE_MARGIN, RolloutRecord
+from magnetosuture_thread.arguments import bounded, checked_arguments
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.forecast.rollout import KINDS, NEEDLE_MARGIN, NO_CONTACT, OBSTACLE_MARGIN, RolloutRecord
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator import ThreadEstimate
+from magnetosuture_thread.model.formulations import WarmStart
+from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.thread import Thread
+
+Vector = NDArray[np.float64]
 
 WALL_NAME = "wall"
+
+
+@checked_arguments("forecast start", InvalidInputError)
+@dataclass(frozen=True, eq=False)
+class ForecastStart:
+    """Needle and thread at the start of a forecast.
+
+    Attributes:
+        pose: of the needle's tail.
+        vertices: of the thread, shape (n + 1, 2) [m].
+        velocities: of the thread's nodes over the last step, shape (n + 1, 2) [m/s]; None for a thread at rest.
+        interval: duration of that step; 0 if there was none [s].
+        tip_velocity: filtered velocity of the tip before the start, shape (2,) [m/s], from which the acceleration is
+            limited; None if it is not known, and then the first change is not limited.
+        needle_force: of the thread upon the needle, shape (2,) [N], from which a needle with drag goes on; None if it
+            is not known.
+        warm_start: of the formulation, which brings friction that holds already; None for none.
+        thread: with the stiffness, rest curvature and drag to forecast with; None for the forecaster's own.
+    """
+
+    pose: NeedlePose
+    vertices: Points
+    velocities: Points | None = None
+    interval: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0
+    tip_velocity: Vector | None = None
+    warm_start: WarmStart | None = None
+    needle_force: Vector | None = None
+    thread: Thread | None = None
+
+    @classmethod
+    def of_estimate(
+        cls, estimate: ThreadEstimate, pose: NeedlePose, tip_velocity: Vector | None = None
+    ) -> ForecastStart:
+        """Return the start from an estimate, with what the estimator has learned of the thread.
+
+        Args:
+            estimate: of the thread.
+            pose: of the needle's tail.
+            tip_velocity: see the attributes.
+        """
+        forces = estimate.prediction.forces
+        needle_force = None if forces is None else forces.needle_force
+        positions = estimate.positions
+        return cls(pose, positions, tip_velocity=tip_velocity, needle_force=needle_force, thread=estimate.thread)
+
+    @classmethod
+    def of_predictor(
+        cls,
+        predictor: ThreadPredictor,
+        pose: NeedlePose | None = None,
+        tip_velocity: Vector | None = None,
+        needle_force: Vector | None = None,
+    ) -> ForecastStart:
+        """Return the start from where a predictor is.
+
+        Args:
+            predictor: that has started.
+            pose: of the needle's tail, where the thread is not fixed to that.
+            tip_velocity: see the attributes.
+            needle_force: see the attributes.
+
+        Raises:
+            InvalidInputError: it has not started.
+        """
+        if predictor.state is None or predictor.pose is None:
+            raise InvalidInputError("predictor", "one before its start", "one that has started")
+        state = predictor.state
+        warm_start = predictor.formulation.warm_start() if state.interval > 0.0 else None
+        own = predictor.pose if pose is None else pose
+        return cls(own, state.positions, state.velocities, state.interval, tip_velocity, warm_start, needle_force)
 
 
 @dataclass(frozen=True)
@@ -71,6 +151,7 @@ class Forecast:
         problem: why the forecast ends before its horizon; empty if it does not.
         shapes: names of the scene's shapes, then "wall".
         scene_version: of the scene; empty where there is none.
+        record: of compiled code, of at least as many steps.
     """
 
     stamp: float
@@ -89,53 +170,7 @@ class Forecast:
     problem: str
     shapes: tuple[str, ...]
     scene_version: str
-    _record: RolloutRecord = field(repr=False)
-
-    @classmethod
-    def of(
-        cls,
-        record: RolloutRecord,
-        steps: int,
-        *,
-        stamp: float,
-        interval: float,
-        commanded: Points,
-        problem: str,
-        shapes: tuple[str, ...],
-        scene_version: str,
-    ) -> Forecast:
-        """Return the forecast of a record.
-
-        Args:
-            record: of a rollout.
-            steps: k, of which it holds the results.
-            stamp: of the start [s].
-            interval: of a step [s].
-            commanded: shape (k, 2) or longer [m/s].
-            problem: why there are no more steps.
-            shapes: names of the scene's shapes, then of the wall.
-            scene_version: of the scene.
-        """
-        instants = steps + 1
-        return cls(
-            stamp=stamp,
-            times=interval * np.arange(float(instants)),
-            vertices=record.vertices[:instants],
-            tails=record.poses[:instants, :2],
-            headings=record.poses[:instants, 2:],
-            commanded=commanded[:steps],
-            filtered=record.filtered[:steps],
-            slowdown=record.slowdown[:steps],
-            margins={name: record.margin[:instants, kind] for kind, name in enumerate(KINDS)},
-            friction=record.rubbed[:instants],
-            tension=record.tension[:instants],
-            needle_force=record.pull[:instants],
-            converged=bool(record.converged[:instants].all()),
-            problem=problem,
-            shapes=shapes,
-            scene_version=scene_version,
-            _record=record,
-        )
+    record: RolloutRecord = field(repr=False)
 
     @property
     def horizon(self) -> float:
@@ -149,10 +184,10 @@ class Forecast:
 
     def _minimum(self, kind: int, name: str) -> ForecastMargin:
         at = int(self.margins[name].argmin())
-        value, shape = float(self.margins[name][at]), int(self._record.shape[at, kind])
+        value, shape = float(self.margins[name][at]), int(self.record.shape[at, kind])
         named = np.isfinite(value) and (kind in (OBSTACLE_MARGIN, NEEDLE_MARGIN) or name == WALL_NAME)
         return ForecastMargin(
-            value, float(self.times[at]), int(self._record.node[at, kind]), self.shapes[shape] if named else ""
+            value, float(self.times[at]), int(self.record.node[at, kind]), self.shapes[shape] if named else ""
         )
 
     @cached_property
@@ -179,7 +214,7 @@ class Forecast:
     @cached_property
     def first_contact(self) -> ForecastContact | None:
         """When the thread first touches a shape or the wall, and which; None if it does not."""
-        contact = self._record.contact[: len(self.times)]
+        contact = self.record.contact[: len(self.times)]
         found = np.flatnonzero(contact[:, 0] != NO_CONTACT)
         if not len(found):
             return None
@@ -199,5 +234,5 @@ class Forecast:
         """Names of the shapes, and "wall", at which it comes to rest; empty if it does not."""
         if self.rest_time is None:
             return ()
-        touched = self._record.touched[len(self.filtered) - 1]
+        touched = self.record.touched[len(self.filtered) - 1]
         return tuple(name for name, active in zip(self.shapes, touched.tolist(), strict=True) if active)

@@ -1,41 +1,38 @@
-"""The forecaster: rolls needle, safety filter and thread out over a horizon, one forecast or a batch of them."""
+"""The forecaster: rolls needle, safety filter and thread out over a horizon."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import replace
-from queue import Empty, SimpleQueue
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.forecast.drag import NeedleDrag
-from magnetosuture_thread.forecast.forecast import WALL_NAME, Forecast
-from magnetosuture_thread.forecast.rollout import roll_out
-from magnetosuture_thread.forecast.rollout_data import (
-    MarginBuffers,
+from magnetosuture_thread.forecast.forecast import WALL_NAME, Forecast, ForecastStart
+from magnetosuture_thread.forecast.rollout import (
+    KINDS,
+    DragData,
+    FrictionData,
     RolloutBuffers,
     RolloutModel,
     RolloutRecord,
     RolloutState,
+    roll_out,
 )
-from magnetosuture_thread.forecast.start import ForecastStart
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM, MotionBuffers
-from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
+from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM
+from magnetosuture_thread.model.formulations.step_buffers import ContactBuffers, StepBuffers
 from magnetosuture_thread.model.margins import FrictionLaw
 from magnetosuture_thread.model.prediction import NeedlePose, check_pose
 from magnetosuture_thread.model.predictor import MAX_STEP_LENGTH, ThreadPredictor
+from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.safety import NeedleSafetyFilter
@@ -47,8 +44,55 @@ Controller = Callable[[float, Vector, Vector], Vector]
 
 MAX_HORIZON = 60.0  # s
 MAX_STEPS = 20_000
-MAX_BATCH = 10_000
-NO_FRICTION = np.array([-math.inf, 1.0, math.inf, 0.0])
+
+
+@checked_arguments("needle drag")
+@dataclass(frozen=True)
+class NeedleDrag:
+    """The needle's drag, by which the thread's pull moves it.
+
+    Coils allocated for a velocity v of the tip give the needle a force along its chord and a torque. With the force F
+    of the thread at its tail, the unit vector e from tail to tip, n to its left, and the chord l, the needle moves with
+
+        u = (along v . e + F . e) / (along - thread),    w = F . n / across
+        omega = (v . n) / (l / 2) - (l / 2) (F . n) / turning
+
+    where `along` has, as that of the coil bridge, the drag `thread` of a straight thread behind the needle: with that
+    thread u = v . e. Source: none; force and torque balance without inertia. Deviation: the moment of a clamped thread
+    is left out; and the pull moves the needle no faster than the filtered velocity times the share of the commanded one
+    that this is, as a needle that the barriers hold back leans on what they keep it from.
+
+    Attributes:
+        along: drag along the needle, that of a straight thread included [N s/m].
+        across: drag across it [N s/m].
+        turning: torque at 1 rad/s [N m s].
+        thread: part of `along` that the thread adds; None for all of its drag along itself [N s/m].
+
+    Raises:
+        ConfigurationError: a number is not positive, or the thread's part is not less than the whole.
+    """
+
+    along: Annotated[float, bounded("N s/m", 1e-15)]
+    across: Annotated[float, bounded("N s/m", 1e-15)]
+    turning: Annotated[float, bounded("N m s", 1e-20)]
+    thread: float | None = None
+
+    def data(self, thread: Thread, learned: Thread | None = None) -> DragData:
+        """Return it for compiled code.
+
+        Args:
+            thread: with which `along` was measured.
+            learned: that is driven, as the estimator has learned it; None for the same.
+
+        Raises:
+            ConfigurationError: the thread's part is not less than the whole.
+        """
+        part = thread.medium.drag_along * thread.length if self.thread is None else self.thread
+        if not 0.0 <= part < self.along:
+            raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
+        driven = learned or thread
+        whole = driven.medium.drag_across * driven.length
+        return DragData(self.along, self.along - part, self.across, self.turning, whole)
 
 
 class ThreadForecaster:
@@ -63,7 +107,7 @@ class ThreadForecaster:
     drag is given, and the thread follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor`
     divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand,
     but for rounding; it is compiled from end to end. Where the structured solver does not get on with a step, the
-    forecast ends there and says so, as no general solver is tried.
+    forecast ends there and says so, as no general solver is tried. Several threads may forecast at once.
 
     Args:
         thread: the thread.
@@ -75,13 +119,8 @@ class ThreadForecaster:
         drag: of the needle, by which the thread's pull moves it; None for one that follows the filtered velocity
             exactly.
         step: duration of a step [s].
-        margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
-        contact_tolerance: a node this close to a shape or the wall touches it [m].
-        residual_tolerance: the largest scaled residual with which a solution is accepted.
-        max_step: steps of the thread are no longer than this [s].
-        max_substeps: but a step is divided into so many at the most.
         fixed_nodes: nodes that stay where they are.
-        workers: threads of the processor for a batch; None for as many as there are.
+        options: by name, see `PredictorOptions`; `margin_range` is 2 mm by default.
 
     Attributes:
         thread, scene, safety, step: see the arguments.
@@ -104,66 +143,38 @@ class ThreadForecaster:
         attachment_offset: Annotated[Sequence[float], bounded("m", -0.1, 0.1, multiple=2)] = (),
         drag: NeedleDrag | None = None,
         step: Annotated[float, bounded("s", 1e-4, 1.0)] = 1.0 / 66.0,
-        margin_range: float = 2e-3,
-        contact_tolerance: float = 2e-6,
-        residual_tolerance: float = 1e-6,
-        max_step: float = 0.02,
-        max_substeps: int = 200,
         fixed_nodes: Sequence[int] = (),
-        workers: Annotated[int | None, bounded("", 1, 1024)] = None,
+        **options: object,
     ) -> None:
         safety = NeedleSafetyFilter(scene) if safety is None else safety
         if safety.scene.version != scene.version:
             expected = f"the forecast's own, {scene.version}"
             raise ConfigurationError("safety filter's scene", safety.scene.version, expected)
-        if law is not None and law.threshold > margin_range:
-            raise ConfigurationError(
-                "margin_range", margin_range, f"at least the friction threshold {law.threshold:g} m"
-            )
-        self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
-        predictor = ThreadPredictor(
-            thread,
-            scene,
-            margin_range=margin_range,
-            contact_tolerance=contact_tolerance,
-            residual_tolerance=residual_tolerance,
-            max_step=max_step,
-            max_substeps=max_substeps,
-            fixed_nodes=fixed_nodes,
-        )
-        formulation = predictor.formulation
+        numbers: dict[str, Any] = {"margin_range": 2e-3, **options}
+        predictor = ThreadPredictor(thread, scene, fixed_nodes=fixed_nodes, **numbers)
+        chosen, formulation, friction = predictor.options, predictor.formulation, FrictionData()
         assert isinstance(formulation, RodFormulation)
-        self._formulation, self._drag = formulation, drag
-        around = Workspace(
-            scene.obstacles, margin_range + 0.5 * thread.diameter, wall_radius=scene.dish.radius
-        )  # margins are of the thread's surface
-        offset = np.zeros(2)
-        offset[: len(attachment_offset)] = attachment_offset
-        friction = NO_FRICTION
         if law is not None:
-            friction = np.array([law.threshold, law.beta, law.stuck_speed, friction_averaging])
-        self._slowed = RolloutModel(
-            rod=formulation.rod,
-            near=formulation.workspace.data,
-            around=around.data,
+            if law.threshold > chosen.margin_range:
+                expected = f"at least the friction threshold {law.threshold:g} m"
+                raise ConfigurationError("margin_range", chosen.margin_range, expected)
+            friction = FrictionData(law.threshold, law.beta, law.stuck_speed, float(friction_averaging))
+        self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
+        self._formulation, self._drag = formulation, drag
+        reach = chosen.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
+        self._model = RolloutModel(
+            step=formulation.step_model(),
+            around=Workspace(scene.obstacles, reach, wall_radius=scene.dish.radius).data,
             needle=safety.compiled_data(),
-            offset=offset,
+            offset=np.array(attachment_offset or (0.0, 0.0), np.float64),
             prescribed=np.array([0, *predictor.fixed_nodes], np.int64),
-            tolerance=float(residual_tolerance),
-            max_step=float(max_step),
+            max_step=float(chosen.max_step),
             max_way=MAX_STEP_LENGTH * thread.segment_length,
-            max_substeps=int(max_substeps),
-            contact_tolerance=float(contact_tolerance),
+            max_substeps=int(chosen.max_substeps),
+            contact_tolerance=float(chosen.contact_tolerance),
             friction=friction,
-            drag=np.zeros(5) if drag is None else drag.numbers(thread),
+            drag=DragData() if drag is None else drag.data(thread),
         )
-        unslowed = friction.copy()
-        unslowed[1] = 1.0  # the factor of each node; which nodes are under friction stays
-        self._unslowed = self._slowed._replace(friction=unslowed)
-        self._workers = max(1, os.cpu_count() or 1) if workers is None else max(1, workers)
-        self._room = 2 * (thread.segments + 1)  # for contacts
-        self._buffers: SimpleQueue[RolloutBuffers] = SimpleQueue()
-        self._pool: ThreadPoolExecutor | None = None
         self._names = (*scene.names, WALL_NAME)
 
     def warm_up(self) -> None:
@@ -174,21 +185,15 @@ class ThreadForecaster:
                 tail = radius * np.array([math.cos(angle), math.sin(angle)]) - [0.5 * chord, 0.0]
                 if self.safety.clearance(tail, east) <= 0.0:
                     continue
-                pose = NeedlePose(0.0, tail, east)
-                vertices = self._straight(pose)
-                self.forecast(ForecastStart(pose, vertices), np.zeros(2), self.step)
+                self.forecast(self.straight(NeedlePose(0.0, tail, east)), np.zeros(2), self.step)
                 return
 
     def straight(self, pose: NeedlePose) -> ForecastStart:
         """Return the start of a thread at rest, straight behind the needle, and along the wall where that is near."""
         check_pose(pose)
-        return ForecastStart(pose, self._straight(pose))
-
-    def _straight(self, pose: NeedlePose) -> Points:
-        fixed = self._attached(pose)
         radius = self.scene.dish.radius - 0.5 * self.thread.diameter
-        path = lay_behind_needle(fixed, pose.heading, self.thread.length, radius)
-        return chain_inside(path, self.thread.segments, self.thread.segment_length, radius)
+        path = lay_behind_needle(self._attached(pose), pose.heading, self.thread.length, radius)
+        return ForecastStart(pose, chain_inside(path, self.thread.segments, self.thread.segment_length, radius))
 
     def forecast(
         self, start: ForecastStart, commands: Vector | Controller, horizon: float = 3.0, *, slowed: bool = True
@@ -208,122 +213,59 @@ class ThreadForecaster:
         """
         steps = self._steps(horizon)
         self._check_start(start)
-        buffers = self._take_buffers()
-        try:
+        sequence = np.zeros((steps, 2)) if callable(commands) else self._sequence(commands, steps)
+        nodes, state = self.thread.segments + 1, self._begin(start)
+        model, buffers = self._model_of(start, slowed), self._buffers(start)
+        record = RolloutRecord.of(steps, nodes, len(self.scene.shapes))
+        if start.needle_force is not None:
+            record.pull[0] = start.needle_force
+        code, done, asked = ENDED, 0, 1 if callable(commands) else steps
+        while code == ENDED and done < steps:
             if callable(commands):
-                return self._controlled(start, commands, steps, buffers, slowed)
-            return self._held(start, self._sequence(commands, steps), steps, buffers, slowed)
-        finally:
-            self._buffers.put(buffers)
-
-    def forecasts(
-        self,
-        start: ForecastStart | Sequence[ForecastStart],
-        commands: Sequence[Vector] | Vector,
-        horizon: float = 3.0,
-        *,
-        slowed: bool = True,
-    ) -> list[Forecast]:
-        """Return a batch of forecasts, on all cores: each is equal to what `forecast` returns.
-
-        Args:
-            start: of all, or one for each.
-            commands: of each: velocities to hold, shape (m, 2), or sequences, shape (m, k, 2) [m/s].
-            horizon: of all [s].
-            slowed: whether the friction law slows the commands.
-
-        Raises:
-            InvalidInputError: see `forecast`; or there are more than `MAX_BATCH`, or as many starts as not commands.
-        """
-        steps = self._steps(horizon)
-        count = len(commands)
-        if not 0 < count <= MAX_BATCH:
-            raise InvalidInputError("commands", f"{count} of them", f"1 to {MAX_BATCH}")
-        starts = [start] * count if isinstance(start, ForecastStart) else list(start)
-        if len(starts) != count:
-            raise InvalidInputError("starts", f"{len(starts)} of them", f"{count}, one for each command")
-        for each in {id(each): each for each in starts}.values():
-            self._check_start(each)
-        sequences = [self._sequence(command, steps) for command in commands]
-
-        def work(index: int) -> Forecast:
-            buffers = self._take_buffers()
-            try:
-                return self._held(starts[index], sequences[index], steps, buffers, slowed)
-            finally:
-                self._buffers.put(buffers)
-
-        if min(self._workers, count) == 1:
-            return [work(index) for index in range(count)]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._workers, "forecast")
-        return list(self._pool.map(work, range(count)))
-
-    def _held(
-        self, start: ForecastStart, commands: Points, steps: int, buffers: RolloutBuffers, slowed: bool
-    ) -> Forecast:
-        model = self._model(start, slowed)
-        while True:
-            state, record = self._begin(start, buffers), self._record(steps)
-            self._set_force(start, record)
-            code, done = roll_out(model, buffers, state, commands, self.step, 0, steps, record)
-            if code != NO_ROOM:
-                return self._result(start, record, commands, code, done)
-            self._room = max(self._room, 2 * len(buffers.step.node))
-            buffers = self._make_buffers()
-
-    def _controlled(
-        self, start: ForecastStart, controller: Controller, steps: int, buffers: RolloutBuffers, slowed: bool
-    ) -> Forecast:
-        model = self._model(start, slowed)
-        state, record, commands = self._begin(start, buffers), self._record(steps), np.zeros((steps, 2))
-        self._set_force(start, record)
-        code, done = ENDED, 0
-        while done < steps and code == ENDED:
-            tail, heading = state.pose[:2].copy(), state.pose[2:].copy()
-            velocity = np.asarray(controller(done * self.step, tail, heading), np.float64)
-            if velocity.shape != (2,) or not np.isfinite(velocity).all():
-                raise InvalidInputError("controller's command", velocity.tolist(), "two finite numbers [m/s]")
-            commands[done] = velocity
-            code, done = roll_out(model, buffers, state, commands, self.step, done, done + 1, record)
-        if code == NO_ROOM:  # a controller may remember, so it is not asked again: the commands so far are repeated
-            forecast = self._held(start, commands[: done + 1], done + 1, buffers, slowed)
-            return replace(forecast, problem=f"more than {len(buffers.contacts.node)} contacts at once")
-        return self._result(start, record, commands, code, done)
-
-    def _model(self, start: ForecastStart, slowed: bool) -> RolloutModel:
-        """Return the constants of a forecast that starts with this thread."""
-        model, thread = self._slowed if slowed else self._unslowed, start.thread
-        if thread is None or thread is self.thread:
-            return model
-        model = model._replace(rod=self._formulation.rod_of(thread))
-        return model if self._drag is None else model._replace(drag=self._drag.numbers(self.thread, thread))
-
-    def _result(self, start: ForecastStart, record: RolloutRecord, commands: Points, code: int, done: int) -> Forecast:
-        problem = "" if code == ENDED else f"the step at {done * self.step:.3f} s has no solution within the tolerance"
-        return Forecast.of(
-            record,
-            done,
+                velocity = commands(done * self.step, state.pose[:2].copy(), state.pose[2:].copy())
+                sequence[done] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
+            code, done = roll_out(model, buffers, state, sequence, self.step, done, done + asked, record)
+        problem, instants = "", done + 1
+        if code == NO_ROOM:
+            problem = f"more than {len(buffers.contacts.node)} contacts at once at {done * self.step:.3f} s"
+        elif code != ENDED:
+            problem = f"the step at {done * self.step:.3f} s has no solution within the tolerance"
+        return Forecast(
             stamp=start.pose.stamp,
-            interval=self.step,
-            commanded=commands,
+            times=self.step * np.arange(float(instants)),
+            vertices=record.vertices[:instants],
+            tails=record.poses[:instants, :2],
+            headings=record.poses[:instants, 2:],
+            commanded=sequence[:done],
+            filtered=record.filtered[:done],
+            slowdown=record.slowdown[:done],
+            margins={name: record.margin[:instants, kind] for kind, name in enumerate(KINDS)},
+            friction=record.rubbed[:instants],
+            tension=record.tension[:instants],
+            needle_force=record.pull[:instants],
+            converged=bool(record.converged[:instants].all()),
             problem=problem,
             shapes=self._names,
             scene_version=self.scene.version,
+            record=record,
         )
 
-    def _begin(self, start: ForecastStart, buffers: RolloutBuffers) -> RolloutState:
-        """Return the state at the start, with the buffers as the step before it left them."""
-        step = buffers.step
-        step.forget()
-        if start.warm_start is not None and start.interval > 0.0:
-            multipliers, push, shapes, grip = start.warm_start
-            step.multipliers[: len(multipliers)] = multipliers
-            step.push[:], step.grip_shape[:], step.grip[:] = push, shapes, grip
+    def _model_of(self, start: ForecastStart, slowed: bool) -> RolloutModel:
+        """Return the constants of a forecast that starts with this thread."""
+        model, thread = self._model, start.thread
+        if not slowed:  # which nodes are under friction stays
+            model = model._replace(friction=model.friction._replace(beta=1.0))
+        if thread is None or thread is self.thread:
+            return model
+        model = model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
+        return model if self._drag is None else model._replace(drag=self._drag.data(self.thread, thread))
+
+    def _begin(self, start: ForecastStart) -> RolloutState:
+        """Return the state at the start."""
         vertices = np.array(start.vertices, np.float64, order="C")
         velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
         heading = np.asarray(start.pose.heading, np.float64)
-        pulled = self._slowed.drag[0] > 0.0 and start.needle_force is not None
+        pulled = self._drag is not None and start.needle_force is not None
         x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
         return RolloutState(
             vertices,
@@ -334,26 +276,21 @@ class ThreadForecaster:
             np.full(3, math.nan if pulled else 0.0),  # what is no number is worked out from the force
         )
 
-    def _set_force(self, start: ForecastStart, record: RolloutRecord) -> None:
-        if start.needle_force is not None:
-            record.pull[0] = start.needle_force
-
-    def _record(self, steps: int) -> RolloutRecord:
-        return RolloutRecord.of(steps, self.thread.segments + 1, len(self.scene.shapes))
-
-    def _take_buffers(self) -> RolloutBuffers:
-        with suppress(Empty):
-            while True:
-                buffers = self._buffers.get_nowait()
-                if len(buffers.step.node) >= self._room:
-                    return buffers
-        return self._make_buffers()
-
-    def _make_buffers(self) -> RolloutBuffers:
-        segments, contacts = self.thread.segments, self._room
-        step = StepBuffers.of(segments + 1, 2, segments, contacts)
-        solver = BandedSolver().buffers(segments + 1, 2, len(step.first))
-        return RolloutBuffers(step, solver, MotionBuffers.of(segments + 1, 2), MarginBuffers.of(4 * contacts))
+    def _buffers(self, start: ForecastStart) -> RolloutBuffers:
+        """Return buffers as the step before the start left them."""
+        segments, prescribed = self.thread.segments, len(self._model.prescribed)
+        step = StepBuffers.of(segments + 1, 2, segments)
+        if start.warm_start is not None and start.interval > 0.0:
+            step.restore(start.warm_start)
+        return RolloutBuffers(
+            step=step,
+            solver=BandedSolver().buffers(segments + 1, 2, len(step.first)),
+            contacts=ContactBuffers.of(segments + 1, 2),
+            ends=np.zeros((3, prescribed, 2)),
+            pose=np.zeros(6),
+            tension=np.zeros(segments),
+            close=np.zeros(segments + 1, np.int64),
+        )
 
     def _steps(self, horizon: float) -> int:
         if not bounded("s", 0.5 * self.step, MAX_HORIZON).within(horizon):
@@ -371,7 +308,7 @@ class ThreadForecaster:
         return np.array(np.broadcast_to(given, (steps, 2)), order="C")
 
     def _attached(self, pose: NeedlePose) -> Vector:
-        (x, y), (along, left) = pose.heading, self._slowed.offset
+        (x, y), (along, left) = pose.heading, self._model.offset
         return np.asarray(pose.tail + np.array([along * x - left * y, along * y + left * x]))
 
     def _check_start(self, start: ForecastStart) -> None:
@@ -394,3 +331,42 @@ class ThreadForecaster:
         clearance = self.safety.clearance(pose.tail, pose.heading)
         if clearance <= 0.0:
             raise InvalidInputError("needle pose", f"{-clearance:.2e} m inside of a shape or the wall", "one outside")
+
+
+def make_forecaster(
+    settings: ThreadModelSettings, scene: Scene, safety: NeedleSafetyFilter | None = None, **options: Any
+) -> ThreadForecaster:
+    """Return a forecaster of the thread of a thread model, with its friction law.
+
+    The thread takes one step in each of the forecast, however long: what shorter ones change is small beside what the
+    needle does otherwise than forecast.
+
+    Args:
+        settings: of the thread model.
+        scene: dish and shapes.
+        safety: the needle's filter; None for one with the settings' needle, `keep_out` and `pose_margin`.
+        options: further arguments of `ThreadForecaster`, by name; they come before those of the settings.
+
+    Raises:
+        ConfigurationError: see `ThreadForecaster`.
+    """
+    if safety is None:
+        safety = NeedleSafetyFilter(
+            scene,
+            keep_out=settings.keep_out + settings.pose_margin,
+            needle_length=settings.needle_length,
+            needle_curvature=settings.needle_curvature,
+        )
+    step = options.get("step", settings.forecast_step)
+    chosen: dict[str, Any] = {
+        "law": settings.friction_law(),
+        "friction_averaging": settings.friction_averaging,
+        "attachment_offset": settings.attachment_offset,
+        "step": step,
+        "margin_range": settings.margin_range,
+        "contact_tolerance": settings.contact_tolerance,
+        "residual_tolerance": settings.residual_tolerance,
+        "max_step": max(settings.max_step, 1.001 * step),  # against rounding
+        "fixed_nodes": settings.fixed_nodes,
+    }
+    return ThreadForecaster(settings.thread(), scene, safety, **{**chosen, **options})

@@ -14,9 +14,8 @@ from typing import Any
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.campaign.bag import RunBag
 from magnetosuture_thread.campaign.loop import START
-from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
-from magnetosuture_thread.campaign.run import TRACKING, RunResult, check_run, run_procedure
-from magnetosuture_thread.campaign.variation import vary
+from magnetosuture_thread.campaign.page import CampaignDetails, write_campaign_page
+from magnetosuture_thread.campaign.run import RunResult, check_run, run_procedure, vary
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE
@@ -39,8 +38,6 @@ class CampaignResult:
         procedure: its name.
         setup: its name.
         camera: whether frames were rendered and tracked.
-        follower: whether the setup's path follower ran in place of the procedure.
-        local: how the procedure's paths were followed.
         runs: in the order of their seeds.
         died: seeds whose process ended early, and why.
     """
@@ -48,8 +45,6 @@ class CampaignResult:
     procedure: str
     setup: str
     camera: bool
-    follower: bool
-    local: str
     runs: tuple[RunResult, ...]
     died: dict[int, str]
 
@@ -64,8 +59,6 @@ class CampaignResult:
             "procedure": self.procedure,
             "setup": self.setup,
             "camera": self.camera,
-            "follower": self.follower,
-            "local": self.local,
             "simulated": True,
             "successes": self.successes,
             "runs": [run.to_json() for run in self.runs],
@@ -93,8 +86,6 @@ def simulate_campaign(
     *,
     setup: str = "",
     camera: bool = False,
-    follower: bool = False,
-    local: str = TRACKING,
     bags: Collection[int] = (),
     workers: int = 1,
     scheduler: str = "",
@@ -111,8 +102,6 @@ def simulate_campaign(
         output: folder to make.
         setup: name or file of the setup; empty for the procedure's own.
         camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
-        follower: whether the setup's path follower runs in place of the procedure, for comparison.
-        local: how the procedure's paths are followed, one of `LOCAL_CONTROLLERS`.
         bags: seeds whose runs are recorded as bags.
         workers: processes.
         scheduler: address of a Dask scheduler, whose workers make the runs in place of those; for bags they must have
@@ -129,12 +118,11 @@ def simulate_campaign(
     if not set(bags) <= set(seeds):
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
     used = read_procedure_setup(procedure, setup)
-    if not follower:
-        check_run(procedure, used, vary(used, seeds[0]))
+    check_run(procedure, used, vary(used, seeds[0]))
     runs: dict[int, RunResult] = {}
     died: dict[int, str] = {}
     folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
-    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera, follower, local)
+    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera)
     with whole_folder(output) as folder, make_runner(work, workers, scheduler) as runner:
         tasks = [_Task(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
         for index, found in runner.run(tasks, log, progress):
@@ -148,9 +136,9 @@ def simulate_campaign(
             speed = runs[seed].simulated_s / used_time
             log(f"seed {seed}: {outcome} ({speed:.1f} times real time)")
         ordered = tuple(runs[seed] for seed in seeds if seed in runs)
-        result = CampaignResult(procedure.name, used.name, camera, follower, local, ordered, died)
+        result = CampaignResult(procedure.name, used.name, camera, ordered, died)
         (folder / FILE).write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
-        details = CampaignDetails(procedure, used, camera, follower, died, folders)
+        details = CampaignDetails(procedure, used, camera, died, folders)
         (folder / PAGE).write_text(write_campaign_page(details, ordered), encoding="utf-8")
     return result
 
@@ -160,8 +148,6 @@ def _run(
     setup: Setup,
     text: str,
     camera: bool,
-    follower: bool,
-    local: str,
     task: _Task,
     log: Log,
     progress: Progress,
@@ -174,5 +160,5 @@ def _run(
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with nullcontext() if task.bag is None else RunBag(task.bag, setup, notes, START, camera=camera) as bag:
         variation = vary(setup, task.seed)
-        found = run_procedure(procedure, setup, variation, camera=camera, follower=follower, local=local, recorder=bag)
+        found = run_procedure(procedure, setup, variation, camera=camera, recorder=bag)
     return found, process_time() - began

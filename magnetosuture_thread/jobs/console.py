@@ -1,62 +1,68 @@
-"""The job `magnetosuture console`: the operator's page, and the graph behind it. It needs ROS."""
+"""The job `magnetosuture console`: the operator's page, the graph behind it, and recordings. It needs ROS."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from magnetosuture_thread import MagnetosutureError
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.jobs.console_hosts import RecordingHost, SimulatedHost
-from magnetosuture_thread.jobs.replay import GraphInput, live_replay
-from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, Log, open_bag
-from magnetosuture_thread.nodes.console.graph import ConsoleGraph
-from magnetosuture_thread.nodes.console.node import joined
-from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
+from magnetosuture_thread.jobs.graph import FORECAST, JOB, START_TIMEOUT, log_compiling, own_domain
+from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.replay import GraphInput
+from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, SETUP_NOTE, Log, open_bag
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.console.graph import RECORDED_TOPICS, ConsoleGraph, Inbox
+from magnetosuture_thread.nodes.console.node import RIG, GraphHost, joined
+from magnetosuture_thread.nodes.processes import NodeProcesses
+from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import Setup, read_setup
 
 POLL_PERIOD = 0.2  # s between two checks of the nodes
+QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
 REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
+# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
+# go before the browser and the rig, and behind the bridge.
+PREFERRED, PRIORITY = "perception", 5
+SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
+SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
 def console(
     setup_name: str = "",
     *,
+    recordings: Path,
     running: bool = False,
     namespace: str = "",
     bag: Path | None = None,
-    recordings: Path,
-    address: str | None = None,
-    port: int | None = None,
-    token: str | None = None,
-    certificate: str | None = None,
-    private_key: str | None = None,
-    origin: str | None = None,
+    served: Mapping[str, Any],
     log: Log = lambda text: None,
 ) -> None:
     """Serve the operator's page until this process gets SIGINT, SIGTERM or SIGHUP.
 
     Args:
         setup_name: name or path of a setup; where it is empty, that which the bag names, or the default.
+        recordings: folder that gets a bag for each recording.
         running: whether the page is served on the graph of the ROS domain that the environment names; else around a
             simulated rig.
         namespace: of the running graph, where it is in one.
         bag: to play through the nodes in its place.
-        recordings: folder that gets a bag for each recording.
-        address: that the page is served on; the setup's if None.
-        port: of it; the setup's if None.
-        token: that commands need; the setup's if None.
-        certificate: file of the certificate to serve over TLS; the setup's if None.
-        private_key: file of its key; the setup's if None.
-        origin: under which browsers reach the page besides; the setup's if None.
+        served: settings of the page in place of the setup's, of those in `SERVED`.
         log: called with a line for a person at each stage.
 
     Raises:
@@ -64,12 +70,9 @@ def console(
         ConfigurationError: the setup or an option cannot be used.
         GraphError: a node ended or did not come.
     """
-    options = {"address": address, "port": port, "token": token}
-    options |= {"certificate": certificate, "private_key": private_key, "origin": origin}
-    given = {name: value for name, value in options.items() if value is not None}
 
     def settings(setup: Setup) -> ConsoleSettings:
-        return from_mapping(ConsoleSettings, {**to_mapping(setup.console), **given})
+        return from_mapping(ConsoleSettings, {**to_mapping(setup.console), **served})
 
     name = setup_name or DEFAULT_SETUP
     host: RecordingHost
@@ -79,57 +82,316 @@ def console(
             graph = ConsoleGraph(stack.enter_context(joined(namespace=namespace)), settings(setup))
             host = RecordingHost(graph, setup, recordings, log)
         elif bag is not None:
-            replayed = stack.enter_context(open_bag(bag, log, setup_name=setup_name))
-            replayed.check_loop()
-            source, served = GraphInput(replayed), settings(replayed.setup)
-            if source.transport:
-                served = replace(served, image_transport=source.transport)
-            domain, environment, logs = _own_domain(stack)
-            graph = ConsoleGraph(stack.enter_context(joined(domain=domain, simulated_clock=True)), served)
-            host = ReplayHost(graph, source, domain, environment, logs, log)
-            log(f"starting {', '.join(source.nodes)} (ROS domain {domain}, this machine only)")
+            source = GraphInput(stack.enter_context(open_bag(bag, log, setup_name=setup_name)))
+            source.given.check_loop()
+            shown = settings(source.given.setup)
+            shown = replace(shown, image_transport=source.transport) if source.transport else shown
+            place = _place(stack)
+            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
+            host = ReplayHost(graph, source, place, log)
+            log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
         else:
-            served = settings(read_setup(name))
+            shown = settings(read_setup(name))
             shipped = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
-            domain, environment, logs = _own_domain(stack)
-            graph = ConsoleGraph(stack.enter_context(joined(domain=domain)), served)
-            setups = tuple(dict.fromkeys([*shipped, name]))
-            host = SimulatedHost(graph, name, setups, environment, logs, recordings, log)
-            log(f"starting the graph around a simulated rig (ROS domain {domain}, this machine only)")
+            place = _place(stack)
+            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
+            host = SimulatedHost(graph, name, tuple(dict.fromkeys([*shipped, name])), place, recordings, log)
+            log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
         asyncio.run(_serve(graph, host, log))
 
 
-def _own_domain(stack: ExitStack) -> tuple[int, dict[str, str], Path]:
-    """Return a ROS domain for this command alone, the environment for its nodes, and a folder for their logs."""
-    domain = stack.enter_context(reserved_domain())
-    environment = graph_environment(domain)
-    stack.enter_context(environment_of(environment))
-    return domain, environment, Path(stack.enter_context(TemporaryDirectory()))
+@dataclass(frozen=True)
+class Place:
+    """Where nodes run.
+
+    Attributes:
+        domain: ROS domain.
+        environment: for the nodes.
+        logs: folder for what each node prints.
+    """
+
+    domain: int
+    environment: dict[str, str]
+    logs: Path
+
+
+def _place(stack: ExitStack) -> Place:
+    return Place(*stack.enter_context(own_domain()), Path(stack.enter_context(TemporaryDirectory())))
 
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     """Serve the page until this process gets a signal to end, or the graph breaks."""
-    loop, ending = asyncio.get_running_loop(), asyncio.Event()
-    for which in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(which) is not signal.SIG_IGN:
-            loop.add_signal_handler(which, ending.set)
+
+    def report(url: str) -> None:
+        log(f"open {url}")
+        log("Ctrl-C ends everything")
+
+    ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
     try:
         host.start()
-        server = ConsoleServer(graph.settings, graph, host)
-        log(f"open {await server.start()}")
-        log("Ctrl-C ends everything")
-        try:
-            while not ending.is_set():
-                await host.watch()
-                try:
-                    await asyncio.wait_for(ending.wait(), POLL_PERIOD)
-                except asyncio.TimeoutError:
-                    continue
-        finally:
-            await server.stop()
+        await serve_until(ends, ConsoleServer(graph.settings, graph, host), host.watch, POLL_PERIOD, report)
     finally:
         await host.close()
     log("ended")
+
+
+class BagRecording:
+    """Records a bag, in a thread of its own so that a slow disk delays neither jogging nor stopping.
+
+    Args:
+        output: the bag's folder; it is there, whole, once the recording has ended.
+        notes: of the bag.
+        graph: that is recorded.
+        recorded: topics that are recorded.
+    """
+
+    def __init__(
+        self, output: Path, notes: Mapping[str, str], graph: ConsoleGraph, recorded: Sequence[topics.Topic]
+    ) -> None:
+        self.output = output
+        self._notes = notes
+        self._inboxes = [Inbox(graph.node, topic, QUEUE_DEPTH) for topic in recorded]
+        self._ending = threading.Event()
+        self._writing: asyncio.Task[None] | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended, by `end` or because the disk is full."""
+        return self._writing is not None and self._writing.done()
+
+    async def begin(self) -> None:
+        """Begin to record.
+
+        Raises:
+            BagError: the output exists or cannot be written.
+        """
+        loop = asyncio.get_running_loop()
+        begun = loop.create_future()
+        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(begun.set_result, None))
+        self._writing = asyncio.create_task(writing)
+        await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
+        if self._writing.done():
+            await self.end()
+
+    async def end(self) -> None:
+        """End, once all messages are written.
+
+        Raises:
+            BagError: the disk is full or fails; what was recorded before is there.
+        """
+        self._ending.set()
+        try:
+            if self._writing is not None:
+                await self._writing
+        finally:
+            for inbox in self._inboxes:
+                inbox.close()
+            self._inboxes = []
+
+    def _write(self, begun: Callable[[], object]) -> None:
+        with (
+            whole_folder(self.output, is_recording=True) as folder,
+            BagWriter(folder, self._notes, name=self.output.name) as bag,
+        ):
+            for inbox in self._inboxes:
+                bag.add_topic(inbox.topic.channel.recorded, inbox.topic.channel.type_name)
+            begun()
+            ending = False
+            while not ending:
+                ending = self._ending.wait(RECORDING_PERIOD)
+                for inbox in self._inboxes:
+                    for data, arrived in inbox.take():
+                        bag.write(inbox.topic.channel.recorded, arrived, data)
+
+
+def new_name(folder: Path, name: str) -> Path:
+    """Return a folder that does not exist yet for a recording, named by the time and the setup."""
+    stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
+    output, count = folder / stem, 1
+    while output.exists():
+        count += 1
+        output = folder / f"{stem}_{count}"
+    return output
+
+
+class RecordingHost(GraphHost):
+    """Host of a running graph that records bags.
+
+    Args:
+        graph: to serve.
+        setup: with which.
+        recordings: folder that gets a bag for each recording.
+        log: called with a line for a person.
+    """
+
+    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log) -> None:
+        super().__init__(graph)
+        self.setup = setup
+        self.busy = ""
+        self.log = log
+        self._recordings = recordings
+        self._recording: BagRecording | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        recording = "" if self._recording is None else str(self._recording.output)
+        own = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
+        return {**super().state(), **own}
+
+    def notes(self, operator: str) -> dict[str, str]:
+        """Return the notes of a recording, which the page that has control began.
+
+        Args:
+            operator: who commands that page.
+        """
+        notes = {"setup": self.setup.name, SETUP_NOTE: self.setup.path.read_text(encoding="utf-8")}
+        if self.graph.is_active(RIG):
+            what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
+            notes["simulated"] = what
+        return notes
+
+    def start(self) -> None:
+        """Start what this runs; here nothing."""
+
+    async def set_recording(self, recording: bool, operator: str) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal."""
+        if recording == (self._recording is not None):
+            return ""
+        if not recording:
+            return await self._end_recording()
+        if self.busy:
+            return self.busy
+        raw = self.graph.settings.image_transport == "raw"
+        recorded = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
+        output = new_name(self._recordings, self.setup.name)
+        bag = self._recording = BagRecording(output, self.notes(operator), self.graph, recorded)
+        try:
+            await bag.begin()
+        except MagnetosutureError as error:
+            self._recording = None
+            return str(error)
+        self.log(f"recording to {bag.output}")
+        return ""
+
+    async def watch(self) -> None:
+        """Check what runs; called several times a second.
+
+        Raises:
+            GraphError: a node has ended.
+        """
+        if self._recording is not None and self._recording.ended:
+            await self._end_recording()
+
+    async def close(self) -> None:
+        """End the recording."""
+        await self._end_recording()
+
+    async def _end_recording(self) -> str:
+        """End the recording, if there is one; return the problem if it is not complete."""
+        recording = self._recording
+        if recording is None:
+            return ""
+        self._recording = None
+        try:
+            await recording.end()
+        except MagnetosutureError as error:
+            self.log(f"the recording has ended: {error}")
+            return str(error)
+        self.log(f"recorded: {recording.output}")
+        return ""
+
+
+class SimulatedHost(RecordingHost):
+    """Host that starts the whole graph around a simulated rig; any setup can be selected.
+
+    Args:
+        graph: to serve.
+        setup: name or path of the initial setup.
+        setups: that can be selected.
+        place: where the nodes run.
+        recordings: folder that gets a bag for each recording.
+        log: called with a line for a person.
+    """
+
+    mode = "simulated"
+
+    def __init__(
+        self, graph: ConsoleGraph, setup: str, setups: Sequence[str], place: Place, recordings: Path, log: Log
+    ) -> None:
+        super().__init__(graph, read_setup(setup), recordings, log)
+        self._setup_name, self._setups, self._place = setup, tuple(setups), place
+        self._nodes: NodeProcesses | None = None
+        self._since, self._logged = 0.0, set[str]()
+        self._block(f"starting {self.setup.name}")
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        return {**super().state(), "setup": self._setup_name, "setups": list(self._setups), "simulated": True}
+
+    def start(self) -> None:
+        """Start the nodes; they are busy until each of them has reported its state."""
+        arguments = ["--params-file", str(self.setup.path.resolve()), *JOB, *SIMULATED_COILS, *FORECAST]
+        # Here and not in another thread: the nodes end with the thread that has started them.
+        nodes = NodeProcesses(
+            (SCENE_SERVER, RIG, *PROCESSES, PLANNER), arguments, self._place.environment, self._place.logs
+        )
+        self._nodes = nodes.__enter__()
+        self._since = time.monotonic()
+
+    async def select_setup(self, setup: str) -> str:
+        """Stop the nodes and start those of a setup; return the reason of a refusal."""
+        if self.busy:
+            return self.busy
+        if setup not in self._setups:
+            return f"setup: got {setup!r}, expected one of {', '.join(self._setups)}"
+        try:
+            selected = read_setup(setup)
+            version = selected.scene.version  # read while the old nodes still run: they stay if it cannot be
+        except MagnetosutureError as error:
+            return str(error)
+        self._block(f"starting {selected.name}")
+        before, self._nodes = self._nodes, None  # `watch` does not wait for the nodes that are still there
+        await self._end_recording()
+        if before is not None:
+            await asyncio.to_thread(before.end)
+        self.setup, self._setup_name, self.paused = selected, setup, False
+        served = {name: getattr(self.graph.settings, name) for name in SERVED}
+        self.graph.begin(replace(selected.console, **served))
+        self.start()
+        self.log(f"starting {selected.name}, scene {version}")
+        return ""
+
+    async def watch(self) -> None:
+        """Permit commands once all nodes are ready; raise `GraphError` if one has ended."""
+        await super().watch()
+        if self._nodes is None:
+            return
+        self._nodes.check()
+        if not self.busy:
+            return
+        nodes = self.graph.nodes().items()
+        log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
+        missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
+        bridge = self.graph.state()["bridge"] or {}
+        if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
+            # Only now: while it compiles for the first time, others shall not wait for it.
+            self.log(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
+            self._block("")
+            self.log(f"{self.setup.name} runs; the coils are not armed")
+        elif time.monotonic() - self._since > START_TIMEOUT:
+            unheard = ", ".join(missing) or "a bridge that is ready"
+            raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {unheard}")
+
+    async def close(self) -> None:
+        """End recording and nodes."""
+        await super().close()
+        if self._nodes is not None:
+            await asyncio.to_thread(self._nodes.end)
+
+    def _block(self, reason: str) -> None:
+        """Stop the needle and block commands for a reason; an empty one permits them again."""
+        self.graph.publish_velocity((0.0, 0.0))
+        self.busy = self.graph.blocked = reason
 
 
 class ReplayHost(RecordingHost):
@@ -138,30 +400,19 @@ class ReplayHost(RecordingHost):
     Args:
         graph: to serve.
         source: the bag.
-        domain: the graph's ROS domain.
-        environment: for the nodes.
-        logs: folder for what each node prints.
+        place: where the nodes run.
         log: called with a line for a person.
     """
 
     mode = "replay"
 
-    def __init__(
-        self,
-        graph: ConsoleGraph,
-        source: GraphInput,
-        domain: int,
-        environment: dict[str, str],
-        logs: Path,
-        log: Log,
-    ) -> None:
+    def __init__(self, graph: ConsoleGraph, source: GraphInput, place: Place, log: Log) -> None:
         super().__init__(graph, source.given.setup, Path(), log)
-        self._source, self._domain = source, domain
-        self._environment, self._logs = environment, logs
-        self._nodes: NodeProcesses | None = None
+        arguments = source.arguments(place.logs / "lossless.yaml")
+        self._source, self._domain = source, place.domain
+        self._nodes = NodeProcesses(source.processes, arguments, place.environment, place.logs)
         self._ending = threading.Event()
-        self._problem: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="replay")
+        self._playing: asyncio.Task[None] | None = None
         self.busy = f"starting the nodes for {source.given.recording.path}"
         graph.blocked = REPLAY_BLOCKED
 
@@ -173,9 +424,8 @@ class ReplayHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes, and play the bag once they are there."""
-        arguments = self._source.arguments(self._logs / "lossless.yaml")
-        self._nodes = NodeProcesses(self._source.processes, arguments, self._environment, self._logs).__enter__()
-        self._thread.start()
+        self._nodes.__enter__()
+        self._playing = asyncio.create_task(asyncio.to_thread(self._play))
 
     async def set_recording(self, recording: bool, operator: str) -> str:
         """Refuse: another command records a replay."""
@@ -183,36 +433,32 @@ class ReplayHost(RecordingHost):
 
     async def watch(self) -> None:
         """Raise what ended the replay, as a node that has ended or a bag that cannot be played on."""
-        if self._problem is not None:
-            raise self._problem
+        if self._playing is not None and self._playing.done():
+            self._playing.result()
 
     async def close(self) -> None:
         """End the replay and its nodes."""
         self._ending.set()
-        if self._thread.is_alive():
-            await asyncio.to_thread(self._thread.join)
-        if self._nodes is not None:
-            await asyncio.to_thread(self._nodes.end)
+        if self._playing is not None:
+            await asyncio.wait([self._playing])
+        await asyncio.to_thread(self._nodes.end)
 
-    def _run(self) -> None:
-        """Play until `close` is called; in a thread, as a replay waits for the graph in its own way."""
-        live = live_replay(self._source, self._domain, 1.0, lambda topic, time, data: None, self._check, self.log)
+    def _play(self) -> None:
+        """Play until `close` is called; in a thread, as a replay waits for the graph itself."""
+        live = self._source.live(self._domain, 1.0, lambda topic, time, data: None, self._check, self.log)
         try:
             live.wait_for_graph()
             self.busy = ""
             live.play_on(self._source.records)
         except _EndedError:
             pass
-        except Exception as error:  # in a thread nobody else would hear of it
-            self._problem = error
         finally:
             live.close()
 
     def _check(self) -> None:
         if self._ending.is_set():
             raise _EndedError
-        if self._nodes is not None:
-            self._nodes.check()
+        self._nodes.check()
 
 
 class _EndedError(Exception):

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.tables import Row, failed_row, table_csv, table_json
+from magnetosuture_thread.evaluation.tables import Row, failed_row, flat, table_csv, table_json
 from magnetosuture_thread.files import is_url
 from magnetosuture_thread.interface import STORAGE_SUFFIXES
 from magnetosuture_thread.jobs.evaluate_bag import evaluate_bag
-from magnetosuture_thread.jobs.output import whole_folder
+from magnetosuture_thread.jobs.output import whole_folder, write_parquet
 from magnetosuture_thread.jobs.replay_inputs import BagSelection, Log, Progress
 from magnetosuture_thread.jobs.track import numbered
 from magnetosuture_thread.setups import read_setup
@@ -103,6 +103,7 @@ def evaluate_bags(
         ordered = [rows[index] for index in range(len(tasks))]
         (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
         (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
+        write_parquet(folder / "table.parquet", [flat(row) for row in ordered])
     return ordered
 
 

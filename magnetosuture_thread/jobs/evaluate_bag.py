@@ -20,9 +20,9 @@ from magnetosuture_thread.configuration import Configuration, configuration_fiel
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation, WorstFrame
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, BagFigures, LiveFigures
+from magnetosuture_thread.evaluation.plots import Photo, ReportPicture, draw_worst_frame
+from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, Figures, LiveFigures
 from magnetosuture_thread.evaluation.report.page import write_page
-from magnetosuture_thread.evaluation.report.pictures import Photo, ReportPicture, draw_worst_frame
 from magnetosuture_thread.evaluation.tables import Row, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
@@ -91,7 +91,7 @@ class MeasuredBag:
     about: BagDetails
     model: ThreadModelSettings
     metrics: RunMetrics
-    figures: BagFigures
+    figures: Figures
 
 
 def measure_bag(given: BagInput, name: str, against: str, formulation: str, progress: Progress) -> MeasuredBag:
@@ -114,7 +114,7 @@ def measure_bag(given: BagInput, name: str, against: str, formulation: str, prog
     seen = _MeteredReader(given, metrics, progress)
     refused = _predict(given, model, metrics, seen)
     live = live_figures(given.recording, given.start, given.duration)
-    figures = BagFigures.of(metrics, live, (given.start, given.start + given.duration))
+    figures = Figures.of(metrics, live, (given.start, given.start + given.duration))
     if not figures.predicted:
         counts = Counter(metrics.reasons) + refused
         why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING

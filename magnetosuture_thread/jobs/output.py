@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from magnetosuture_thread.bags.writer import RecordingEndedError
 from magnetosuture_thread.errors import BagError
@@ -91,3 +92,17 @@ def whole_file(path: Path) -> Iterator[Path]:
     finally:
         if partial is not None:
             partial.unlink(missing_ok=True)
+
+
+def write_parquet(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows as a Parquet table for DuckDB or pandas; without pyarrow (extra `cluster`) none is written.
+
+    Args:
+        path: the file to make.
+        rows: plain values by column, the same columns in each.
+    """
+    try:
+        from pyarrow import Table, parquet
+    except ModuleNotFoundError:
+        return
+    parquet.write_table(Table.from_pylist([dict(row) for row in rows]), path)

@@ -10,15 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import Attachment, ConfigurationError, Disc, interface
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.messages.packing import (
+    packed_camera_info,
+    packed_compressed_image,
+    packed_path,
+    packed_pose,
+    packed_pose_stamped,
+    packed_twist,
+)
+from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 from magnetosuture_thread.setups import Setup
 
 SIZE = (640, 480)
@@ -84,7 +91,7 @@ def render_bag(
         for channel in (interface.SCENE, *channels):
             bag.add_topic(channel.recorded, channel.type_name)
         begin = round((start + EPOCH) * 1e9)
-        bag.write_message(interface.SCENE.recorded, begin, MESSAGES.scene_message(begin, setup.scene))
+        bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
         for index in range(frames):
             time = start + index / rate
             before, after = max(first, time - 0.5 / rate), min(last, time + 0.5 / rate)
@@ -92,12 +99,12 @@ def render_bag(
             stamp, (tail, heading, thread) = round((time + EPOCH) * 1e9), reference.at(time)
             instant = (
                 *source.messages(stamp, tail, heading, thread),
-                MESSAGES.twist_message(stamp, velocity),
-                MESSAGES.placed(stamp, tail, heading),
-                MESSAGES.path_message(stamp, _resampled(thread, GROUND_TRUTH_POINTS)),
+                packed_twist(stamp, velocity),
+                packed_pose_stamped(stamp, tail, heading),
+                packed_path(stamp, _resampled(thread, GROUND_TRUTH_POINTS)),
             )
             for channel, message in zip(channels, instant, strict=True):
-                bag.write_message(channel.recorded, stamp, message)
+                bag.write(channel.recorded, stamp, message)
             progress((index + 1) / frames)
     return frames
 
@@ -150,12 +157,12 @@ class _FrameTopics:
         self._camera = DishCamera(scene, view, SIZE, seed)
         self._quality = quality
 
-    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[Any, Any]:
+    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
         """Return a message for each channel."""
         camera = self._camera
         data = encode_jpeg(camera.render(tail, heading, thread), self._quality)
-        information = MESSAGES.camera_info(stamp, camera.size, camera.view, CAMERA_HEIGHT)
-        return MESSAGES.compressed_image(stamp, data), information
+        information = packed_camera_info(stamp, camera.size, camera.view, CAMERA_HEIGHT)
+        return packed_compressed_image(stamp, data), information
 
 
 class _PoseTopics:
@@ -167,16 +174,16 @@ class _PoseTopics:
         self._noise = np.array([noise, noise, noise / setup.vision.needle_length])
         self._random = np.random.default_rng(seed)
 
-    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[Any, Any]:
+    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
         """Return a message for each channel."""
         offset = self._noise * self._random.standard_normal(3)
         angle = heading + offset[2]
         direction = np.array([np.cos(angle), np.sin(angle)])
-        pose = MESSAGES.pose_message(stamp, tail + offset[:2], direction, np.diag(self._noise**2))
+        pose = packed_pose(stamp, tail + offset[:2], direction, np.diag(self._noise**2))
         measured = _resampled(thread, MEASURED_POINTS)
         measured[1:] += self._noise[:2] * self._random.standard_normal(measured[1:].shape)
         measured[0] = tail + offset[:2]  # a measured thread begins at the measured tail
-        return pose, MESSAGES.path_message(stamp, measured)
+        return pose, packed_path(stamp, measured)
 
 
 def _resampled(thread: Points, count: int) -> Points:

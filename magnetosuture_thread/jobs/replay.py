@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import stage_latencies
+from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
 from magnetosuture_thread.interface import (
     CAMERA,
     CAMERA_INFO,
@@ -31,6 +31,7 @@ from magnetosuture_thread.interface import (
     THREAD_OBSERVATION,
     Channel,
 )
+from magnetosuture_thread.jobs.graph import JOB, OwnGraph, own_graph
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import (
     BagInput,
@@ -41,12 +42,9 @@ from magnetosuture_thread.jobs.replay_inputs import (
     replay_summary,
     write_results,
 )
-from magnetosuture_thread.jobs.simulate import ACTIVE, SLOWER_BRIDGE
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
-from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.nodes.replay.player import DEPTH, LiveReplay
-from magnetosuture_thread.nodes.run import Interruption
+from magnetosuture_thread.nodes.player import DEPTH, LiveReplay, Timeline
 from magnetosuture_thread.offline.observations import CHANGING
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.scene import write_scene
@@ -55,7 +53,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 # A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed", *SLOWER_BRIDGE, *ACTIVE)
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class GraphInput:
         # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
         scene = qos.with_name("scene.yaml")
         write_scene(self.given.setup.scene, scene)
-        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES]
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES, *JOB]
         if self.transport:
             arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
         return arguments
@@ -120,8 +118,7 @@ class GraphInput:
         """Give the messages to play, by time."""
         given = self.given
         # The scene comes first: the one that is in force in the bag, or else the setup's.
-        message = MESSAGES.scene_message(given.begin, given.setup.scene)
-        data = bytes(typestore().serialize_cdr(message, SCENE.type_name))
+        data = packed_scene(given.begin, given.setup.scene)
         yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what came before about the thread is in force
             earlier = [channel for channel in CHANGING if channel != SCENE]
@@ -134,6 +131,20 @@ class GraphInput:
                 if version == before:
                     continue
             yield record
+
+    def live(
+        self, domain: int, rate: float, receive: Callable[[str, int, bytes], None], check: Callable[[], None], log: Log
+    ) -> LiveReplay:
+        """Return the node that plays the bag; see `LiveReplay`."""
+        return LiveReplay(
+            domain,
+            Timeline(self.given.begin, rate),
+            played=self.topics(),
+            nodes=len(self.nodes),
+            receive=receive,
+            watch=check,
+            log=log,
+        )
 
 
 def replay_live(
@@ -175,11 +186,46 @@ def replay_live(
             log("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
         if rate > 1.0:
             log("played faster than recorded: latencies count what waits in the queues")
-        with whole_folder(output) as folder:
-            summary, problem = _Replay(given, folder, rate, remark, refused, log, progress).run(loop)
+        with whole_folder(output) as folder, TemporaryDirectory() as spare:
+            source = GraphInput(given)
+            arguments, logs = source.arguments(Path(spare) / "lossless.yaml"), folder / "logs"
+            with own_graph(source.processes, arguments, logs, ", ".join(source.nodes), log) as graph:
+                outputs = BagWriter(folder / "bag", given.notes)
+                for topic in (topics.SCENE, *topics.OUTPUTS):
+                    outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
+                live = source.live(graph.domain, rate, outputs.write, graph.check, log)
+                try:
+                    with outputs, graph.interruption:
+                        live.wait_for_graph()
+                        log(
+                            f"playing {given.duration:.1f} s" + (f" at {rate:g} times the speed" if rate != 1.0 else "")
+                        )
+                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{PAUSE_REPLAY}"
+                        log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
+                        length = max(given.duration, 1e-9)
+                        live.play(source.records(), lambda time: progress(min(1.0, time / length)))
+                    log("evaluating the outputs")
+                    summary = _summary(given, folder, live, refused=refused, remark=remark)
+                    write_results(folder, given, *summary, log)
+                    problem = _play_on(live, source, graph, log) if loop else ""
+                finally:
+                    live.close()
     if problem:
         raise GraphError(f"{problem}; the first pass is in {output}")
-    return summary
+    return summary[1]
+
+
+def _play_on(live: LiveReplay, source: GraphInput, graph: OwnGraph, log: Log) -> str:
+    """Play on until Ctrl-C; return what ended it else."""
+    log("the first pass is recorded and evaluated; playing on until Ctrl-C")
+    try:
+        with graph.interruption:
+            live.play_on(source.records)
+    except KeyboardInterrupt:
+        log("ended")
+    except GraphError as error:
+        return str(error)
+    return ""
 
 
 def _check_poses(given: BagInput, log: Log) -> tuple[str, dict[str, int]]:
@@ -196,123 +242,40 @@ def _check_poses(given: BagInput, log: Log) -> tuple[str, dict[str, int]]:
     return remark, dict(checked.refused)
 
 
-@dataclass
-class _Replay:
-    """One replay; see `replay_live`."""
-
-    given: BagInput
-    folder: Path
-    rate: float
-    remark: str
-    refused: dict[str, int]
-    log: Log
-    progress: Progress
-
-    def run(self, loop: bool) -> tuple[ReplaySummary, str]:
-        """Play the bag into the graph and evaluate its outputs; return also what failed after the first pass."""
-        qos = self.folder / "lossless.yaml"
-        source, interruption, problem = GraphInput(self.given), Interruption(), ""
-        with reserved_domain() as domain:
-            environment = graph_environment(domain)
-            self.log(f"starting {', '.join(source.nodes)} (ROS domain {domain}, this machine only)")
-            with (
-                environment_of(environment),
-                NodeProcesses(source.processes, source.arguments(qos), environment, self.folder / "logs") as nodes,
-            ):
-                outputs = BagWriter(self.folder / "bag", self.given.notes)
-                for topic in (topics.SCENE, *topics.OUTPUTS):
-                    outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
-
-                def watch() -> None:
-                    interruption.check()
-                    nodes.check()
-
-                live = live_replay(source, domain, self.rate, outputs.write, watch, self.log)
-                try:
-                    with outputs, interruption:
-                        self._play(live, source, f"ROS_DOMAIN_ID={domain} ros2 service call /{PAUSE_REPLAY}")
-                    self.log("evaluating the outputs")
-                    summary = self._evaluate(live)
-                    if loop:
-                        self.log("the first pass is recorded and evaluated; playing on until Ctrl-C")
-                        try:
-                            with interruption:
-                                live.play_on(source.records)
-                        except KeyboardInterrupt:
-                            self.log("ended")
-                        except GraphError as error:
-                            problem = str(error)
-                finally:
-                    live.close()
-        qos.unlink()
-        qos.with_name("scene.yaml").unlink()
-        return summary, problem
-
-    def _play(self, live: LiveReplay, source: GraphInput, pause: str) -> None:
-        live.wait_for_graph()
-        at = f" at {self.rate:g} times the speed" if self.rate != 1.0 else ""
-        self.log(f"playing {self.given.duration:.1f} s{at}")
-        self.log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
-        length = max(self.given.duration, 1e-9)
-        live.play(source.records(), lambda time: self.progress(min(1.0, time / length)))
-
-    def _evaluate(self, live: LiveReplay) -> ReplaySummary:
-        """Compare the outputs; write summary.json and summary.png."""
-        given = self.given
-        collector = GraphCollector(given.setup.model.thread_length)
-        recorded, replayed = CurrentSeries(), CurrentSeries()
-        truth = GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL
-        expected = [c for c in (*truth, CURRENTS) if given.recording.counts.get(c.recorded)]
-        for record in given.recording.records(expected, start=given.start, duration=given.duration):
-            if record.topic == CURRENTS.recorded:
-                recorded.add(record.decode())
-            else:
-                collector.add(record.topic, record.decode())
-        made = Bag(self.folder / "bag")
-        for record in made.records(set(made.topics)):
-            message = record.decode()
-            collector.add(record.topic, message)
-            if record.topic == CURRENTS.recorded:
-                replayed.add(message)
-        metrics, losses = collector.metrics(given.recording.start), live.losses
-        frames = losses.played[NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
-        if not len(metrics.series):
-            health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
-            things = "poses" if given.source == "poses" else "frames"
-            raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
-        commands = live.published.get(NEEDLE_COMMAND.name, {})
-        summary = replay_summary(
-            given,
-            metrics,
-            frames=frames,
-            tracked=collector.poses,
-            commands=len(commands),
-            driven=len(collector.applied & set(commands)),
-            latency=stage_latencies(live.published, live.arrived, collector.applied),
-            currents=replayed.against(recorded),
-            refused=self.refused,
-            dropped=losses.dropped(),
-            remark=self.remark,
-        )
-        write_results(self.folder, given, metrics, summary, self.log)
-        return summary
-
-
-def live_replay(
-    source: GraphInput,
-    domain: int,
-    rate: float,
-    receive: Callable[[str, int, bytes], None],
-    watch: Callable[[], None],
-    log: Log,
-) -> LiveReplay:
-    """Return the node that plays a bag; see `LiveReplay`."""
-    return LiveReplay(
-        domain,
-        Timeline(source.given.begin, rate),
-        played=source.topics(),
-        nodes=len(source.nodes),
-        receive=receive,
-        watch=watch,
-        log=log,
+def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> tuple[RunMetrics, ReplaySummary]:
+    """Compare the outputs with what the bag holds."""
+    collector = GraphCollector(given.setup.model.thread_length)
+    recorded, replayed = CurrentSeries(), CurrentSeries()
+    truth = GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL
+    expected = [c for c in (*truth, CURRENTS) if given.recording.counts.get(c.recorded)]
+    for record in given.recording.records(expected, start=given.start, duration=given.duration):
+        if record.topic == CURRENTS.recorded:
+            recorded.add(record.decode())
+        else:
+            collector.add(record.topic, record.decode())
+    made = Bag(folder / "bag")
+    for record in made.records(set(made.topics)):
+        message = record.decode()
+        collector.add(record.topic, message)
+        if record.topic == CURRENTS.recorded:
+            replayed.add(message)
+    metrics, losses = collector.metrics(given.recording.start), live.losses
+    frames = losses.played[NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
+    if not len(metrics.series):
+        health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
+        things = "poses" if given.source == "poses" else "frames"
+        raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
+    commands = live.published.get(NEEDLE_COMMAND.name, {})
+    summary = replay_summary(
+        given,
+        metrics,
+        frames=frames,
+        tracked=collector.poses,
+        commands=len(commands),
+        driven=len(collector.applied & set(commands)),
+        latency=stage_latencies(live.published, live.arrived, collector.applied),
+        currents=replayed.against(recorded),
+        dropped=losses.dropped(),
+        **others,
     )
+    return metrics, summary

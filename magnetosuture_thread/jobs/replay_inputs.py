@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 DEFAULT_SETUP = "petri_35mm_polyamide"
 SETUP_NOTE = "scenario"  # of a bag, which holds the setup's text
 MIN_LOOP_DURATION = 1.5  # s; nodes take a jump back of a second and less for messages that come late
-PLAIN_SIZE, PLAIN_SHARE = (480, 640), 0.9  # of the picture of a dish that no camera saw, and the dish's part of it
-PLAIN_FLOOR, PLAIN_OUTSIDE = 225, 170  # its brightness
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -255,16 +253,16 @@ def write_results(folder: Path, given: BagInput, metrics: RunMetrics, summary: R
     (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     chosen = metrics.worst_measured
     assert chosen is not None
-    found = _frame_of(given, chosen.stamp) if given.source == "camera" else _plain_dish(given)
-    if found is None:
+    from magnetosuture_thread.evaluation.plots import Photo, draw_plan, draw_summary  # late, as it imports matplotlib
+
+    found = _frame_of(given, chosen.stamp) if given.source == "camera" else None
+    if found is None and given.source == "camera":
         log("no picture: the dish is not found in any frame")
         return
-    from magnetosuture_thread.evaluation.plots import draw_summary  # late, as it imports matplotlib
-
-    frame, view = found
+    scene = given.setup.scene
+    photo = Photo(*found) if found is not None else draw_plan(scene.dish.diameter)
     at = (chosen.stamp - given.recording.start) * 1e-9
-    obstacles = given.setup.scene.obstacles
-    draw_summary(folder / "summary.png", frame, view, chosen, at, metrics.series, obstacles, summary)
+    draw_summary(folder / "summary.png", photo, replace(chosen, obstacles=scene.obstacles), at, summary)
 
 
 def _frame_of(given: BagInput, stamp: int) -> tuple[NDArray[np.uint8], DishView] | None:
@@ -287,13 +285,3 @@ def _frame_of(given: BagInput, stamp: int) -> tuple[NDArray[np.uint8], DishView]
         if view is not None and frame is not None:
             return frame, view
     return None
-
-
-def _plain_dish(given: BagInput) -> tuple[NDArray[np.uint8], DishView]:
-    """Return a drawn dish, where no camera saw the real one."""
-    rows, columns = PLAIN_SIZE
-    diameter = given.setup.scene.dish.diameter
-    view = DishView((0.5 * (columns - 1), 0.5 * (rows - 1)), diameter / (PLAIN_SHARE * rows))
-    v, u = np.mgrid[:rows, :columns]
-    inside = np.hypot(u - view.centre_px[0], v - view.centre_px[1]) < 0.5 * PLAIN_SHARE * rows
-    return np.where(inside, PLAIN_FLOOR, PLAIN_OUTSIDE).astype(np.uint8), view

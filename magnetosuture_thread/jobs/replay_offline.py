@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.bags.message_types import MESSAGES
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
@@ -35,15 +34,15 @@ from magnetosuture_thread.jobs.replay_inputs import (
     replay_summary,
     write_results,
 )
-from magnetosuture_thread.messages.cdr import time_of
-from magnetosuture_thread.messages.packing import (
-    packed_estimate,
-    packed_margins,
-    packed_observation,
-    packed_path,
-    packed_pose,
-    packed_prediction,
+from magnetosuture_thread.messages.outputs import (
+    Outputs,
+    estimate_outputs,
+    pose_outputs,
+    prediction_outputs,
+    thread_outputs,
 )
+from magnetosuture_thread.messages.packing import packed_tracker_state
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
@@ -170,7 +169,7 @@ class _Output:
     def __init__(self, bag: BagWriter, seen: ObservationReader, given: BagInput) -> None:
         self._bag = bag
         bag.add_topic(SCENE.recorded, SCENE.type_name)
-        bag.write_message(SCENE.recorded, given.begin, MESSAGES.scene_message(given.begin, given.setup.scene))
+        bag.write(SCENE.recorded, given.begin, packed_scene(given.begin, given.setup.scene))
         by_tracker = [TRACKER_STATE, THREAD_OBSERVATION] if seen.source == "camera" else []
         if seen.source == "poses" and given.recording.counts.get(THREAD_OBSERVATION.recorded):
             by_tracker = [THREAD_OBSERVATION]
@@ -181,29 +180,21 @@ class _Output:
 
     def write(self, step: Step) -> None:
         """Write prediction, estimate and margins of an observation."""
-        stamp, result = step.result.stamp, step.result
-        when = time_of(stamp)
-        if result.prediction is not None:
-            packed = packed_prediction(when, result.prediction, step.settings.material)
-            self._bag.write(PREDICTED_THREAD.recorded, max(stamp, 0), packed)
-        if result.refused is not None or result.late:
-            return  # as live: a pose that is refused gets no answer, nor does an observation
-        if result.estimate is not None:
-            self._bag.write(ESTIMATED_THREAD.recorded, max(stamp, 0), packed_estimate(when, result.estimate))
-        of_estimate, reason = result.estimate is not None, "" if step.margins else result.reason
-        packed = packed_margins(when, step.margins, reason, result.scene_version, of_estimate=of_estimate)
-        self._bag.write(MARGINS.recorded, max(stamp, 0), packed)
+        result = step.result
+        self._write(result.stamp, prediction_outputs(result, step.settings.material))
+        if result.refused is None and not result.late:  # as live: a pose that is refused gets no answer
+            self._write(result.stamp, estimate_outputs(result))
 
     def _frame(self, stamp: int, seen: FrameMeasurement) -> None:
         track = seen.track
         if seen.tracked:
-            pose = packed_pose(time_of(stamp), track.tail, track.heading, track.covariance)
-            self._bag.write(NEEDLE_POSE.recorded, max(stamp, 0), pose)
-            observed = packed_observation(time_of(stamp), track.observation)
-            self._bag.write(THREAD_OBSERVATION.recorded, max(stamp, 0), observed)
-            if len(seen.centreline):
-                self._bag.write(MEASURED_THREAD.recorded, max(stamp, 0), packed_path(time_of(stamp), seen.centreline))
-        self._bag.write_message(TRACKER_STATE.recorded, max(stamp, 0), MESSAGES.tracker_state(stamp, track))
+            self._write(stamp, pose_outputs(stamp, track.tail, track.heading, track.covariance))
+            self._write(stamp, thread_outputs(stamp, track.observation, seen.centreline))
+        self._bag.write(TRACKER_STATE.recorded, max(stamp, 0), packed_tracker_state(stamp, track))
+
+    def _write(self, stamp: int, outputs: Outputs) -> None:
+        for channel, data in outputs:
+            self._bag.write(channel.recorded, max(stamp, 0), data)
 
     def _record(self, stamp: int, record: RecordedMessage) -> None:
         if record.topic == SCENE.recorded:

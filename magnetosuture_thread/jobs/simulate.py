@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
+from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.interface import (
     CAMERA,
@@ -26,55 +28,47 @@ from magnetosuture_thread.interface import (
     SCENE,
     SCENE_MARKERS,
     SCENE_SERVER,
-    STANDBY_NODES,
     TIP_SETPOINT,
+)
+from magnetosuture_thread.jobs.graph import (
+    FORECAST,
+    JOB,
+    POLL_PERIOD,
+    START_TIMEOUT,
+    OwnGraph,
+    log_compiling,
+    own_graph,
 )
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
-from magnetosuture_thread.jobs.simulate_procedure import ProcedureRun
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
-from magnetosuture_thread.nodes.diagnostics import COMPILING
-from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.clients import DONE, CoilClient, ProcedureClient, ProcedureReport
 from magnetosuture_thread.nodes.recorder import Recorder
-from magnetosuture_thread.nodes.run import Interruption
 from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.rig.power.stage import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
-    topics.NEEDLE_COMMAND,
-    topics.OPERATOR_COMMAND,
-    topics.TIP_SETPOINT,
-    topics.FAULT_REQUEST,
-    topics.MATERIAL,
-    *topics.ON_REQUEST,
-    *topics.PROCEDURES,
+    *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
+    *(*topics.ON_REQUEST, *topics.PROCEDURES),
 )
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
-START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
 SETTLING_TIME = 1.0  # s for all nodes to have found each other
 PREDICTION_TIMEOUT = 10.0  # s for the first prediction: where the needle cannot be tracked, there is none
-FINAL_TIME = 0.5  # s that go on once the path is done
-TIMEOUT_FACTOR = 3.0  # times the path's own duration, and ...
-EXTRA_TIME = 20.0  # s of simulated time besides: then a run that never ends is ended
+FINAL_TIME = 0.5  # s that go on once the path or procedure is done
+# A run along a path that never ends is ended after this many times its own duration, and so many s of simulated time.
+TIMEOUT_FACTOR, EXTRA_TIME = 3.0, 20.0
+MAX_PROCEDURE_TIME = 600.0  # s of simulated time, as in a campaign
 BOARDS_TIMEOUT = 15.0  # s for simulated boards to be ready
 FAULT = "fault: "  # what a bridge says of itself that needs a reset
-POLL_PERIOD = 0.02  # s between two looks at the nodes
 
-# Where two cores carry the whole graph and a recording besides, the bridge leaves them more of it.
-SLOWER_BRIDGE = ("-p", "coil_bridge:rate:=100.0")
-# Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
-FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
 # On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
-BRIDGE_AND_RECORDER = ("-p", "path_follower:audience:=2")
-# Whatever a setup says for a launch: nobody would activate the nodes of a job.
-ACTIVE = tuple(part for name in STANDBY_NODES for part in ("-p", f"{name}:autostart:=active"))
+AUDIENCE = "audience:=2"  # bridge and recorder
 SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
-
 # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
 # for 75 ms, as happens with two busy cores, would be taken for dead.
 SLOW_BOARD_TIMEOUTS = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
@@ -119,29 +113,25 @@ def simulate(
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
-    execution = ProcedureRun(procedure, setup) if procedure else None
-    if execution is None and not setup.follower.waypoints:
-        raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
+    steering = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
     if setup.vision.image_transport != "compressed":
         name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
         raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
     with whole_folder(output, is_recording=True) as folder:
-        problem = _run(setup, folder, output.name, duration, rate, boards, execution, log, progress)
+        problem = _Run(setup, steering, duration, rate, boards, log, progress).record(folder, output.name)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
-    if problem and execution is None:
+    if problem and steering.result is None:
         raise GraphError(f"{problem}; what was recorded is in {output}")
     log("evaluating the run")
-    figures = None if execution is None else {"setup": setup.name, "procedure": execution.result}
+    figures = {"setup": setup.name, "procedure": steering.result}
     try:
-        summary = measure_loop(Bag(output), setup).summary(setup.name)
-        if execution is not None:
-            summary = replace(summary, procedure=execution.result)
-            figures = summary.to_json()
+        summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=steering.result)
+        figures = summary.to_json()
     except GraphError as error:
         raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
     finally:
-        if figures is not None:
+        if steering.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if problem:
         raise GraphError(f"{problem}; what was recorded is in {output}")
@@ -159,86 +149,221 @@ def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
     return collector
 
 
-def _run(
-    setup: Setup,
-    folder: Path,
-    name: str,
-    duration: float | None,
-    rate: float | None,
-    boards: bool,
-    execution: ProcedureRun | None,
-    log: Log,
-    progress: Progress,
-) -> str:
-    """Run the graph and record it; return what went wrong, so that the bag stays."""
-    arguments = ["--params-file", str(setup.path.resolve()), *SLOWER_BRIDGE, *ACTIVE]
-    if execution is not None:
-        arguments += [*execution.scene_arguments, *FORECAST]
-    if rate is not None:
-        arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(rate)}"]
-    notes = {
-        "setup": setup.name,
-        SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
-        "simulated": f"the whole rig, closed loop, setup {setup.name}",
-    }
-    procedures = () if execution is None else topics.PROCEDURES
-    every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
-    recorded = [topic for topic in every if topic is not topics.IMAGE]
-    with reserved_domain() as domain, BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
-        environment = graph_environment(domain)
-        arguments += _wired(ports, len(setup.coils.coil_angles)) if boards else SIMULATED_COILS
-        for topic in recorded:
-            bag.add_topic(topic.channel.recorded, topic.channel.type_name)
-        log(f"starting {SCENE_SERVER}, rig_simulator, {', '.join(NODES)} (ROS domain {domain}, this machine only)")
-        with (
-            environment_of(environment),
-            NodeProcesses(
-                (SCENE_SERVER, "rig_simulator", *PROCESSES), arguments, environment, folder / "logs"
-            ) as nodes,
-        ):
-            running, interruption = False, Interruption()
-            early: dict[str, bytes] = {}
-            begin: int | None = None
+class _Path:
+    """The setup's path, along which the path follower steers.
 
-            def receive(topic: str, arrival: int, data: bytes) -> None:
-                nonlocal begin
-                # While nodes start, only what is published once is kept, for the bag's start.
-                if not running:
-                    if topic in ONCE:
-                        early[topic] = data
-                    return
-                if begin is None:
-                    begin = arrival
-                    for name, content in early.items():
-                        bag.write(name, begin, content)
-                # What waited elsewhere may have arrived before: the scene is the bag's first message all the same.
-                bag.write(topic, max(arrival, begin + 1), data)
+    Attributes:
+        node: that steers.
+        arguments: for all nodes.
+        time_limit: of the whole run [s of simulated time].
+        stage: 0 before the node is there, 1 before the needle moves, 2 from then on.
+        share: of the path that is done, 0 to 1.
+        ended: whether it is done.
+        result: None: there is no procedure.
+    """
 
-            def check() -> None:
-                interruption.check()
-                nodes.check()
+    node = "path_follower"
+    arguments: tuple[str, ...] = ()
+    result: dict[str, Any] | None = None
 
-            recorder = Recorder(domain, recorded, simulated_clock=rate is not None, receive=receive)
-            try:
-                with interruption:
-                    _wait(recorder, check, log)
-                if boards:
-                    _arm()
-                log("running" if rate is None else f"running at {rate:g} times the speed")
-                running = True
-                if execution is not None:
-                    nodes.start(PLANNER, arguments=execution.arguments)
-                    with interruption:
-                        return execution.execute(recorder, check, duration, rate or 1.0, progress)
-                nodes.start("path_follower", arguments=BRIDGE_AND_RECORDER)
-                with interruption:
-                    return _follow(recorder, check, setup, duration, rate or 1.0, progress)
-            except KeyboardInterrupt:
-                if not running:
-                    raise
-                return INTERRUPTED  # passed on once the bag is whole
-            finally:
-                recorder.close()
+    def __init__(self, setup: Setup, duration: float | None) -> None:
+        if not setup.follower.waypoints:
+            raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
+        points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
+        path_time = float(arc_lengths(points)[-1]) / setup.follower.speed
+        self.time_limit = TIMEOUT_FACTOR * path_time + EXTRA_TIME + (duration or 0.0)
+        self.stage, self.share, self.ended = 0, 0.0, False
+        self._duration = duration
+
+    def __enter__(self) -> _Path:
+        """Begin."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End."""
+
+    def poll(self, recorder: Recorder) -> str:
+        """Take what is new; return what went wrong."""
+        state, values = recorder.status_texts.get(self.node, ("", {}))
+        self.stage = 2 if recorder.taken[TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
+        self.share = float(values.get("progress", 0.0))
+        self.ended = state == "done" and self._duration is None
+        bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
+        return f"coil_bridge: {bridge}" if bridge.startswith(FAULT) else ""
+
+    def problem(self, elapsed: float, recorder: Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
+        return f"after {elapsed:.0f} s only {self.share:.0%} of the path is done; {states}"
+
+
+class _Procedure:
+    """A procedure that the needle planner executes; see `_Path`.
+
+    Attributes:
+        result: name, state, reason, goals met, goals and minimum clearance of the needle's axis by its measured poses
+            [m].
+
+    Raises:
+        ConfigurationError: there is no such procedure, or it does not fit the setup's scene.
+    """
+
+    node = PLANNER
+    time_limit = MAX_PROCEDURE_TIME
+
+    def __init__(self, name: str, setup: Setup) -> None:
+        procedure = read_procedure(name)
+        setup.planner.planner(setup.scene).check(procedure)
+        scene = ("-p", f"scene:={find_scene_file(procedure.scene).resolve()}") if procedure.scene else ()
+        self.arguments = (*scene, *FORECAST)
+        self.stage, self.share, self.ended = 0, 0.0, False
+        self.result: dict[str, Any] = {
+            "procedure": procedure.name,
+            "state": "not begun",
+            "reason": "",
+            "goals_met": 0,
+            "goals": len(procedure.goals),
+            "min_clearance_m": None,
+        }
+        self._client = ProcedureClient(str(find_procedure_file(name).resolve()))
+
+    def __enter__(self) -> _Procedure:
+        """Join the graph."""
+        self._client.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Leave the graph."""
+        self._client.__exit__(*error)
+
+    def poll(self, recorder: Recorder) -> str:
+        """Take what is new; return what went wrong."""
+        self._client.poll()
+        status, result = self._client.status, self._client.result
+        if status is not None:
+            self.stage = 2
+            self.share = (status.goals_met + status.progress) / self.result["goals"]
+            self.result["min_clearance_m"] = finite_or_none(status.clearance)
+            self._update(status)
+        if result is not None:
+            self.ended = True
+            self._update(result)
+        return self._state() if result is not None and result.state != DONE else ""
+
+    def problem(self, elapsed: float, recorder: Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        if self.stage == 0:
+            self.result["reason"] = self._client.refusal or "no needle planner"
+            return self._state()
+        return f"after {elapsed:.0f} s {self._state()}"
+
+    def _update(self, report: ProcedureReport) -> None:
+        self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
+
+    def _state(self) -> str:
+        result = self.result
+        met = f"{result['goals_met']} of {result['goals']} goals met"
+        return f"the procedure {result['procedure']} is {result['state']}, {met}: {result['reason']}"
+
+
+@dataclass
+class _Run:
+    """One run of the graph; see `simulate`."""
+
+    setup: Setup
+    steering: _Path | _Procedure
+    duration: float | None
+    rate: float | None
+    boards: bool
+    log: Log
+    progress: Progress
+
+    def record(self, folder: Path, name: str) -> str:
+        """Run the graph and record it; return what went wrong, so that the bag stays."""
+        setup, arguments = self.setup, ["--params-file", str(self.setup.path.resolve()), *JOB, *self.steering.arguments]
+        if self.rate is not None:
+            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
+        notes = {
+            "setup": setup.name,
+            SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
+            "simulated": f"the whole rig, closed loop, setup {setup.name}",
+        }
+        procedures = () if self.steering.result is None else topics.PROCEDURES
+        every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
+        recorded = [topic for topic in every if topic is not topics.IMAGE]
+        what = f"{SCENE_SERVER}, rig_simulator, {', '.join(NODES)}"
+        processes = (SCENE_SERVER, "rig_simulator", *PROCESSES)
+        with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
+            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else SIMULATED_COILS
+            for topic in recorded:
+                bag.add_topic(topic.channel.recorded, topic.channel.type_name)
+            with own_graph(processes, arguments, folder / "logs", what, self.log) as graph:
+                sink = _Sink(bag)
+                recorder = Recorder(graph.domain, recorded, simulated_clock=self.rate is not None, receive=sink.receive)
+                try:
+                    return self._run(graph, recorder, sink)
+                finally:
+                    recorder.close()
+
+    def _run(self, graph: OwnGraph, recorder: Recorder, sink: _Sink) -> str:
+        with graph.interruption:
+            _wait(recorder, graph.check, self.log)
+        if self.boards:
+            _arm()
+        self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
+        sink.running = True
+        try:
+            graph.nodes.start(self.steering.node, arguments=("-p", f"{self.steering.node}:{AUDIENCE}"))
+            with graph.interruption, self.steering:
+                return self._steer(recorder, graph.check)
+        except KeyboardInterrupt:
+            return INTERRUPTED  # passed on once the bag is whole
+
+    def _steer(self, recorder: Recorder, check: Callable[[], None]) -> str:
+        """Record until the path or procedure is done, or the time is over; return what went wrong."""
+        steering, rate = self.steering, self.rate or 1.0
+        stage, began = 0, time.monotonic()
+        while True:
+            check()
+            recorder.spin(POLL_PERIOD)
+            problem = steering.poll(recorder)
+            if steering.stage > stage:
+                stage, began = steering.stage, time.monotonic()
+            elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
+            timed = 0.0 if self.duration is None or not stage else min(1.0, elapsed / self.duration)
+            self.progress(steering.share if self.duration is None else timed)
+            if steering.ended:
+                recorder.spin(FINAL_TIME / rate)
+            if problem or steering.ended:
+                return problem
+            wanted = None if self.duration is None else self.duration + (EXTRA_TIME if stage == 1 else 0.0)
+            if wanted is not None and stage and elapsed > wanted:
+                return ""
+            if elapsed > (steering.time_limit if stage else START_TIMEOUT):
+                return steering.problem(elapsed, recorder)
+
+
+class _Sink:
+    """Writes what comes while the run is on; of before, only what is published once, at the bag's start."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        self.running = False
+        self._bag = bag
+        self._early: dict[str, bytes] = {}
+        self._begin: int | None = None
+
+    def receive(self, topic: str, arrival: int, data: bytes) -> None:
+        """Take a message."""
+        if not self.running:
+            if topic in ONCE:
+                self._early[topic] = data
+            return
+        if self._begin is None:
+            self._begin = arrival
+            for name, content in self._early.items():
+                self._bag.write(name, arrival, content)
+        # What waited elsewhere may have arrived before: the scene is the bag's first message all the same.
+        self._bag.write(topic, max(arrival, self._begin + 1), data)
 
 
 def _arm() -> None:
@@ -266,20 +391,6 @@ def _wired(folder: str, coils: int) -> list[str]:
     return [part for each in given for part in ("-p", each)]
 
 
-def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:
-    """Log, once of each node, that it compiles.
-
-    Args:
-        texts: state of each node.
-        logged: nodes of which it was logged.
-        log: called with a line for a person.
-    """
-    for name, text in texts.items():
-        if text.startswith(COMPILING) and name not in logged:
-            logged.add(name)
-            log(f"{name}: {text}")
-
-
 def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
     """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
 
@@ -298,40 +409,3 @@ def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
         check()
         recorder.spin(POLL_PERIOD)
     recorder.spin(SETTLING_TIME)
-
-
-def _follow(
-    recorder: Recorder,
-    check: Callable[[], None],
-    setup: Setup,
-    duration: float | None,
-    rate: float,
-    progress: Progress,
-) -> str:
-    """Record until the needle is at the end of its path, or the time is over; return what went wrong."""
-    points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-    timeout = TIMEOUT_FACTOR * float(arc_lengths(points)[-1]) / setup.follower.speed + EXTRA_TIME + (duration or 0.0)
-    began = time.monotonic()
-    following, started = False, began
-    while True:
-        check()
-        recorder.spin(POLL_PERIOD)
-        if not following and recorder.taken[TIP_SETPOINT.recorded]:
-            following, began = True, time.monotonic()
-        if "path_follower" not in recorder.status_texts and time.monotonic() - started < START_TIMEOUT:
-            began = time.monotonic()  # its process is still loading
-        state, values = recorder.status_texts.get("path_follower", ("", {}))
-        elapsed = (time.monotonic() - began) * rate
-        done = float(values.get("progress", 0.0))
-        progress(done if duration is None else min(1.0, elapsed / duration))
-        if duration is not None and elapsed > duration + (0.0 if following else EXTRA_TIME):
-            return ""
-        if duration is None and state == "done":
-            recorder.spin(FINAL_TIME / rate)
-            return ""
-        bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
-        if bridge.startswith(FAULT):
-            return f"coil_bridge: {bridge}"
-        if elapsed > timeout:
-            states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
-            return f"after {elapsed:.0f} s only {done:.0%} of the path is done; {states}"

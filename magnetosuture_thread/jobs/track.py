@@ -25,8 +25,7 @@ from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
 from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
-from magnetosuture_thread.vision.image_header import image_header
-from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.images import decode_image, image_header, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay

@@ -1,9 +1,10 @@
-"""CDR bytes: formats of plain CDR, little endian, each field at a multiple of its size; and headers out of them."""
+"""CDR bytes: messages packed field by field, and the headers of messages read back."""
 
 from __future__ import annotations
 
 import struct
-from functools import lru_cache
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +12,7 @@ from numpy.typing import ArrayLike
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import DISH_FRAME
 
-BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian; places count from behind it
-KEPT = 256  # formats and texts; a run has a few
-REAL = np.dtype("<f8")
-
+BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian; positions count from behind it
 LITTLE_ENDIAN = b"\0\1"  # what plain CDR begins with, as every ROS 2 machine of today writes it
 _BIG_ENDIAN = b"\0\0"
 _STAMP, _LENGTH, _FRAME = 4, 12, 16  # where the stamp begins, the length of the frame's name, and the name
@@ -25,58 +23,84 @@ _DISH = {
     _BIG_ENDIAN: len(_NAME).to_bytes(4, "big") + _NAME,
 }
 DISH_END = _FRAME + len(_NAME)  # where a header in the dish frame ends
-_STAMPS = (struct.Struct(">4xiI"), struct.Struct("<4xiI"))  # by the bytes' order
+_STAMPS = (struct.Struct(">4xiI"), struct.Struct("<4xiI"))  # by the byte order
+_TIME, _COUNT = struct.Struct("<iI"), struct.Struct("<I")
+_NUMBERS = {"bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 
-Text = tuple[int, bytes]  # as a message has it: its length and its bytes
-Time = tuple[int, int]  # seconds and nanoseconds
-
-
-def time_of(stamp: int) -> Time:
-    """Return a time [ns] as a message has it."""
-    return divmod(stamp, 10**9)
+Stamp = Any  # nanoseconds as int, or a time message of any library
 
 
-@lru_cache(KEPT)
-def text(value: str) -> Text:
-    """Return a text as a message has it."""
-    data = value.encode() + b"\0"
-    return len(data), data
+def pack(layout: str, *values: Any) -> bytes:
+    """Return the CDR bytes of a message.
+
+    Args:
+        layout: the kinds of its fields in their order, with those of nested messages in their place, separated by
+            spaces. `header` is a stamp in the dish frame and `time` a stamp, both of type `Stamp`; `text` is a string;
+            numbers have their names in ROS. `float64[]` is a sequence of numbers, `float64[9]` an array, whose numbers
+            stand without a count; `points` is an array of shape (m, 2) as a sequence of points or vectors with z = 0;
+            `texts` is a sequence of strings; `raw` is bytes that are in place as they are.
+        values: of the fields.
+    """
+    data = bytearray(BEGIN)
+    for (kind, number, size), value in zip(_fields(layout), values, strict=True):
+        if kind == "number":
+            data += bytes((4 - len(data)) % size)
+            data += number.pack(value)
+        elif kind == "header":
+            _put_time(data, value)
+            data += _DISH[LITTLE_ENDIAN]
+        elif kind == "text":
+            _put_text(data, value)
+        elif kind == "time":
+            _put_time(data, value)
+        elif kind == "texts":
+            data += bytes(-len(data) % 4) + _COUNT.pack(len(value))
+            for text in value:
+                _put_text(data, text)
+        elif kind == "raw":
+            data += value
+        else:
+            _put_numbers(data, kind, number, value)
+    return bytes(data)
 
 
-def numbers(values: ArrayLike, kind: np.dtype[np.generic]) -> bytes:
-    """Return numbers as a sequence's bytes."""
-    return np.asarray(values, kind).tobytes()
+@cache
+def _fields(layout: str) -> tuple[tuple[str, Any, int], ...]:
+    """Return for each field what it is, its format or type, and its size [bytes]."""
+    fields: list[tuple[str, Any, int]] = []
+    for word in layout.split():
+        name, bracket, count = word.partition("[")
+        if name not in _NUMBERS:
+            fields.append((name, np.dtype("<f8"), 8))
+        elif not bracket:
+            number = struct.Struct("<" + _NUMBERS[name])
+            fields.append(("number", number, number.size))
+        else:
+            dtype = np.dtype("<" + _NUMBERS[name])
+            fields.append(("array" if count != "]" else "sequence", dtype, dtype.itemsize))
+    return tuple(fields)
 
 
-def points_of(vertices: ArrayLike) -> bytes:
-    """Return points of shape (m, 2) [m] as the bytes of a sequence of Point."""
-    flat = np.asarray(vertices)
-    points = np.zeros((len(flat), 3), REAL)
-    points[:, :2] = flat
-    return points.tobytes()
+def _put_time(data: bytearray, stamp: Stamp) -> None:
+    data += bytes(-len(data) % 4)
+    data += _TIME.pack(*(divmod(stamp, 10**9) if isinstance(stamp, int) else (stamp.sec, stamp.nanosec)))
 
 
-def text_codes(length: int) -> tuple[str, ...]:
-    """Return the codes of a text of this length."""
-    return "I", f"{length}s"
+def _put_text(data: bytearray, text: str) -> None:
+    content = text.encode() + b"\0"
+    data += bytes(-len(data) % 4) + _COUNT.pack(len(content)) + content
 
 
-def array_codes(count: int, kind: str, width: int = 1) -> tuple[str, ...]:
-    """Return the codes of a sequence, whose numbers come as bytes; of an empty one only the count is there."""
-    aligned = (f"0{kind}",) if count else ()
-    return "I", *aligned, f"{count * width * struct.calcsize('<' + kind)}s"
-
-
-def form(*codes: str) -> struct.Struct:
-    """Return the format of fields behind each other, each at a multiple of its size; `0d` only goes to such a place."""
-    whole = "<"
-    for code in codes:
-        whole += f"{-struct.calcsize(whole) % struct.calcsize('<' + code[-1])}x{code}"
-    return struct.Struct(whole)
-
-
-DISH, EMPTY = text(DISH_FRAME), text("")
-HEADER = ("i", "I", *text_codes(DISH[0]))
+def _put_numbers(data: bytearray, kind: str, dtype: np.dtype[Any], values: ArrayLike) -> None:
+    numbers = np.asarray(values, dtype)
+    if kind == "points":
+        numbers = np.zeros((len(numbers), 3))
+        if len(numbers):
+            numbers[:, :2] = values
+    if kind != "array":
+        data += bytes(-len(data) % 4) + _COUNT.pack(len(numbers))
+    if numbers.size:  # an empty sequence is not aligned
+        data += bytes((4 - len(data)) % dtype.itemsize) + numbers.tobytes()
 
 
 def header_stamp(data: bytes) -> int | None:

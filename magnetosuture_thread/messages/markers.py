@@ -1,49 +1,87 @@
-"""Packs the markers of the thread as CDR bytes, for RViz and Foxglove."""
+"""Packs markers for RViz and Foxglove: the thread, its forecast, the scene."""
 
 from __future__ import annotations
 
-import struct
-from functools import lru_cache
-from typing import NamedTuple
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
+from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.building import ADD, LINE_STRIP, TRIANGLE_LIST
-from magnetosuture_thread.messages.cdr import (
-    BEGIN,
-    DISH,
-    EMPTY,
-    HEADER,
-    KEPT,
-    Text,
-    Time,
-    array_codes,
-    form,
-    points_of,
-    text,
-    text_codes,
-)
+from magnetosuture_thread.messages.cdr import Stamp, pack
+from magnetosuture_thread.messages.packing import forecast_instants, time_or_nan
 from magnetosuture_thread.model.estimator import ThreadEstimate
 from magnetosuture_thread.model.estimator.estimate import ONE_SIDED_99
 from magnetosuture_thread.model.margins import UNKNOWN, Margins, friction_colour
 from magnetosuture_thread.model.prediction import Prediction
+from magnetosuture_thread.scene import Scene
 
-ARROW, SPHERE_LIST, TEXT_VIEW_FACING = 0, 7, 9  # as in Marker.msg
+if TYPE_CHECKING:
+    from magnetosuture_thread.forecast import Forecast
+
+# As in Marker.msg.
+ARROW, CYLINDER, LINE_STRIP, SPHERE_LIST, TEXT, TRIANGLE_LIST = 0, 3, 4, 7, 9, 11
+ADD, DELETE_ALL = 0, 3
+
 ARROW_LENGTH = 2.5e-3  # m; of a disturbance's arrow, whose head is where it acts
 TEXT_HEIGHT, LINE_HEIGHT = 8e-4, 1e-3  # m
-LIFETIME = 500_000_000  # ns of a text or arrow; poses come far more often
+LIFETIME = 500_000_000  # ns of a text, an arrow or a forecast; poses come far more often
 SEGMENT_BARRIERS = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
-_THREAD, _MARGINS, _PREDICTED, _DEVIATION, _DISTURBANCES = map(
-    text, ("thread", "margins", "predicted", "deviation", "disturbances")
+GHOSTS = 3  # instants of a forecast
+GHOST_WIDTH = 1.5e-4  # m
+THICKNESS = 1e-3  # m; of a disc's cylinder
+RIM_POINTS = 180
+NAME_SIZE = 0.025  # of the dish's diameter
+
+Colour = tuple[float, ...]
+Place = Sequence[float] | NDArray[np.float64]
+INK, RED = (0.1, 0.13, 0.16), (0.78, 0.06, 0.18)
+TEAL, MAGENTA, VIOLET = (0.0, 0.6, 0.65), (0.71, 0.09, 0.62), (0.45, 0.3, 0.75)
+NAME_INK, RIM = (0.13, 0.19, 0.24), (0.45, 0.5, 0.55)
+KINDS = {"tissue": (0.85, 0.65, 0.6), "instrument": (0.55, 0.6, 0.66), "wall": (0.45, 0.42, 0.38)}
+
+
+class Marker(NamedTuple):
+    """A marker of visualization_msgs, as far as ours differ."""
+
+    namespace: str
+    number: int
+    kind: int
+    scale: tuple[float, float, float]
+    colour: Colour
+    opacity: float = 1.0
+    place: Place = (0.0, 0.0, 0.0)
+    points: Points = np.empty((0, 2))
+    caption: str = ""
+    lifetime: int = 0  # ns; 0 for ever
+    action: int = ADD
+    turn: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+
+# Header to points; then colours, a texture and its coordinates, the text, and a mesh, all empty but the text.
+_MARKER = (
+    "header text int32 int32 int32 float64[7] float64[3] float32[4] int32 uint32 bool points "
+    "uint32 text time text text uint32 uint32 text text text uint32 bool "
 )
-_INK, _RED = (0.1, 0.13, 0.16, 1.0), (0.78, 0.06, 0.18, 1.0)
-_TEAL, _MAGENTA = (0.0, 0.6, 0.65, 0.35), (0.71, 0.09, 0.62, 0.9)
 
 
-def packed_markers(
-    time: Time,
+def packed_markers(stamp: Stamp, markers: Sequence[Marker]) -> bytes:
+    """Return a MarkerArray."""
+    values: list[object] = []
+    for each in markers:
+        pose = (*each.place, 0.0, 0.0, 0.0)[:3] + each.turn
+        values += [stamp, each.namespace, each.number, each.kind, each.action, pose, each.scale]
+        values += [(*each.colour, each.opacity), *divmod(each.lifetime, 10**9), False, each.points]
+        values += [0, "", 0, "", "", 0, 0, each.caption, "", "", 0, False]
+    return pack("uint32 " + _MARKER * len(markers), len(markers), *values)
+
+
+def packed_thread_markers(
+    stamp: Stamp,
     prediction: Prediction | None,
     margins: Margins | None,
     diameter: float,
@@ -64,7 +102,7 @@ def packed_markers(
     with every node, where sliding under friction, blue where stuck. Deviation: grey where unknown.
 
     Args:
-        time: of the pose, seconds and nanoseconds.
+        stamp: of the pose.
         prediction: the thread; None where there is none.
         margins: of the thread; None where there are none.
         diameter: of the thread [m].
@@ -74,44 +112,40 @@ def packed_markers(
     assert thread is not None
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     friction = UNKNOWN if margins is None else margins.friction
-    colour = (*friction_colour(friction), 1.0)
-    nodes = thread.positions
+    colour, nodes = friction_colour(friction), thread.positions
     markers = [
-        _Marker(_THREAD, 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
-        _Marker(_THREAD, 1, SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
+        Marker("thread", 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
+        Marker("thread", 1, SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
     ]
     shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in SEGMENT_BARRIERS]
     for number, minimum in enumerate(shown):
         clearance = minimum.minimum_clearance
         x, y = nodes[minimum.node[0]]
-        place = (float(x), float(y) + (number + 1) * LINE_HEIGHT, 0.0)  # several may be closest at the same node
-        caption = text(f"{minimum.barrier} {1e3 * clearance:.2f} mm")
-        colour = _RED if clearance <= 0.0 else _INK
-        marker = _Marker(_MARGINS, number, TEXT_VIEW_FACING, (0.0, 0.0, TEXT_HEIGHT), colour, place, caption=caption)
-        markers.append(marker)
+        place = (x, y + (number + 1) * LINE_HEIGHT)  # several may be closest at the same node
+        caption = f"{minimum.barrier} {1e3 * clearance:.2f} mm"
+        markers.append(_text("margins", number, RED if clearance <= 0.0 else INK, place, caption))
     if estimate is not None:
         markers += _estimate_markers(prediction, estimate, 0.4 * width)
-    values = [value for marker in markers for value in marker.values(time)]
-    codes = tuple((len(marker.points), len(marker.namespace[1]), len(marker.caption[1])) for marker in markers)
-    return BEGIN + _markers_form(codes).pack(len(markers), *values)
+    return packed_markers(stamp, markers)
 
 
-def _estimate_markers(prediction: Prediction | None, estimate: ThreadEstimate, width: float) -> list[_Marker]:
-    markers = [
-        _Marker(_DEVIATION, 0, TRIANGLE_LIST, (1.0, 1.0, 1.0), _TEAL, points=deviation_band(estimate)),
-    ]
+def _text(namespace: str, number: int, colour: Colour, place: Place, caption: str) -> Marker:
+    size = (0.0, 0.0, TEXT_HEIGHT)
+    return Marker(namespace, number, TEXT, size, colour, place=place, caption=caption, lifetime=LIFETIME)
+
+
+def _estimate_markers(prediction: Prediction | None, estimate: ThreadEstimate, width: float) -> list[Marker]:
+    band = deviation_band(estimate)
+    markers = [Marker("deviation", 0, TRIANGLE_LIST, (1.0, 1.0, 1.0), TEAL, 0.35, points=band)]
     if prediction is not None:
         line = prediction.positions
-        markers.append(_Marker(_PREDICTED, 0, LINE_STRIP, (width, 0.0, 0.0), _MAGENTA, points=line))
+        markers.append(Marker("predicted", 0, LINE_STRIP, (width, 0.0, 0.0), MAGENTA, 0.9, points=line))
     for number, found in enumerate(estimate.disturbances):
-        tip = np.array([found.position - ARROW_LENGTH * found.direction, found.position])
-        sizes = (width, 4.0 * width, 4.0 * width)
-        markers.append(_Marker(_DISTURBANCES, 2 * number, ARROW, sizes, _RED, points=tip))
-        x, y = found.position - 1.3 * ARROW_LENGTH * found.direction
-        size = (0.0, 0.0, TEXT_HEIGHT)
-        markers.append(
-            _Marker(_DISTURBANCES, 2 * number + 1, TEXT_VIEW_FACING, size, _RED, (x, y, 0.0), caption=text(str(found)))
-        )
+        arrow = np.array([found.position - ARROW_LENGTH * found.direction, found.position])
+        sizes, name = (width, 4.0 * width, 4.0 * width), "disturbances"
+        markers.append(Marker(name, 2 * number, ARROW, sizes, RED, points=arrow, lifetime=LIFETIME))
+        place = found.position - 1.3 * ARROW_LENGTH * found.direction
+        markers.append(_text(name, 2 * number + 1, RED, place, str(found)))
     return markers
 
 
@@ -126,33 +160,72 @@ def deviation_band(estimate: ThreadEstimate) -> Points:
     return np.stack(corners, axis=1).reshape(-1, 2)
 
 
-class _Marker(NamedTuple):
-    """A marker of visualization_msgs, as far as ours differ."""
+def packed_forecast_markers(stamp: Stamp, forecast: Forecast) -> bytes:
+    """Return a MarkerArray in the namespace `forecast`: the thread at three instants, and what happens when.
 
-    namespace: Text
-    number: int
-    kind: int
-    scale: tuple[float, ...]
-    colour: tuple[float, ...]
-    place: tuple[float, ...] = (0.0, 0.0, 0.0)
-    points: Points = np.empty((0, 2))
-    caption: Text = EMPTY
+    The line is fainter the later the instant. The text stands beside the node of the first contact, else beside the
+    needle's tail at the end. All disappear by themselves half a second after the last forecast.
+    """
+    markers = []
+    for number, instant in enumerate(forecast_instants(forecast, GHOSTS + 1)[1:]):
+        line, opacity, size = forecast.vertices[instant], 0.8 - 0.2 * number, (GHOST_WIDTH, 0.0, 0.0)
+        ghost = Marker("forecast", number, LINE_STRIP, size, VIOLET, opacity, points=line, lifetime=LIFETIME)
+        markers.append(ghost)
+    contact, caption = forecast.first_contact, forecast_text(forecast)
+    if caption:
+        place = forecast.tails[-1]
+        if contact is not None:
+            place = forecast.vertices[int(np.searchsorted(forecast.times, contact.time)), contact.node]
+        markers.append(_text("forecast", GHOSTS, RED, place, caption))
+    return packed_markers(stamp, markers)
 
-    def values(self, time: Time) -> tuple[object, ...]:
-        """Return the fields in the message's order."""
-        upright, lifetime = (0.0, 0.0, 0.0, 1.0), (0, LIFETIME if self.kind in (TEXT_VIEW_FACING, ARROW) else 0)
-        head = (*time, *DISH, *self.namespace, self.number, self.kind, ADD, *self.place, *upright)
-        shape = (*self.scale, *self.colour, *lifetime, False, len(self.points), points_of(self.points))
-        # Colours of single points, a texture with its header and picture, its coordinates, then a mesh and its file.
-        return (*head, *shape, 0, *EMPTY, 0, 0, *EMPTY, *EMPTY, 0, 0, *self.caption, *EMPTY, *EMPTY, 0, False)
+
+def forecast_text(forecast: Forecast) -> str:
+    """Return what will happen and when, for a person; empty where nothing does. See `forecast_events`."""
+    contact = forecast.first_contact
+    time, shape = (math.nan, "") if contact is None else (contact.time, contact.shape)
+    friction, rest = time_or_nan(forecast.first_friction), time_or_nan(forecast.rest_time)
+    return ", ".join(forecast_events(time, shape, friction, rest))
 
 
-@lru_cache(KEPT)
-def _markers_form(sizes: tuple[tuple[int, int, int], ...]) -> struct.Struct:
-    codes = ["I"]
-    empty = text_codes(EMPTY[0])
-    for points, namespace, caption in sizes:
-        codes += [*HEADER, *text_codes(namespace), "i", "i", "i", *"d" * 7, *"d" * 3, *"f" * 4, "i", "I", "?"]
-        codes += [*array_codes(points, "d", 3), "I", *empty, "i", "I", *empty, *empty, "I", "I"]
-        codes += [*text_codes(caption), *empty, *empty, "I", "?"]
-    return form(*codes)
+def forecast_events(contact: float, shape: str, friction: float, rest: float) -> list[str]:
+    """Return what will happen and when, for a person, the first event first. What holds already is not announced.
+
+    Args:
+        contact: when the thread first touches something [s]; NaN for never, as for the other times.
+        shape: that it touches, or "wall".
+        friction: when its first node is under friction [s].
+        rest: when the needle comes to rest although it is commanded to move [s].
+    """
+    events = []
+    if contact > 0.0:
+        events.append((contact, f"touches the {shape.replace('_', ' ')} in {contact:.1f} s"))
+    if friction > 0.0:
+        events.append((friction, f"friction in {friction:.1f} s"))
+    if rest >= 0.0:
+        events.append((rest, f"needle rests in {rest:.1f} s" if rest > 0.0 else "needle rests"))
+    return [text for _, text in sorted(events)]
+
+
+def packed_scene_markers(stamp: Stamp, scene: Scene) -> bytes:
+    """Return a MarkerArray of a scene in place of the one before: the rim, each shape in its kind's colour, its name.
+
+    A disc is a flat cylinder, a polygon the triangles that it is cut into.
+    """
+    diameter = scene.dish.diameter
+    angles = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS + 1)
+    rim = scene.dish.radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    nothing = Marker("", 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, action=DELETE_ALL)
+    markers = [nothing, Marker("dish", 0, LINE_STRIP, (0.005 * diameter, 0.0, 0.0), RIM, 0.8, points=rim)]
+    for index, shape in enumerate(scene.shapes):
+        geometry, colour = shape.geometry, KINDS[shape.kind]
+        if isinstance(geometry, Disc):
+            scale = (2.0 * geometry.radius, 2.0 * geometry.radius, THICKNESS)
+            markers.append(Marker("shapes", index, CYLINDER, scale, colour, 0.8, place=geometry.centre))
+        else:
+            cut = triangulate(geometry)
+            corners = cut.vertices[cut.triangles].reshape(-1, 2)
+            markers.append(Marker("shapes", index, TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners))
+        place, size = (*shape.label_point, THICKNESS), (0.0, 0.0, NAME_SIZE * diameter)
+        markers.append(Marker("names", index, TEXT, size, NAME_INK, place=place, caption=shape.name))
+    return packed_markers(stamp, markers)

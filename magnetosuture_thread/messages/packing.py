@@ -1,348 +1,336 @@
-"""Packs the messages of every pose as CDR bytes: pose, path, prediction, estimate, margins, markers."""
+"""Packs the messages of the graph as CDR bytes, which nodes publish and bags store as they are.
+
+Each layout has the fields of the message's definition in their order; stamps are nanoseconds or time messages.
+"""
 
 from __future__ import annotations
 
-import struct
-from functools import lru_cache
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.building import IN_PLANE
-from magnetosuture_thread.messages.cdr import (
-    BEGIN,
-    DISH,
-    EMPTY,
-    HEADER,
-    KEPT,
-    REAL,
-    Time,
-    array_codes,
-    form,
-    numbers,
-    points_of,
-    text,
-    text_codes,
-    time_of,
-)
+from magnetosuture_thread.interface import CAMERA_FRAME
+from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, Stamp, aligned, pack
 from magnetosuture_thread.model.margins import FrictionState, Margins
 from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.coils.bridge import BridgeOutput
+    from magnetosuture_thread.coils.coil_system import CoilSystem
+    from magnetosuture_thread.coils.drivers import DriverState
+    from magnetosuture_thread.forecast import Forecast
     from magnetosuture_thread.model.estimator import ThreadEstimate
+    from magnetosuture_thread.vision.look import Track
 
-_UNKNOWN, _FREE, _IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
-_OF_NOTHING, _OF_PREDICTION, _OF_ESTIMATE = 0, 1, 2
-_BARRIER, _NODE, _OBSTACLE = (np.dtype(code) for code in ("u1", "<u4", "<i4"))
-_PLACES = [6 * row + column for row in IN_PLANE for column in IN_PLANE]
-_POSE = form(*HEADER, *"d" * 7, *"d" * 36)
-_PATH = form(*HEADER, "I")
-# One PoseStamped of a path begins at a multiple of 8, as the next does.
-_STAMPED = np.dtype(
-    {
-        "names": ["sec", "nanosec", "length", "frame", "x", "y", "w"],
-        "formats": ["<i4", "<u4", "<u4", f"S{DISH[0]}", REAL, REAL, REAL],
-        "offsets": [0, 4, 8, 12, 24, 32, 72],
-        "itemsize": 80,
-    }
-)
+Vector = NDArray[np.float64]
+
+IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
+STATES = {"SEARCHING": 0, "TRACKED": 1, "LOST": 2}  # as in TrackerState.msg
+UNCONFIGURED, CONDITIONS = 0, {"INACTIVE": 1, "ACTIVE": 2, "FAULT": 3}  # as in CoilBridgeState.msg
+CONTACT_UNKNOWN, CONTACT_FREE, IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
+OF_NOTHING, OF_PREDICTION, OF_ESTIMATE = 0, 1, 2
 MAX_PROBLEMS = 8  # of a frame that are published
+MAX_INSTANTS = 11  # of a forecast: the start, and ten after it
 
 
-def packed_pose(
-    time: Time, tail: NDArray[np.float64], heading: NDArray[np.float64], covariance: NDArray[np.float64] | None = None
-) -> bytes:
+def packed_header(stamp: Stamp) -> bytes:
+    """Return a Header in the dish frame."""
+    return pack("header", stamp)
+
+
+def planar_pose_fields(point: Vector, angle: float) -> tuple[float, ...]:
+    """Return position and quaternion of a pose in the dish plane: a point [m], and the angle from the x axis [rad]."""
+    return (point[0], point[1], 0.0, 0.0, 0.0, *yaw_quaternion(angle))
+
+
+def packed_pose(stamp: Stamp, tail: Vector, heading: Vector, covariance: Vector | None = None) -> bytes:
     """Return the needle's pose, a PoseWithCovarianceStamped: position of the tail, x axis along the needle there.
 
     Args:
-        time: of the frame that it was measured in, seconds and nanoseconds.
+        stamp: of the frame that it was measured in.
         tail: shape (2,) [m].
         heading: unit vector, shape (2,).
         covariance: of x, y [m] and the angle of the heading [rad], shape (3, 3); zeros, which say in ROS
             that it is not known, if None.
     """
-    whole = [0.0] * 36
+    whole = np.zeros((6, 6))
     if covariance is not None:
-        for place, value in zip(_PLACES, covariance.ravel().tolist(), strict=True):
-            whole[place] = value
-    z, w = yaw_quaternion(heading_angle(heading))
-    return BEGIN + _POSE.pack(*time, *DISH, tail[0], tail[1], 0.0, 0.0, 0.0, z, w, *whole)
+        whole[np.ix_(IN_PLANE, IN_PLANE)] = covariance
+    return pack("header float64[7] float64[36]", stamp, planar_pose_fields(tail, heading_angle(heading)), whole)
 
 
-def packed_path(time: Time, points: Points) -> bytes:
-    """Return a polyline of shape (m, 2) [m] as a Path.
+def packed_pose_stamped(stamp: Stamp, point: Vector, angle: float) -> bytes:
+    """Return a PoseStamped in the dish plane: a point of shape (2,) [m] and an angle from the x axis [rad]."""
+    return pack("header float64[7]", stamp, planar_pose_fields(point, angle))
 
-    Args:
-        time: seconds and nanoseconds.
-        points: of the polyline.
-    """
-    poses = np.zeros(len(points), _STAMPED)
-    poses["sec"], poses["nanosec"] = time
-    poses["length"], poses["frame"] = DISH
+
+PATH_AT = aligned(DISH_END, 4) + 4  # where the poses of a path begin, behind their count
+PATH_POSES = np.dtype(  # each begins at a multiple of 8
+    {
+        "names": ["time", "frame", "x", "y", "w"],
+        "formats": ["V8", f"V{DISH_END - len(BEGIN) - 8}", "<f8", "<f8", "<f8"],
+        "offsets": [0, 8, 24, 32, 72],
+        "itemsize": 80,
+    }
+)
+
+
+def packed_path(stamp: Stamp, points: Points) -> bytes:
+    """Return a polyline of shape (m, 2) [m] as a Path."""
+    poses = np.zeros(len(points), PATH_POSES)
+    header = packed_header(stamp)[len(BEGIN) :]
+    poses["time"], poses["frame"] = np.void(header[:8]), np.void(header[8:])
     poses["x"], poses["y"], poses["w"] = points[:, 0], points[:, 1], 1.0
-    return BEGIN + _PATH.pack(*time, *DISH, len(points)) + poses.tobytes()
+    return pack("header uint32 raw", stamp, len(points), poses.tobytes())
 
 
-def packed_observation(time: Time, observation: ThreadObservation) -> bytes:
-    """Return what a frame shows of the thread as a ThreadObservation.
+def packed_twist(stamp: Stamp, velocity: Vector) -> bytes:
+    """Return a velocity of shape (2,) [m/s] as a TwistStamped."""
+    return pack("header float64[6]", stamp, (velocity[0], velocity[1], 0.0, 0.0, 0.0, 0.0))
+
+
+def packed_wrench(stamp: Stamp, force: Vector, moment: float) -> bytes:
+    """Return a WrenchStamped of a force in the dish plane, shape (2,) [N], and a counter-clockwise moment [N m]."""
+    return pack("header float64[6]", stamp, (force[0], force[1], 0.0, 0.0, 0.0, moment))
+
+
+def packed_compressed_image(stamp: Stamp, data: NDArray[np.uint8]) -> bytes:
+    """Return a JPEG file's bytes, shape (bytes,), as a CompressedImage."""
+    return pack("time text text uint8[]", stamp, CAMERA_FRAME, "bgr8; jpeg compressed bgr8", data)
+
+
+def packed_image(stamp: Stamp, pixels: NDArray[np.uint8]) -> bytes:
+    """Return a BGR image of shape (height, width, 3) as an Image."""
+    height, width = pixels.shape[:2]
+    layout = "time text uint32 uint32 text uint8 uint32 uint8[]"
+    return pack(layout, stamp, CAMERA_FRAME, height, width, "bgr8", 0, 3 * width, pixels.ravel())
+
+
+def packed_camera_info(stamp: Stamp, size: tuple[int, int], view: DishView, distance: float) -> bytes:
+    """Return the intrinsics of a camera that looks straight down from a distance [m]; size is width and height."""
+    matrix = view.intrinsics(distance)
+    # Distortion, intrinsic, rectification, projection matrix; then binning and region of interest, which are not set.
+    layout = "time text uint32 uint32 text float64[] float64[9] float64[9] float64[12] uint32[6] bool"
+    projection = np.column_stack([matrix, np.zeros(3)])
+    head = (stamp, CAMERA_FRAME, size[1], size[0], "plumb_bob")
+    return pack(layout, *head, np.zeros(5), matrix, np.eye(3), projection, np.zeros(6), False)
+
+
+def packed_tracker_state(stamp: Stamp, track: Track, processing_time: float = 0.0) -> bytes:
+    """Return what the tracker makes of a frame as a TrackerState.
 
     Args:
-        time: of the frame, seconds and nanoseconds.
-        observation: of the thread.
+        stamp: of the frame.
+        track: of the frame.
+        processing_time: wall-clock time it took [s]; offline it is no property of a frame, and 0.
     """
-    codes, values = [*HEADER, "I"], [*time, *DISH, len(observation.pieces)]
+    confidence, curvature, view = 0.0, 0.0, track.view
+    if track.state.name == "TRACKED":
+        confidence, curvature = track.confidence, track.curvature
+    placed = ((), 0.0, 0.0) if view is None else (view.centre_px, view.metres_per_pixel, view.rotation)
+    measured = (STATES[track.state.name], track.reason, confidence, curvature, processing_time)
+    layout = "header uint8 text float64 float64 float64 float64[] float64 float64"
+    return pack(layout, stamp, *measured, *placed)
+
+
+def packed_observation(stamp: Stamp, observation: ThreadObservation) -> bytes:
+    """Return what a frame shows of the thread as a ThreadObservation."""
+    layout, values = ["header uint32"], [stamp, len(observation.pieces)]
     for piece in observation.pieces:
-        count = len(piece.points)
-        codes += [*array_codes(count, "d", 3), *array_codes(count, "d"), "B", "B", "d", "d", "?", "d"]
-        values += [count, points_of(piece.points), count, numbers(piece.deviation, REAL)]
-        values += [int(piece.first_end), int(piece.last_end), *map(float, piece.arc_length)]
-        values += [bool(piece.direction_known), float(piece.confidence)]
-    codes += ["?", "I"]
-    values += [bool(observation.complete), len(observation.hidden)]
-    for outline in observation.hidden:
-        codes += array_codes(len(outline), "d", 3)
-        values += [len(outline), points_of(outline)]
-    return BEGIN + form(*codes).pack(*values)
+        layout.append("points float64[] uint8 uint8 float64 float64 bool float64")
+        values += [piece.points, piece.deviation, piece.first_end, piece.last_end]
+        values += [*piece.arc_length, bool(piece.direction_known), piece.confidence]
+    layout += ["bool uint32", *["points"] * len(observation.hidden)]
+    values += [bool(observation.complete), len(observation.hidden), *observation.hidden]
+    return pack(" ".join(layout), *values)
 
 
-def packed_prediction(time: Time, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
+_PREDICTION = (
+    "header text text text points float64[] float64[] uint32[] points float64[4] uint8[] float64[] "
+    "text text float64 float64 uint32 float64"
+)
+
+
+def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
     """Return a PredictedThread.
 
     Args:
-        time: of the pose, seconds and nanoseconds.
+        stamp: of the pose.
         prediction: the thread.
         material: its name.
         step_time: wall-clock time that it took [s]; offline it is no property of a prediction, and told as 0.
     """
-    vertices, forces = prediction.positions, prediction.forces
-    tension, contact, pull, moment, states, use = np.empty(0), np.empty((0, 2)), (0.0, 0.0), 0.0, b"", np.empty(0)
+    tension, use, contact, pull = np.empty(0), np.empty(0), np.empty((0, 2)), (0.0, 0.0, 0.0, 0.0)
+    states: tuple[FrictionState, ...] = ()
+    forces = prediction.forces
     if forces is not None:
         tension, contact = forces.tension, forces.contact
-        pull, moment = forces.needle_force.tolist(), forces.needle_moment
+        pull = (*forces.needle_force, 0.0, forces.needle_moment)
         if forces.friction_use.any():
-            states, use = bytes(forces.friction_states), forces.friction_use
+            states, use = forces.friction_states, forces.friction_use
     nodes = np.flatnonzero(contact.any(axis=1))
-    words = (prediction.formulation, prediction.scene_version, material, prediction.solver, prediction.status)
-    formulation, scene, thread, solver, status = map(text, words)
-    sizes = (formulation[0], scene[0], thread[0], len(vertices), len(prediction.strain), solver[0], status[0])
-    return BEGIN + _prediction_form(*sizes, len(tension), len(nodes), len(use)).pack(
-        *time,
-        *DISH,
-        *formulation,
-        *scene,
-        *thread,
-        len(vertices),
-        points_of(vertices),
-        len(prediction.strain),
-        numbers(prediction.strain, REAL),
-        len(tension),
-        numbers(tension, REAL),
-        len(nodes),
-        numbers(nodes, _NODE),
-        len(nodes),
-        points_of(contact[nodes]),
-        *pull,
-        0.0,
-        moment,
-        len(states),
-        states,
-        len(use),
-        numbers(use, REAL),
-        *solver,
-        *status,
-        prediction.residual,
-        prediction.interval,
-        prediction.substeps,
-        step_time,
+    return pack(
+        _PREDICTION,
+        *(stamp, prediction.formulation, prediction.scene_version, material),
+        *(prediction.positions, prediction.strain, tension),
+        *(nodes, contact[nodes], pull, states, use),
+        *(prediction.solver, prediction.status, prediction.residual),
+        *(prediction.interval, prediction.substeps, step_time),
     )
 
 
-def packed_estimate(time: Time, estimate: ThreadEstimate) -> bytes:
+def packed_estimate(stamp: Stamp, estimate: ThreadEstimate) -> bytes:
     """Return an EstimatedThread.
 
     Args:
-        time: of the frame, seconds and nanoseconds.
+        stamp: of the frame.
         estimate: of the thread at the same time.
     """
-    positions, disturbances = estimate.positions, estimate.disturbances
-    scene, problems = text(estimate.prediction.scene_version), [text(why) for why in estimate.problems[:MAX_PROBLEMS]]
     square, degrees = (0.0, 0) if estimate.innovations is None else estimate.innovations.total
-    sizes = tuple(size for size, _ in problems)
-    return BEGIN + _estimate_form(scene[0], len(positions), len(disturbances), sizes).pack(
-        *time,
-        *DISH,
-        *scene,
-        len(positions),
-        points_of(positions),
-        len(positions),
-        numbers(estimate.deviation, REAL),
-        4 * len(positions),
-        numbers(estimate.covariance, REAL),
-        not estimate.corrected,
-        estimate.unmeasured_for,
-        estimate.hidden,
-        estimate.points,
-        square,
-        degrees,
-        len(disturbances),
-        *[
-            part
-            for found in disturbances
-            for part in (
-                found.arc_length,
-                found.extent,
-                *found.position,
-                0.0,
-                *found.direction,
-                0.0,
-                found.force,
-                found.significance,
-                *time_of(round(found.since * 1e9)),
-            )
-        ],
-        len(problems),
-        *[part for problem in problems for part in problem],
-        estimate.converged,
-        estimate.residual,
+    disturbances: list[Any] = []
+    for found in estimate.disturbances:
+        numbers = (found.arc_length, found.extent, *found.position, 0.0, *found.direction, 0.0)
+        disturbances += [(*numbers, found.force, found.significance), round(found.since * 1e9)]
+    layout = "header text points float64[] float64[] bool float64 float64 uint32 float64 uint32 uint32 "
+    return pack(
+        layout + "float64[10] time " * len(estimate.disturbances) + "texts bool float64",
+        *(stamp, estimate.prediction.scene_version, estimate.positions, estimate.deviation),
+        *(np.ravel(estimate.covariance), not estimate.corrected, estimate.unmeasured_for, estimate.hidden),
+        *(estimate.points, square, degrees, len(estimate.disturbances), *disturbances),
+        *(estimate.problems[:MAX_PROBLEMS], estimate.converged, estimate.residual),
     )
 
 
+_MARGINS = "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
+_MINIMUM = "text uint32 int32 float64 float64 float64 "
+_CONTACT_AND_FRICTION = "uint8 uint32[] uint8 uint32[] float64"
+
+
 def packed_margins(
-    time: Time, margins: Margins | None, reason: str = "", scene_version: str = "", *, of_estimate: bool = False
+    stamp: Stamp, margins: Margins | None, reason: str = "", scene_version: str = "", *, of_estimate: bool = False
 ) -> bytes:
     """Return a SafetyMargins: every barrier, the minimum of each, and what is in contact; or why there are none.
 
     Args:
-        time: of the pose, seconds and nanoseconds.
+        stamp: of the pose.
         margins: of the thread; None where there are none.
         reason: why there are none.
         scene_version: of the scene in force where there are none.
         of_estimate: whether they are of the estimated thread; else of the predicted one.
     """
-    scene = text(scene_version if margins is None else margins.scene_version)
     if margins is None:
-        words = text(reason)
-        return BEGIN + _no_margins_form(scene[0], words[0]).pack(
-            *time, *DISH, *scene, False, *words, _OF_NOTHING, *[0] * 8, _UNKNOWN, 0, FrictionState.UNKNOWN, 0, 1.0
-        )
-    names = [text(name) for name in margins]
-    minima = [(text(row.barrier), row) for row in margins.minima]
-    counts = [len(barrier) for barrier in margins.barriers]
-    count, friction = sum(counts), margins.friction
-    touching, squeezed = len(margins.in_contact), len(friction.nodes)
-    layout = _margins_form(
-        scene[0], tuple(size for size, _ in names), count, tuple(name[0] for name, _ in minima), touching, squeezed
-    )
-    columns = [np.repeat(np.arange(len(names)), counts).astype(_BARRIER).tobytes()]
-    real = [(name, REAL) for name in ("value", "clearance", "bound")]
-    for attribute, kind in (("node", _NODE), ("obstacle", _OBSTACLE), *real):
-        columns.append(b"".join(numbers(getattr(barrier, attribute), kind) for barrier in margins.barriers))
-    return BEGIN + layout.pack(
-        *time,
-        *DISH,
-        *scene,
-        True,
-        *EMPTY,
-        _OF_ESTIMATE if of_estimate else _OF_PREDICTION,
-        len(names),
-        *[part for name in names for part in name],
-        *[part for column in columns for part in (count, column)],
-        len(minima),
-        *[
-            part
-            for name, row in minima
-            for part in (*name, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0])
-        ],
-        _IN_CONTACT if touching else _FREE,
-        touching,
-        *margins.in_contact,
-        friction.state,
-        squeezed,
-        *friction.nodes,
-        friction.slowdown,
+        head = (stamp, scene_version, False, reason, OF_NOTHING, ())
+        nothing = (CONTACT_UNKNOWN, (), FrictionState.UNKNOWN, (), 1.0)
+        return pack(_MARGINS + _CONTACT_AND_FRICTION, *head, *[()] * 6, 0, *nothing)
+    barriers, minima, friction = margins.barriers, margins.minima, margins.friction
+    columns: list[ArrayLike] = [np.repeat(np.arange(len(barriers)), [len(barrier) for barrier in barriers])]
+    for name in ("node", "obstacle", "value", "clearance", "bound"):
+        columns.append(np.concatenate([getattr(barrier, name) for barrier in barriers]) if barriers else ())
+    rows: list[Any] = []
+    for row in minima:
+        rows += [row.barrier, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0]]
+    source = OF_ESTIMATE if of_estimate else OF_PREDICTION
+    return pack(
+        _MARGINS + _MINIMUM * len(minima) + _CONTACT_AND_FRICTION,
+        *(stamp, margins.scene_version, True, "", source, [barrier.barrier for barrier in barriers]),
+        *(*columns, len(minima), *rows),
+        *(IN_CONTACT if margins.in_contact else CONTACT_FREE, margins.in_contact),
+        *(friction.state, friction.nodes, friction.slowdown),
     )
 
 
-@lru_cache(KEPT)
-def _prediction_form(
-    formulation: int,
-    scene: int,
-    material: int,
-    vertices: int,
-    segments: int,
-    solver: int,
-    status: int,
-    tensions: int,
-    contacts: int,
-    rubbed: int,
-) -> struct.Struct:
-    """Return the format of a PredictedThread with texts of these lengths, and so many vertices, segments and forces."""
-    begin = (*HEADER, *text_codes(formulation), *text_codes(scene), *text_codes(material))
-    arrays = (*array_codes(vertices, "d", 3), *array_codes(segments, "d"), *array_codes(tensions, "d"))
-    pushes = (*array_codes(contacts, "I"), *array_codes(contacts, "d", 3), *"dddd")
-    friction = (*array_codes(rubbed, "B"), *array_codes(rubbed, "d"))
-    return form(*begin, *arrays, *pushes, *friction, *text_codes(solver), *text_codes(status), "d", "d", "I", "d")
+_FORECAST = (
+    "header text float64[3] float64 bool text float64[] points points points texts float64[] float64[] uint32[] texts "
+    "float64 text uint32 float64 uint32[] float64 texts float64 float64"
+)
 
 
-@lru_cache(KEPT)
-def _estimate_form(scene: int, nodes: int, disturbances: int, problems: tuple[int, ...]) -> struct.Struct:
-    """Return the format of an EstimatedThread of so many nodes and disturbances, and problems of these lengths."""
-    return form(
-        *HEADER,
-        *text_codes(scene),
-        *array_codes(nodes, "d", 3),
-        *array_codes(nodes, "d"),
-        *array_codes(4 * nodes, "d"),
-        *("?", "d", "d", "I", "d", "I"),
-        "I",
-        *[*"d" * 10, "i", "I"] * disturbances,
-        "I",
-        *[code for size in problems for code in text_codes(size)],
-        *("?", "d"),
-    )
-
-
-@lru_cache(KEPT)
-def _margins_form(
-    scene: int, names: tuple[int, ...], rows: int, minima: tuple[int, ...], touching: int, squeezed: int
-) -> struct.Struct:
-    """Return the format of a SafetyMargins.
+def packed_forecast(stamp: Stamp, forecast: Forecast) -> bytes:
+    """Return a ThreadForecast.
 
     Args:
-        scene: bytes of the scene's version.
-        names: bytes of each barrier's name.
-        rows: of all barriers.
-        minima: bytes of the name of each barrier that has rows.
-        touching: nodes that touch something.
-        squeezed: nodes under friction.
+        stamp: of the needle's pose at the start.
+        forecast: of a command that is held.
     """
-    return form(
-        *HEADER,
-        *text_codes(scene),
-        "?",
-        *text_codes(EMPTY[0]),
-        "B",
-        "I",
-        *[code for size in names for code in text_codes(size)],
-        *[code for kind in "BIiddd" for code in array_codes(rows, kind)],
-        "I",
-        *[code for size in minima for code in (*text_codes(size), "I", "i", "d", "d", "d")],
-        *_nodes(touching),
-        *_nodes(squeezed),
-        "d",
+    shown, contact, minima = forecast_instants(forecast, MAX_INSTANTS), forecast.first_contact, forecast.minima
+    command = forecast.commanded[0] if len(forecast.times) > 1 else (0.0, 0.0)
+    margins = list(minima.values())
+    return pack(
+        _FORECAST,
+        *(stamp, forecast.scene_version, (*command, 0.0), forecast.horizon, forecast.converged, forecast.problem),
+        *(forecast.times[shown], forecast.tails[shown], forecast.headings[shown]),
+        *(forecast.vertices[shown].reshape(-1, 2), list(minima)),
+        *([margin.value for margin in margins], [margin.time for margin in margins]),
+        *([margin.node for margin in margins], [margin.shape for margin in margins]),
+        *((math.nan, "", 0) if contact is None else (contact.time, contact.shape, contact.node)),
+        *(time_or_nan(forecast.first_friction), forecast.friction_nodes, time_or_nan(forecast.rest_time)),
+        *(forecast.stopped_by, forecast.peak_tension, forecast.peak_needle_force),
     )
 
 
-@lru_cache(KEPT)
-def _no_margins_form(scene: int, reason: int) -> struct.Struct:
-    """Return the format of a SafetyMargins without any, but a reason of this length."""
-    return form(*HEADER, *text_codes(scene), "?", *text_codes(reason), "B", *"IIIIIIII", *_nodes(0), *_nodes(0), "d")
+def forecast_instants(forecast: Forecast, count: int) -> NDArray[np.intp]:
+    """Return evenly spaced instants with the first and the last among them, at most `count`."""
+    return np.unique(np.linspace(0, len(forecast.times) - 1, count).round().astype(np.intp))
 
 
-def _nodes(count: int) -> tuple[str, ...]:
-    """Return the codes of a state and the nodes that it is about."""
-    return "B", "I", *"I" * count
+def time_or_nan(value: float | None) -> float:
+    """Return a time [s], NaN for never."""
+    return math.nan if value is None else value
+
+
+_CURRENTS = "header texts float64[] time text bool"
+
+
+def packed_currents(stamp: Stamp, command: Stamp | None, output: BridgeOutput) -> bytes:
+    """Return coil currents with the stamp of the command that they follow, or why they are zero, as CoilCurrents."""
+    allocation, stop = output.allocation, "; ".join(output.reasons)
+    return pack(_CURRENTS, stamp, output.coils, allocation.currents, command or 0, stop, allocation.saturated)
+
+
+def packed_rig_currents(stamp: Stamp, currents: Vector) -> bytes:
+    """Return currents for the simulated coils, shape (m,) [A], as CoilCurrents."""
+    return pack(_CURRENTS, stamp, (), currents, 0, "", False)
+
+
+def _velocities(output: BridgeOutput) -> tuple[float, ...]:
+    """Return the commanded, filtered and applied velocity as vectors in space [m/s]."""
+    return (*output.commanded, 0.0, *output.filtered, 0.0, *output.applied, 0.0)
+
+
+def packed_filter_state(stamp: Stamp, output: BridgeOutput) -> bytes:
+    """Return what became of the command as a FilterState; the stamp is the command's, or the time now without one."""
+    layout = "header text float64[9] float64 texts text text"
+    end = (output.slowdown, output.active, output.overridden, output.reason)
+    return pack(layout, stamp, output.source, _velocities(output), *end)
+
+
+def packed_bridge_state(stamp: Stamp, system: CoilSystem, driver: DriverState, refused: int) -> bytes:
+    """Return what the bridge does and why as a CoilBridgeState.
+
+    Args:
+        stamp: of the message.
+        system: bridge, driver and latch.
+        driver: what its driver knows.
+        refused: messages so far.
+    """
+    latch, output = system.latch, system.output
+    velocities: tuple[float, ...] = (0.0,) * 9
+    drift, saturated, currents, reasons = 0.0, False, np.empty(0), system.closed_reasons
+    if output is not None:
+        velocities, drift, reasons = _velocities(output), output.drift, output.reasons
+        currents, saturated = output.allocation.currents, output.allocation.saturated
+    closed = output is None and not latch.latched_reason
+    layout = "header uint8 bool bool text texts float64[9] float64 bool text bool texts float64[] float64[] float64[] "
+    return pack(
+        layout + "uint32",
+        *(stamp, UNCONFIGURED if closed else CONDITIONS[latch.state.name], latch.armed, latch.emergency),
+        *("" if system.bridge is None else system.bridge.scene_version, reasons, velocities, drift, saturated),
+        *(system.driver_name, driver.ready, driver.warnings, currents),
+        *(() if driver.currents is None else driver.currents, driver.voltages, refused),
+    )

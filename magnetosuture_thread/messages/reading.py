@@ -25,20 +25,16 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     THREAD_OBSERVATION,
 )
-from magnetosuture_thread.messages.building import IN_PLANE
-from magnetosuture_thread.messages.cdr import DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
+from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
+from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
 from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
-_POSE = struct.Struct("<7d")  # position and quaternion
-_COVARIANT_POSE = struct.Struct("<43d")  # and covariance
+_COVARIANT_POSE = struct.Struct("<43d")  # position, quaternion and covariance
 _VARIANCES = [7 * k for k in IN_PLANE]  # among its 36 numbers
 _COUNT = struct.Struct("<I")
-_MAX_NAME = 256  # bytes of the names of frames that are passed over in a path
-_POSE_AT, _COUNT_AT = aligned(DISH_END, 8), aligned(DISH_END, 4)
-_PATH_AT = _COUNT_AT + _COUNT.size
-_NAME_AT = _PATH_AT + 8  # the length of the frame's name in a path's first pose
+_POSE_AT = aligned(DISH_END, 8)
 MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
 MAX_HEADING_DEVIATION = 1.0  # rad; beyond, it is unknown which end of the needle is the tail
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
@@ -370,23 +366,16 @@ def read_observation(record: SerializedMessage) -> ThreadObservation:
 
 
 def _plain_path(data: bytes) -> Points | None:
-    """Return a path whose poses all have frames of one length, so that they lie at equal distances."""
-    if not _is_plain(data) or len(data) < _PATH_AT:
+    """Return a path whose poses all are in the dish frame, as ours are, so that they lie at equal distances."""
+    if not _is_plain(data) or len(data) < PATH_AT:
         return None
-    (count,) = _COUNT.unpack_from(data, _COUNT_AT)
-    if count == 0:
-        return np.empty((0, 2))
-    if len(data) < _NAME_AT + _COUNT.size:
+    (count,) = _COUNT.unpack_from(data, PATH_AT - _COUNT.size)
+    if len(data) < PATH_AT + count * PATH_POSES.itemsize:
         return None
-    (name,) = _COUNT.unpack_from(data, _NAME_AT)
-    first = aligned(_NAME_AT + _COUNT.size + name, 8)
-    stride = first + _POSE.size - _PATH_AT
-    if len(data) < _PATH_AT + count * stride or (count > 1 and name > _MAX_NAME):
+    poses = np.frombuffer(data, PATH_POSES, count, PATH_AT)
+    if poses["frame"].tobytes() != data[len(BEGIN) + 8 : DISH_END] * count:
         return None
-    names = np.ndarray((count,), "<u4", data, _NAME_AT, (stride,))
-    if names.tobytes() != data[_NAME_AT : _NAME_AT + _COUNT.size] * count:
-        return None
-    return np.array(np.ndarray((count, 2), "<f8", data, first, (stride, 8)), np.float64)
+    return np.column_stack([poses["x"], poses["y"]])
 
 
 def _is_plain(data: bytes) -> bool:

@@ -1,4 +1,4 @@
-"""Scenes as the fields of a message magnetosuture_msgs/Scene of any library, and back."""
+"""Scenes as messages magnetosuture_msgs/Scene: packed as CDR bytes, and parsed from messages of any library."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.obstacles.shapes import Ring
 from magnetosuture_thread.interface import DISH_FRAME, SCENE
+from magnetosuture_thread.messages.cdr import Stamp, pack
 from magnetosuture_thread.scene.scene import (
     MAX_NAME_CHARS,
     MAX_OUTLINES,
@@ -22,20 +23,25 @@ from magnetosuture_thread.scene.scene import (
 SELF_CONTACT = {None: 0, True: 1, False: 2}  # as in Scene.msg
 
 
-def scene_fields(scene: Scene) -> dict[str, Any]:
-    """Return the fields of a scene message as built-in values by name, without the header.
+def packed_scene(stamp: Stamp, scene: Scene) -> bytes:
+    """Return a scene as the CDR bytes of its message.
 
-    A shape has `disc`, a list of none or one of x, y, radius, and `polygon`, a list of none or one of `outline` and
-    `holes`. An outline is a dictionary whose `corners` are dictionaries of x, y and z.
+    A shape has a sequence of none or one disc, and one of none or one polygon.
     """
-    return {
-        "version": scene.version,
-        "dish_diameter": scene.dish.diameter,
-        "dish_depth": scene.dish.depth,
-        "wall_friction": scene.dish.wall_friction,
-        "self_contact": SELF_CONTACT[scene.dish.self_contact],
-        "shapes": [_shape_fields(shape) for shape in scene.shapes],
-    }
+    layout, dish = "header text float64 float64 float64 uint8 uint32", scene.dish
+    values: list[Any] = [stamp, scene.version, dish.diameter, dish.depth, dish.wall_friction]
+    values += [SELF_CONTACT[dish.self_contact], len(scene.shapes)]
+    for shape in scene.shapes:
+        geometry = shape.geometry
+        values += [shape.name, shape.kind]
+        if isinstance(geometry, Disc):
+            layout += " text text uint32 float64[3] uint32 float64"
+            values += [1, (*geometry.centre, geometry.radius), 0]
+        else:
+            layout += " text text uint32 uint32 points uint32" + " points" * len(geometry.holes) + " float64"
+            values += [0, 1, geometry.outline, len(geometry.holes), *geometry.holes]
+        values.append(shape.friction)
+    return pack(layout, *values)
 
 
 def parse_scene_message(message: Any) -> Scene:
@@ -70,22 +76,6 @@ def _self_contact(value: int) -> bool | None:
         if number == value:
             return setting
     raise ConfigurationError("self_contact", value, "0, 1 or 2, see the message's constants")
-
-
-def _shape_fields(shape: SceneShape) -> dict[str, Any]:
-    geometry = shape.geometry
-    fields: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "disc": [], "polygon": []}
-    fields["friction"] = shape.friction
-    if isinstance(geometry, Disc):
-        fields["disc"] = [{"x": geometry.centre[0], "y": geometry.centre[1], "radius": geometry.radius}]
-    else:
-        rings = [_outline_fields(ring) for ring in (geometry.outline, *geometry.holes)]
-        fields["polygon"] = [{"outline": rings[0], "holes": rings[1:]}]
-    return fields
-
-
-def _outline_fields(ring: Ring) -> dict[str, Any]:
-    return {"corners": [{"x": x, "y": y, "z": 0.0} for x, y in ring]}
 
 
 def _require_bounds(message: Any) -> None:

@@ -16,16 +16,16 @@ from magnetosuture_thread.barrier import (
     STIFFNESS,
     WALL,
     BarrierRows,
-    CompiledBarrier,
+    RowBarrier,
 )
-from magnetosuture_thread.compiled import compiled, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, wall_contact
 from magnetosuture_thread.geometry.polyline import Points
 
 
 @dataclass(frozen=True)
-class Connectivity(CompiledBarrier):
+class Connectivity(RowBarrier):
     """No segment is longer than its rest length.
 
         h_con,i = (D^2 - |x_i - x_{i-1}|^2) / 2,    i = 1 ... n
@@ -47,7 +47,7 @@ class Connectivity(CompiledBarrier):
 
 
 @dataclass(frozen=True)
-class EnhancedConnectivity(CompiledBarrier):
+class EnhancedConnectivity(RowBarrier):
     """No two nodes with one between them are farther apart than two rest lengths.
 
         h_enh,i = ((2 D)^2 - |x_i - x_{i-2}|^2) / 2,    i = 2 ... n
@@ -72,7 +72,7 @@ class EnhancedConnectivity(CompiledBarrier):
 
 
 @dataclass(frozen=True)
-class Compression(CompiledBarrier):
+class Compression(RowBarrier):
     """No segment is shorter than its rest length.
 
         h_cmp,i = (|x_i - x_{i-1}|^2 - D_i^2) / 2,    i = 1 ... n
@@ -95,74 +95,24 @@ class Compression(CompiledBarrier):
         return _distance_rows(positions, 1, self.segment_length, self.name, -1.0)
 
 
-@compiled_uncounted
-def distance_barrier(
-    positions: Points,
-    apart: int,
-    max_distance: NDArray[np.float64],
-    value: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-) -> None:
-    """Write h_i = (max_distance_i^2 - |x_{i + apart} - x_i|^2) / 2 and its gradient at the nodes i ... i + 2.
-
-    Args:
-        positions: all nodes, shape (m, d).
-        apart: 1 or 2.
-        max_distance: greatest distance, shape (m - apart,).
-        value: written, shape (m - apart,).
-        gradient: written, at the three nodes from min(i, m - 3) on, shape (m - apart, 3, d).
-    """
-    nodes, dimension = positions.shape
-    for i in range(nodes - apart):
-        shift = i - min(i, nodes - 3)
-        square = 0.0
-        for a in range(dimension):
-            gradient[i, 0, a] = gradient[i, 1, a] = gradient[i, 2, a] = 0.0
-            difference = positions[i + apart, a] - positions[i, a]
-            gradient[i, shift, a] = difference
-            gradient[i, shift + apart, a] = -difference
-            square += difference * difference
-        value[i] = 0.5 * (max_distance[i] ** 2 - square)
-
-
-@compiled
-def _write_distance_rows(
-    positions: Points,
-    apart: int,
-    bound: NDArray[np.float64],
-    sign: float,
-    nodes: NDArray[np.intp],
-    rows: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-) -> None:
-    """Write the rows of `_distance_rows`: value and clearance, shape (2, m), and the gradient at the two nodes."""
-    count, dimension = len(bound), positions.shape[1]
-    three = np.empty((count, 3, dimension))
-    distance_barrier(positions, apart, bound, rows[0], three)
-    for i in range(count):
-        nodes[i, 0], nodes[i, 1] = i, i + apart
-        shift, square = i - min(i, len(positions) - 3), 0.0
-        for a in range(dimension):
-            gradient[i, 0, a], gradient[i, 1, a] = sign * three[i, shift, a], sign * three[i, shift + apart, a]
-            square += three[i, shift, a] * three[i, shift, a]
-        rows[0, i] *= sign
-        rows[1, i] = sign * (bound[i] - np.sqrt(square))
-
-
 def _distance_rows(
     positions: Points, apart: int, max_distance: float | NDArray[np.float64], name: str, sign: float
 ) -> BarrierRows:
-    """Return the rows of `distance_barrier`, or of its negative, with their gradient at the two nodes they touch."""
-    count, dimension = len(positions) - apart, positions.shape[1]
-    bound, nodes = np.empty(count), np.empty((count, 2), dtype=np.intp)
-    rows, gradient = np.empty((2, count)), np.empty((count, 2, dimension))
-    bound[:] = max_distance
-    _write_distance_rows(np.ascontiguousarray(positions), apart, bound, sign, nodes, rows, gradient)
-    return BarrierRows(name, nodes, np.full(count, NO_OBSTACLE), rows[0], gradient, rows[1])
+    """Return the rows h_i = sign (max_distance_i^2 - |x_{i + apart} - x_i|^2) / 2."""
+    along, first = positions[apart:] - positions[:-apart], np.arange(len(positions) - apart)
+    square = np.einsum("id,id->i", along, along)
+    return BarrierRows(
+        name=name,
+        nodes=np.column_stack([first, first + apart]),
+        obstacle=np.full(len(first), NO_OBSTACLE),
+        value=0.5 * sign * (np.square(max_distance) - square),
+        gradient=sign * np.stack([along, -along], axis=1),
+        clearance=sign * (max_distance - np.sqrt(square)),
+    )
 
 
 @dataclass(frozen=True)
-class _ContactBarrier(CompiledBarrier):
+class _ContactBarrier(RowBarrier):
     """A barrier of the nodes' signed distance from something solid.
 
     Attributes:
@@ -187,14 +137,9 @@ class _ContactBarrier(CompiledBarrier):
         """
         chosen = np.flatnonzero(contacts.nearest & ((contacts.obstacle == DISH_WALL) == (self.name == WALL)))
         signed, normal = contacts.distance[chosen], contacts.normal[chosen]
-        value, gradient = self._function(signed, normal)
         node, obstacle = contacts.node[chosen][:, None], contacts.obstacle[chosen]
         clearance = distance[chosen] - self.distance
-        return BarrierRows(self.name, node, obstacle, value, gradient[:, None, :], clearance)
-
-    def _function(self, signed: NDArray[np.float64], normal: Points) -> tuple[NDArray[np.float64], Points]:
-        """Return h and its gradient for signed distances and their gradients."""
-        return signed - self.distance, normal
+        return BarrierRows(self.name, node, obstacle, signed - self.distance, normal[:, None, :], clearance)
 
 
 @dataclass(frozen=True)
@@ -207,7 +152,7 @@ class ObstacleAvoidance(_ContactBarrier):
     obstacle that is farther apart than the workspace' reach has no row.
 
     Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: the paper
-    has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `SquaredObstacleAvoidance`. Outside of
+    has (|x_i - p_O|^2 - rho^2) / 2 with the closest point p_O, see `squared_barrier`. Outside of
     the obstacle both have the same safe set; but the paper's gradient vanishes on the surface and points
     inwards below it, so that a node which once got inside is kept there. The signed distance has a unit
     gradient everywhere.
@@ -216,31 +161,20 @@ class ObstacleAvoidance(_ContactBarrier):
     name = OBSTACLE
 
 
-@dataclass(frozen=True)
-class SquaredObstacleAvoidance(_ContactBarrier):
-    """The same margin in the paper's form.
+def squared_barrier(signed: float, distance: float) -> float:
+    """Return the obstacle function in the paper's form; its slope by sd is |sd|.
 
         h_obs,i,O = (sd |sd| - rho^2) / 2,    sd = sd_O(x_i)
-
-    Unit of h: that of the positions, squared.
 
     Source: [Forghani2025], obstacle avoidance functions h_obs,i,O and h_obs,needle,O. Deviation: |x - p|^2
     is signed, negative inside, so that the gradient |sd| n points out of the obstacle on both sides. It
     vanishes on the surface: the formulation `paper` takes `ObstacleAvoidance` for nodes that are too near.
+
+    Args:
+        signed: sd.
+        distance: rho, in the same unit.
     """
-
-    name = OBSTACLE
-
-    def _function(self, signed: NDArray[np.float64], normal: Points) -> tuple[NDArray[np.float64], Points]:
-        pairs = [squared_barrier(distance, self.distance) for distance in signed.tolist()]
-        value, slope = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        return value, slope[:, None] * normal
-
-
-@compiled
-def squared_barrier(signed: float, distance: float) -> tuple[float, float]:
-    """Return h = (sd |sd| - rho^2) / 2 and its slope by sd, |sd|."""
-    return 0.5 * (signed * abs(signed) - distance * distance), abs(signed)
+    return 0.5 * (signed * abs(signed) - distance * distance)
 
 
 @dataclass(frozen=True)
@@ -263,8 +197,8 @@ class WallAvoidance(_ContactBarrier):
 
 
 @compiled_uncounted
-def moved_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> float:
-    """Move each free node that is outside of a circle about the origin onto it, radially; return the longest way.
+def move_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> None:
+    """Move each free node that is outside of a circle about the origin onto it, radially.
 
     The nearest point of a convex set: no two nodes that are both moved, or inside, get farther apart by it.
 
@@ -273,17 +207,14 @@ def moved_inside(positions: Points, known: NDArray[np.bool_], radius: float) -> 
         known: nodes that stay where they are, shape (n + 1,).
         radius: of the circle, in space of a cylinder along z; in the unit of the positions.
     """
-    longest = 0.0
     for i in range(len(positions)):
         away, x, y = wall_contact(positions[i, 0], positions[i, 1], radius)
         if away < 0.0 and not known[i]:
             positions[i, 0], positions[i, 1] = -radius * x, -radius * y
-            longest = max(longest, -away)
-    return longest
 
 
 @dataclass(frozen=True)
-class Stiffness(CompiledBarrier):
+class Stiffness(RowBarrier):
     """Nodes with one between them go back to their distance at rest.
 
         V_i = (|x_i - x_{i-2}|^2 - delta_i^2)^2 / 2,    i = 2 ... n
@@ -304,43 +235,15 @@ class Stiffness(CompiledBarrier):
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return the n - 1 rows at positions of shape (n + 1, d)."""
-        positions = np.ascontiguousarray(positions)
-        count = len(positions) - 2
-        value, gradient = np.empty(count), np.empty((count, 3, positions.shape[1]))
-        stiffness_function(positions, self.rest_distance, value, gradient)
-        first = np.arange(count)
-        distance = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
+        along, first = positions[2:] - positions[:-2], np.arange(len(positions) - 2)
+        square = np.einsum("id,id->i", along, along)
+        misfit = square - self.rest_distance**2
+        slope = 2.0 * misfit[:, None] * along
         return BarrierRows(
             name=self.name,
             nodes=np.column_stack([first, first + 2]),
-            obstacle=np.full(count, NO_OBSTACLE),
-            value=value,
-            gradient=gradient[:, ::2],
-            clearance=-np.abs(distance - self.rest_distance),
+            obstacle=np.full(len(first), NO_OBSTACLE),
+            value=-0.5 * misfit**2,
+            gradient=np.stack([slope, -slope], axis=1),
+            clearance=-np.abs(np.sqrt(square) - self.rest_distance),
         )
-
-
-@compiled
-def stiffness_function(
-    positions: Points, rest: NDArray[np.float64], value: NDArray[np.float64], gradient: NDArray[np.float64]
-) -> None:
-    """Write h_i = -V_i and its gradient at the nodes i ... i + 2.
-
-    Args:
-        positions: all nodes, shape (m, d).
-        rest: delta_i, shape (m - 2,).
-        value: written, shape (m - 2,).
-        gradient: written, shape (m - 2, 3, d).
-    """
-    nodes, dimension = positions.shape
-    for i in range(nodes - 2):
-        square = 0.0
-        for a in range(dimension):
-            square += (positions[i + 2, a] - positions[i, a]) ** 2
-        misfit = square - rest[i] ** 2
-        value[i] = -0.5 * misfit * misfit
-        for a in range(dimension):
-            slope = -2.0 * misfit * (positions[i + 2, a] - positions[i, a])
-            gradient[i, 0, a] = -slope
-            gradient[i, 1, a] = 0.0
-            gradient[i, 2, a] = slope

@@ -1,4 +1,4 @@
-"""The needle's motion by its measured poses: a Kalman filter of pose and velocity, compiled."""
+"""The needle's motion by its measured poses: a Kalman filter of pose and velocity."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.model.prediction import NeedleMotion, NeedlePose
 
 Vector = NDArray[np.float64]
@@ -39,12 +38,6 @@ class NeedleMotionFilter:
     def __init__(self) -> None:
         self._state, self._covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
         self._stamp = -math.inf
-
-    def warm_up(self) -> None:
-        """Filter two poses, so that no kernel is compiled in the first callback."""
-        for stamp in (0.0, 0.5 * MAX_INTERVAL):
-            self.update(NeedlePose(stamp, np.zeros(2), np.array([1.0, 0.0]), deviation=(1e-5, 1e-2)))
-        self.reset()
 
     def reset(self) -> None:
         """Forget the motion."""
@@ -86,55 +79,49 @@ class NeedleMotionFilter:
         )
 
 
-@compiled
 def filter_pose(
     state: Vector, covariance: Vector, measured: Vector, interval: float, place: float, angle: float
 ) -> None:
     """Predict a state over an interval [s] and correct it by a measured tail and angle with these variances."""
     before = covariance.copy()
-    _predict_pose(state, covariance, interval)
+    middle = float(state[2] + 0.5 * interval * state[5])
+    c, s = math.cos(middle), math.sin(middle)
+    x, y = state[3] * c - state[4] * s, state[3] * s + state[4] * c
+    state[:3] += interval * x, interval * y, interval * state[5]
+    move, noise = _motion(x, y, c, s, interval)
+    covariance[:] = move @ before @ move.T + noise
     innovation = measured - state[:3]
-    innovation[2] -= 2.0 * math.pi * np.round(innovation[2] / (2.0 * math.pi))
-    noise = np.diag(np.array([place, place, angle]))
-    inverse = np.linalg.inv(covariance[:3, :3] + noise)
+    innovation[2] = math.remainder(innovation[2], 2.0 * math.pi)
+    variances = np.diag((place, place, angle))
+    inverse = np.linalg.inv(covariance[:3, :3] + variances)
     if innovation @ inverse @ innovation > MANEUVER:
         before[3:, :], before[:, 3:] = 0.0, 0.0
         before[3, 3] = before[4, 4] = MAX_SPEED**2
         before[5, 5] = MAX_TURNING**2
-        covariance[:] = _predicted_covariance(state, before, interval)
-        inverse = np.linalg.inv(covariance[:3, :3] + noise)
-    gain = np.ascontiguousarray(covariance[:, :3]) @ inverse
+        covariance[:] = move @ before @ move.T + noise
+        inverse = np.linalg.inv(covariance[:3, :3] + variances)
+    gain = covariance[:, :3] @ inverse
     state += gain @ innovation
-    covariance -= gain @ np.ascontiguousarray(covariance[:3, :])
+    covariance -= gain @ covariance[:3, :]
 
 
-@compiled
-def _predict_pose(state: Vector, covariance: Vector, interval: float) -> None:
-    """Move a state and its covariance over an interval [s]."""
-    middle = state[2] + 0.5 * interval * state[5]
-    c, s = math.cos(middle), math.sin(middle)
-    state[0] += interval * (state[3] * c - state[4] * s)
-    state[1] += interval * (state[3] * s + state[4] * c)
-    state[2] += interval * state[5]
-    covariance[:] = _predicted_covariance(state, covariance, interval)
+def _motion(x: float, y: float, c: float, s: float, interval: float) -> tuple[Vector, Vector]:
+    """Return how errors of a state move over an interval [s], and the covariance that noise in its middle adds.
 
-
-@compiled
-def _predicted_covariance(state: Vector, covariance: Vector, interval: float) -> Vector:
-    """Return a covariance moved over an interval [s] that ends at a state; noise enters in the middle."""
-    middle = state[2] - 0.5 * interval * state[5]
-    c, s = math.cos(middle), math.sin(middle)
-    x, y = state[3] * c - state[4] * s, state[3] * s + state[4] * c
+    Args:
+        x: velocity of the tail in the middle [m/s].
+        y: the same.
+        c: cosine of the heading's angle in the middle.
+        s: its sine.
+        interval: [s].
+    """
     move = np.eye(SIZE)
-    move[0, 2], move[1, 2] = -interval * y, interval * x
-    move[0, 3], move[0, 4], move[1, 3], move[1, 4] = interval * c, -interval * s, interval * s, interval * c
-    move[0, 5], move[1, 5] = -0.5 * interval**2 * y, 0.5 * interval**2 * x
+    move[0, 2:] = -interval * y, interval * c, -interval * s, -0.5 * interval**2 * y
+    move[1, 2:] = interval * x, interval * s, interval * c, 0.5 * interval**2 * x
     move[2, 5] = interval
-    half = np.eye(SIZE)  # from the middle on
-    half[:2, 3:5] = 0.5 * move[:2, 3:5]
-    half[2, 5] = 0.5 * interval
-    noise = np.zeros((SIZE, SIZE))
-    noise[3, 3] = noise[4, 4] = interval * ACCELERATION**2
-    noise[5, 5] = interval * TURNING**2
-    moved: Vector = move @ covariance @ move.T + half @ noise @ half.T
-    return moved
+    half = np.zeros((SIZE, 3))  # from the middle on, of the velocities
+    half[:2] = 0.5 * interval * np.array([[c, -s, 0.0], [s, c, 0.0]])
+    half[2, 2] = 0.5 * interval
+    half[3:] = np.eye(3)
+    rates = interval * np.array([ACCELERATION**2, ACCELERATION**2, TURNING**2])
+    return move, (half * rates) @ half.T

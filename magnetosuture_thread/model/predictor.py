@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.model.forces import ThreadForces
-from magnetosuture_thread.model.forces_in_motion import forces_in_motion
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
@@ -25,6 +25,7 @@ from magnetosuture_thread.model.formulations import (
     RodFormulation,
     StepResult,
     ThreadState,
+    WarmStart,
     make_formulation,
 )
 from magnetosuture_thread.model.margins import Margins
@@ -40,7 +41,28 @@ LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, an
 START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
 MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
+MOTION_TIME = 4e-3  # s; shorter, what the pose's noise bends counts for more, and longer, the thread has gone on
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
+
+
+@checked_arguments("thread predictor")
+@dataclass(frozen=True)
+class PredictorOptions:
+    """Numbers of a predictor that have a good default.
+
+    Attributes:
+        margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
+        contact_tolerance: a node this close to a shape or the wall touches it [m].
+        residual_tolerance: the largest scaled residual with which a solution is accepted.
+        max_step: intervals are divided into steps of at most this [s].
+        max_substeps: but into at most so many; then the steps get longer.
+    """
+
+    margin_range: Annotated[float, bounded("m", 0.0, 2.0)] = 5e-3
+    contact_tolerance: Annotated[float, bounded("m", 0.0, 1e-3)] = 2e-6
+    residual_tolerance: Annotated[float, bounded("", 1e-15, 1e-2)] = 1e-6
+    max_step: Annotated[float, bounded("s", 1e-5, 2.0)] = 0.02
+    max_substeps: Annotated[int, bounded("", 1, 100_000)] = 200
 
 
 class ThreadPredictor:
@@ -57,18 +79,15 @@ class ThreadPredictor:
         barriers: what is enforced besides the formulation's own barriers, see `Barrier`.
         formulation: `rod`, the accurate one, or `paper`, as printed; or one that is made already, which then knows
             scene and barriers itself.
-        solver: `banded`, `osqp`, or the name of a solver that the package qpsolvers knows.
+        solver: `banded` or `osqp`.
         paper: the options of the formulation `paper`.
-        margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
-        contact_tolerance: a node this close to a shape or the wall touches it [m].
-        residual_tolerance: the largest scaled residual with which a solution is accepted.
-        max_step: intervals are divided into steps of at most this [s].
-        max_substeps: but into at most so many; then the steps get longer.
         fixed_nodes: nodes that stay where they are at the start, as where tissue holds the thread.
+        options: by name, see `PredictorOptions`.
 
     Attributes:
         thread: the thread.
-        formulation, fixed_nodes, contact_tolerance: see the arguments; `scene_version` is empty without a scene.
+        formulation, fixed_nodes, options: see the arguments; `scene_version` is empty without a scene.
+        contact_tolerance: of the options.
         pose, state: the last ones; None before the start.
         added: the barriers that were added, with the time from which those that move count.
         reach: greatest distance of the needle's tail from the dish's centre [m].
@@ -89,22 +108,19 @@ class ThreadPredictor:
         formulation: str | Formulation = "rod",
         solver: str = "banded",
         paper: PaperOptions | None = None,
-        margin_range: Annotated[float, bounded("m", 0.0, 2.0)] = 5e-3,
-        contact_tolerance: Annotated[float, bounded("m", 0.0, 1e-3)] = 2e-6,
-        residual_tolerance: Annotated[float, bounded("", 1e-15, 1e-2)] = 1e-6,
-        max_step: Annotated[float, bounded("s", 1e-5, 2.0)] = 0.02,
-        max_substeps: Annotated[int, bounded("", 1, 100_000)] = 200,
         fixed_nodes: Sequence[int] = (),
+        **options: object,
     ) -> None:
+        self.options = chosen = PredictorOptions(**options)  # type: ignore[arg-type]
         for node in fixed_nodes:
             _check_node("fixed node", node, thread)
-        workspace, self.scene_version, self._scene = Workspace((), margin_range), "", scene
+        workspace, self.scene_version, self._scene = Workspace((), chosen.margin_range), "", scene
         if isinstance(scene, Workspace):
             workspace = scene
         elif scene is not None:
             check_scene(thread, scene)
             # Margins are of the thread's surface, and of the half segments beside a node.
-            reach = margin_range + 0.5 * (thread.diameter + thread.segment_length)
+            reach = chosen.margin_range + 0.5 * (thread.diameter + thread.segment_length)
             workspace = Workspace(
                 scene.obstacles,
                 reach,
@@ -116,11 +132,11 @@ class ThreadPredictor:
             if formulation == RodFormulation.name and scene.dish.has_self_contact(thread.diameter):
                 barriers = (*barriers, SelfContact(thread))
         if isinstance(formulation, str):
-            chosen = make_solver(solver, residual_tolerance)
-            formulation = make_formulation(formulation, thread, workspace, chosen, residual_tolerance, paper, barriers)
-        self.thread, self.formulation, self.contact_tolerance = thread, formulation, contact_tolerance
+            tolerance = chosen.residual_tolerance
+            solves = make_solver(solver, tolerance)
+            formulation = make_formulation(formulation, thread, workspace, solves, tolerance, paper, barriers)
+        self.thread, self.formulation, self.contact_tolerance = thread, formulation, chosen.contact_tolerance
         self.added = formulation.added
-        self._longest_step, self._most_substeps = max_step, max_substeps
         self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
         self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
         self.reach = min(workspace.wall_radius + DISH_MARGIN, MAX_COORDINATE)
@@ -182,7 +198,7 @@ class ThreadPredictor:
         assert begun.margins  # which are computed by kernels of their own
         with suppress(SolverError):  # an obstacle that lies here says nothing of a thread that lies elsewhere
             for count in (1, 2):
-                self.step(NeedlePose(count * self._longest_step, np.zeros(dimension), east))
+                self.step(NeedlePose(count * self.options.max_step, np.zeros(dimension), east))
         self.formulation.warm_up()
         self.reset()
         self.added.first_time = math.inf
@@ -288,8 +304,8 @@ class ThreadPredictor:
         nodes = tuple(ends)
         begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
         way = max(map(math.dist, begin.tolist(), end.tolist()))
-        wanted = max(interval / self._longest_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
-        substeps = min(self._most_substeps, math.ceil(wanted - 1e-9))
+        wanted = max(interval / self.options.max_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
+        substeps = min(self.options.max_substeps, math.ceil(wanted - 1e-9))
         residuals, done, worst, converged = Residuals(0.0, 0.0, 0.0), None, None, True
 
         def drive(part: float) -> PrescribedMotion:
@@ -370,7 +386,7 @@ class ThreadPredictor:
             found = None if last is None else formulation.forces(last, pose.heading)
             if found is None or warm_start is None:
                 return found
-            return forces_in_motion(formulation, state, pose, prescribed, warm_start) or found
+            return self._forces_in_motion(state, pose, prescribed, warm_start) or found
 
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
@@ -389,6 +405,33 @@ class ThreadPredictor:
             compute_margins=compute_margins,
             compute_forces=compute_forces,
         )
+
+    def _forces_in_motion(
+        self, state: ThreadState, pose: NeedlePose, prescribed: Sequence[tuple[int, Points]], warm_start: WarmStart
+    ) -> ThreadForces | None:
+        """Return the forces at a pose while the needle moves as `pose.motion` says; None where a step finds none.
+
+        They are those of a short step of first order on from the state: the drag is that of the present velocity, and
+        not of the way since the last pose, which has the noise of two poses. Nothing is changed by it.
+        """
+        motion, formulation = pose.motion, self.formulation
+        assert motion is not None
+        angle = math.atan2(pose.heading[1], pose.heading[0]) + motion.turning * MOTION_TIME
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        nodes = tuple(node for node, _ in prescribed)
+        velocities = np.array([motion.velocity if node == 0 else velocity for node, velocity in prescribed])
+        moved = PrescribedMotion(nodes, state.positions[list(nodes)] + MOTION_TIME * velocities, heading, pose.stamp)
+        # After a much shorter step nothing is extrapolated from the last velocities.
+        begin = ThreadState(state.positions, state.velocities, 0.1 * MOTION_TIME)
+        kept = formulation.warm_start()
+        formulation.restore(warm_start)
+        try:
+            done = formulation.step(begin, moved, MOTION_TIME)
+        except SolverError:
+            return None
+        finally:
+            formulation.restore(kept)
+        return formulation.forces(done, heading) if done.converged else None
 
 
 def _check_node(field: str, node: int, thread: Thread) -> None:

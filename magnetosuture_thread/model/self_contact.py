@@ -7,15 +7,15 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import NO_OBSTACLE, BarrierRows, CompiledBarrier
+from magnetosuture_thread.barrier import NO_OBSTACLE, BarrierRows, RowBarrier
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.thread import Thread
 
 REACH = 0.5  # segments; what is farther from touching than this has no row
 TIGHTEST_TURN = 0.5 * math.pi  # diameters of arc between places of a thread that can touch: half a turn on itself
-_ROWS_PER_NODE = 4  # of the first buffers
+ROWS_PER_NODE = 32  # for which there is room
 
 
 @compiled
@@ -143,7 +143,7 @@ def find_self_contacts(
     return count, passed
 
 
-class SelfContact(CompiledBarrier):
+class SelfContact(RowBarrier):
     """Segments of a thread keep its diameter apart, so that it does not pass through itself: h >= 0 in the plane.
 
     A `ThreadPredictor` takes it where the scene says so, see `Dish.crossing`; a user can pass it as a barrier.
@@ -161,7 +161,8 @@ class SelfContact(CompiledBarrier):
         if not thread.diameter > 0.0:
             raise ConfigurationError("thread.diameter", thread.diameter, "above 0 m where the thread touches itself")
         self._diameter, self._segment = thread.diameter, thread.segment_length
-        self._buffers = self._room(_ROWS_PER_NODE * (thread.segments + 1))
+        count = ROWS_PER_NODE * (thread.segments + 1)
+        self._buffers = np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3, 2)), np.zeros(count)
 
     def rows(self, positions: Points) -> BarrierRows:
         """Return all rows at positions of shape (n + 1, 2) [m]; those of segments that cross are -diameter or less."""
@@ -180,20 +181,16 @@ class SelfContact(CompiledBarrier):
         last = len(positions) - 1
         return [(i, j) for i in range(last) for j in range(i + 2, last) if _crosses(positions, i, j)]
 
-    @staticmethod
-    def _room(count: int) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-        return np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3, 2)), np.zeros(count)
-
     def _rows(self, before: Points, after: Points, crossing: bool) -> tuple[BarrierRows, int]:
         before, after = np.ascontiguousarray(before), np.ascontiguousarray(after)
-        while True:
-            nodes, gradient, value = self._buffers
-            found = find_self_contacts(before, after, self._diameter, self._segment, crossing, nodes, gradient, value)
-            if found[0] >= 0:
-                break
-            self._buffers = self._room(2 * len(value))
-        count = found[0]
+        nodes, gradient, value = self._buffers
+        count, passed = find_self_contacts(
+            before, after, self._diameter, self._segment, crossing, nodes, gradient, value
+        )
+        if count < 0:
+            words = f"more than {len(value)} places where the thread may touch itself"
+            raise SolverError(self.name, words, math.inf, 0.0)
         values, free = value[:count].copy(), np.full(count, NO_OBSTACLE, dtype=np.intp)
         # h is a distance between places that move by the gradient's own norm or less, so it is the clearance too.
         rows = BarrierRows(self.name, nodes[:count].copy(), free, values, gradient[:count].copy(), values)
-        return rows, found[1]
+        return rows, passed

@@ -170,7 +170,6 @@ class ThreadSession:
         self._last: int | None = None
         self._first = math.inf  # stamp of the first pose [s]
         self._needle_motion = NeedleMotionFilter()
-        self._needle_motion.warm_up()
         self._initial_observation = InitialObservation()
         self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
         self._motion_before = self._estimate_motion  # the estimate's, before its last pose

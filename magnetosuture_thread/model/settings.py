@@ -9,16 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.configuration import autostart_parameter, configuration_fields, quantity
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimator
 from magnetosuture_thread.model.estimator_settings import EstimatorSettings
-from magnetosuture_thread.model.forecast_settings import ForecastSettings
 from magnetosuture_thread.model.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.model.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.model.solvers import SOLVERS, make_solver
+from magnetosuture_thread.model.solvers import SOLVERS
 from magnetosuture_thread.model.thread import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
@@ -45,6 +44,32 @@ FIXED = {  # why a node cannot change it while it is configured
 
 
 @dataclass(frozen=True)
+class ForecastSettings(Configuration):
+    """How far the estimated thread is forecast under the present command, and the needle that is moved."""
+
+    forecast_horizon: float = quantity(
+        0.0,
+        "how far ahead thread/forecast looks from every estimate, the present command held; 0 for none",
+        unit="s",
+        minimum=0.0,
+        maximum=30.0,
+    )
+    forecast_step: float = quantity(0.03, "duration of its steps", unit="s", minimum=0.001, maximum=0.5)
+    forecast_period: float = quantity(
+        0.0,
+        "time between estimates that are forecast; 0 for every estimate, as far as there is time",
+        unit="s",
+        minimum=0.0,
+        maximum=10.0,
+    )
+    friction_feedback: str = shared_parameter("friction_feedback")
+    keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
+
+
+@dataclass(frozen=True)
 class ThreadModelSettings(EstimatorSettings, ForecastSettings):
     """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
@@ -55,9 +80,7 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
     formulation: str = quantity(
         "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
     )
-    solver: str = quantity(
-        "banded", "what solves a step's program: banded, osqp, or a solver that the package qpsolvers knows"
-    )
+    solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
     barriers: tuple[str, ...] = quantity((), "barriers of your own, each as module:class; see Barrier")
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
     diameter: float = quantity(0.0, "of the thread; 0 takes the material's", unit="m", minimum=0.0, maximum=0.01)
@@ -204,11 +227,6 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
         ):
             if len(pair) not in (0, 2):
                 raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
-        if self.solver not in SOLVERS:
-            try:
-                make_solver(self.solver, self.residual_tolerance)
-            except ConfigurationError as error:
-                raise self.refused("solver", error.expectation) from None
         if self.formulation == "paper" and self.medium != "liquid":
             raise self.refused("medium", "liquid, as the formulation paper has no inertia")
         if self.formulation == "paper" and self.flow:

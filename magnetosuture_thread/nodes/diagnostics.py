@@ -12,7 +12,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from magnetosuture_thread.compiled import compilations
-from magnetosuture_thread.nodes.topics import DIAGNOSTICS
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 1.0  # s
@@ -41,7 +41,7 @@ class Health:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._publisher = DIAGNOSTICS.publisher(node)
+        self._publisher = topics.DIAGNOSTICS.publisher(node)
         self._level, self._text, self._standby = DiagnosticStatus.OK, "starting", ""
         self._refused = 0
         self._last_refusal = ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,26 +13,53 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
-from magnetosuture_msgs.msg import CoilBridgeState
+from magnetosuture_msgs.action import ExecuteProcedure
+from magnetosuture_msgs.msg import CoilBridgeState, EstimatedThread, PredictedThread, SafetyMargins, TrackerState
+from magnetosuture_msgs.msg import ProcedureState as StateMessage
 from magnetosuture_msgs.srv import PlanProcedure
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from magnetosuture_thread import InvalidInputError, Scene
-from magnetosuture_thread.interface import ABORT_PROCEDURE, PAUSE_PROCEDURE, PLAN_PROCEDURE, PLANNER, RESUME_PROCEDURE
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.interface import (
+    ABORT_PROCEDURE,
+    DISH_FRAME,
+    EXECUTE_PROCEDURE,
+    PAUSE_PROCEDURE,
+    PLAN_PROCEDURE,
+    PLANNER,
+    RESUME_PROCEDURE,
+)
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
+from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.procedure_action import ProcedureAction
-from magnetosuture_thread.nodes.procedure_inputs import ProcedureInputs
-from magnetosuture_thread.nodes.procedure_outputs import PERIOD, ProcedureOutputs
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode, reason_of
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
-from magnetosuture_thread.planning.session import ProcedureSession, compile_planning
+from magnetosuture_thread.planning.session import ProcedureSession, ProcedureStatus, compile_planning
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+from magnetosuture_thread.texts import shortened
+
+PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
+MAX_DISTURBANCES = 20  # that are read of a message
+IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed: to read them costs most
+STATES = {
+    None: StateMessage.STATE_IDLE,
+    ProcedureState.READY: StateMessage.STATE_READY,
+    ProcedureState.RUNNING: StateMessage.STATE_RUNNING,
+    ProcedureState.PAUSED: StateMessage.STATE_PAUSED,
+    ProcedureState.DONE: StateMessage.STATE_DONE,
+    ProcedureState.FAILED: StateMessage.STATE_FAILED,
+}
+ENDED = (StateMessage.STATE_DONE, StateMessage.STATE_FAILED)
 
 
 class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
@@ -57,8 +85,11 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
             compile_planning()
         self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))
         self._setpoints = self.held(topics.TIP_SETPOINT.publisher(self))
-        self._outputs = ProcedureOutputs(self, self._session)
-        self._inputs = ProcedureInputs(self, self._session, settings.hold_timeout)
+        self._states = self.held(topics.PROCEDURE_STATE.publisher(self))
+        self._plans = self.held(topics.PROCEDURE_PLAN.publisher(self))
+        self._published: tuple[Any, ...] = ()
+        self._published_at = -math.inf
+        ProcedureInputs(self, self._session, settings.hold_timeout)
         self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
         self.held(topics.BRIDGE_STATE.subscribe(self, self.on_bridge))
         self.held(topics.OPERATOR_COMMAND.subscribe(self, self.while_active(self.on_operator)))
@@ -74,7 +105,7 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
 
     def activate(self) -> None:
         """Publish that there is no procedure, or how the last one ended."""
-        self._outputs.repeat()
+        self._published = ()
         self._publish()
 
     def deactivate(self) -> None:
@@ -139,10 +170,10 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
             return self.refuse(error)
         velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())
         if velocity is not None:
-            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), velocity))
+            self._commands.publish(packed_twist(self.get_clock().now().to_msg(), velocity))
             self._moving = bool(velocity.any())
         if (setpoint := self._session.setpoint) is not None:
-            self._setpoints.publish(MESSAGES.placed(message.header.stamp, *setpoint))
+            self._setpoints.publish(packed_pose_stamped(message.header.stamp, *setpoint))
         self._publish()
 
     def on_bridge(self, message: CoilBridgeState) -> None:
@@ -199,14 +230,36 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         """Publish what has changed; bring the needle to rest where the procedure does not command it."""
         if not self._session.is_commanding:
             self._rest()
-        if (message := self._outputs.publish()) is not None:
+        stamp = self.get_clock().now().to_msg()
+        plan = self._session.new_plan()
+        if plan is not None:
+            self._plans.publish(packed_path(stamp, plan))
+        status, now = self._session.status, time.monotonic()
+        key = (status.state, status.procedure, status.goal, status.reason, status.resumes, status.hold_to_run)
+        if key != self._published or (now - self._published_at >= PERIOD and self._session.is_running):
+            self._published, self._published_at = key, now
+            message = state_message(stamp, status)
+            self._states.publish(message)
+            self._report(status)
             self._action.update(message)
         self._action.finish()
+
+    def _report(self, status: ProcedureStatus) -> None:
+        health, name = self.health, shortened(status.procedure)
+        values = {"procedure": name, "goals met": f"{status.goals_met} of {len(status.goals)}"}
+        if status.state is None:
+            health.ok("no procedure", **values)
+        elif status.state is ProcedureState.RUNNING:
+            health.ok(f"{name}: {status.goals[status.goal]}, goal {status.goal + 1} of {len(status.goals)}", **values)
+        elif status.state in (ProcedureState.PAUSED, ProcedureState.FAILED):
+            health.warn(f"{name}: {status.state.value}: {status.reason}", **values)
+        else:
+            health.ok(f"{name}: {status.state.value}", **values)
 
     def _rest(self) -> None:
         """Stop the needle now, and not when its last command times out."""
         if self._moving:
-            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), np.zeros(2)))
+            self._commands.publish(packed_twist(self.get_clock().now().to_msg(), np.zeros(2)))
             self._moving = False
 
     @contextmanager
@@ -217,6 +270,202 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
             yield
         finally:
             self._session.known.shift(time.monotonic() - began)
+
+
+class ProcedureInputs:
+    """Registers tracker, thread and held page in the state of the loop.
+
+    Args:
+        node: that subscribes.
+        session: in which it is registered.
+        hold_timeout: age beyond which a message on `procedure/hold` does not count [s].
+    """
+
+    def __init__(
+        self, node: StandbyNode[NeedlePlannerSettings], session: ProcedureSession, hold_timeout: float
+    ) -> None:
+        self._node, self._session, self._hold_timeout = node, session, hold_timeout
+        self._known = session.known
+        node.held(topics.TRACKER_STATE.subscribe(node, node.while_active(self.on_tracker)))
+        for topic, handle in (
+            (topics.PREDICTED_THREAD, self.on_prediction),
+            (topics.ESTIMATED_THREAD, self.on_estimate),
+            (topics.MARGINS, self.on_margins),
+        ):
+            node.held(topic.subscribe(node, node.while_active(self._sparing(topic, handle)), raw=True))
+        node.held(topics.PROCEDURE_HOLD.subscribe(node, node.while_active(self.on_hold)))
+
+    def on_tracker(self, message: TrackerState) -> None:
+        """Register whether the needle is tracked."""
+        tracked = message.state == TrackerState.STATE_TRACKED
+        self._known.on_tracker("" if tracked else _reason(message))
+
+    def on_prediction(self, message: PredictedThread) -> None:
+        """Register the tension of the thread."""
+        tension = float(np.max(message.tension, initial=0.0))
+        if not math.isfinite(tension):
+            self._node.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
+            return
+        self._known.on_prediction(time.monotonic(), tension, lambda: _vertices(message))
+
+    def on_estimate(self, message: EstimatedThread) -> None:
+        """Register how sure the estimate is, and which forces the model does not know of."""
+        found = {
+            reading.seconds(each.since): disturbance_text(
+                each.arc_length, each.force, (each.direction.x, each.direction.y)
+            )
+            for each in message.disturbances[:MAX_DISTURBANCES]
+        }
+        self._known.on_estimate(time.monotonic(), message.unmeasured_for, found, lambda: _vertices(message))
+
+    def on_margins(self, message: SafetyMargins) -> None:
+        """Register the thread's friction, and whether its margins are valid."""
+        reason = "" if message.valid else _reason(message)
+        if not reason and not 0.0 < message.slowdown <= 1.0:
+            self._node.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
+            return
+        nodes = len(message.friction_nodes)
+        self._known.on_margins(time.monotonic(), reason, nodes, message.slowdown, message.scene_version)
+
+    def on_hold(self, message: Header) -> None:
+        """Register that somebody holds the page; a message that was on its way for too long does not count."""
+        now = self._node.get_clock().now().nanoseconds * 1e-9
+        if abs(now - reading.seconds(message.stamp)) <= self._hold_timeout:
+            self._known.on_hold(time.monotonic())
+
+    def _sparing(self, topic: topics.Topic, handle: Callable[[Any], None]) -> Callable[[bytes], None]:
+        """Return a callback that reads every message while a procedure is executed, and few while none is."""
+        due = -math.inf
+
+        def take(data: bytes) -> None:
+            nonlocal due
+            now = time.monotonic()
+            if now < due and not self._session.is_active:
+                return
+            due = now + IDLE_PERIOD
+            try:
+                message = topic.decode(data)
+            except InvalidInputError as error:
+                self._node.refuse(error)
+            else:
+                handle(message)
+
+        return take
+
+
+def _reason(message: Any) -> str:
+    """Return the reason that a message gives, as it may be kept."""
+    return shortened(message.reason, MAX_REASON_CHARS) or "no reason is given"
+
+
+def _vertices(message: Any) -> Points | None:
+    """Return the nodes of a predicted or estimated thread, shape (n + 1, 2) [m]; None where these are no thread."""
+    found = np.array([(point.x, point.y) for point in message.positions])
+    return found if len(found) >= 2 and np.isfinite(found).all() else None
+
+
+def state_message(stamp: Any, status: ProcedureStatus) -> StateMessage:
+    """Return the state of a procedure as a message."""
+    return StateMessage(
+        header=Header(stamp=stamp, frame_id=DISH_FRAME),
+        state=STATES[status.state],
+        procedure=shortened(status.procedure),
+        goals=list(status.goals),
+        goal=status.goal,
+        goals_met=status.goals_met,
+        progress=status.progress,
+        reason=shortened(status.reason, MAX_REASON_CHARS),
+        resumes=status.resumes,
+        hold_to_run=status.hold_to_run,
+        clearance=status.clearance,
+    )
+
+
+class _DeferredServer(ActionServer):
+    """An action server that calls back when a goal has ended, and not when it begins.
+
+    A callback that waited for the end would keep rclpy's executor busy: it asks every task that waits in each turn.
+    """
+
+    def notify_execute(self, goal_handle: Any, execute_callback: Callable[[Any], Any] | None) -> None:
+        """Begin nothing; with a callback, that a goal has ended, send its result."""
+        if execute_callback is not None:
+            super().notify_execute(goal_handle, execute_callback)
+
+
+class ProcedureAction:
+    """Serves the action. Every goal is accepted, as a refusal could give no reason: one that cannot begin is aborted.
+
+    Args:
+        node: that executes procedures.
+        begin: begins the procedure of a goal, or raises why it cannot.
+        abort: gives the procedure up, for a reason.
+    """
+
+    def __init__(self, node: PackageNode, begin: Callable[[Any], None], abort: Callable[[str], object]) -> None:
+        self._node, self._begin, self._abort = node, begin, abort
+        self._goal: Any = None
+        self._cancelled = False
+        self._ended: StateMessage | None = None
+        self._server = _DeferredServer(
+            node,
+            ExecuteProcedure,
+            EXECUTE_PROCEDURE,
+            lambda goal: ExecuteProcedure.Result(),
+            goal_callback=lambda request: GoalResponse.ACCEPT,
+            handle_accepted_callback=self.on_goal,
+            cancel_callback=self.on_cancel,
+        )
+
+    def on_goal(self, goal: Any) -> None:
+        """Begin the procedure of a goal."""
+        goal.execute()  # it is marked so, and nothing is called
+        try:
+            self._begin(goal.request)
+        except Exception as error:  # it would come out of `spin`
+            self._node.refuse(error)
+            result = ExecuteProcedure.Result(state=StateMessage.STATE_FAILED, reason=reason_of(error))
+            self._send_result(goal, "abort", result)
+        else:
+            self._goal, self._cancelled, self._ended = goal, False, None
+
+    def on_cancel(self, goal: Any) -> CancelResponse:
+        """Give the procedure of a goal up."""
+        if self._goal is None or goal != self._goal or self._ended is not None:
+            return CancelResponse.REJECT
+        self._cancelled = True
+        self._abort("cancelled by the client of the action")
+        return CancelResponse.ACCEPT
+
+    def update(self, status: StateMessage) -> None:
+        """Take the state of the procedure: feedback of the goal, or its end."""
+        if self._goal is None or self._ended is not None:
+            return
+        if status.state in ENDED:
+            self._ended = status
+        else:
+            self._goal.publish_feedback(ExecuteProcedure.Feedback(status=status))
+
+    def finish(self) -> None:
+        """Send the result of a procedure that has ended; of one that is cancelled once rclpy has marked it so."""
+        goal, ended = self._goal, self._ended
+        if ended is None or (self._cancelled and not goal.is_cancel_requested):
+            return
+        self._goal = self._ended = None
+        end = "canceled" if self._cancelled else "abort" if ended.state == StateMessage.STATE_FAILED else "succeed"
+        result = ExecuteProcedure.Result(state=ended.state, reason=ended.reason, goals_met=ended.goals_met)
+        self._send_result(goal, end, result)
+
+    def destroy(self) -> None:
+        """Take the action out of the graph."""
+        self._server.destroy()
+
+    def _send_result(self, goal: Any, end: str, result: Any) -> None:
+        def finished(handle: Any) -> Any:
+            getattr(handle, end)()
+            return result
+
+        self._server.notify_execute(goal, finished)
 
 
 def main(arguments: list[str] | None = None) -> int:

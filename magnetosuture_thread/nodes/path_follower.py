@@ -10,15 +10,13 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.duration import Duration
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.guidance.path import prepare_paths
-from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT, run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 
 
 class PathFollowerNode(StandbyNode[PathFollowerSettings]):
@@ -54,7 +52,7 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
     def deactivate(self) -> None:
         """Bring the needle to rest at once, and not when the last command times out."""
         if self.is_active:
-            self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), np.zeros(2)))
+            self._commands.publish(packed_twist(self.get_clock().now().to_msg(), np.zeros(2)))
             self._commands.wait_for_all_acked(Duration(seconds=DELIVERY_TIMEOUT))
             self.destroy_publisher(self._commands)
             self._held.remove(self._commands)
@@ -94,9 +92,9 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
         except InvalidInputError as error:
             self.health.refuse(error)
             return
-        self._commands.publish(MESSAGES.twist_message(self.get_clock().now().to_msg(), command.velocity))
+        self._commands.publish(packed_twist(self.get_clock().now().to_msg(), command.velocity))
         if 0.0 < command.progress < 1.0:
-            self._setpoints.publish(MESSAGES.placed(message.header.stamp, command.tip, 0.0))
+            self._setpoints.publish(packed_pose_stamped(message.header.stamp, command.tip, 0.0))
         text = "done" if command.progress >= 1.0 else "following" if command.progress else "settling"
         self.health.ok(text, progress=round(command.progress, 4))
 

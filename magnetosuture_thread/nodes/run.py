@@ -122,16 +122,17 @@ def end_signals() -> tuple[signal.Signals, ...]:
 
 
 class _Ending(Future):
-    """Done when a signal has asked the process to end: amid its start by a KeyboardInterrupt, later between callbacks.
+    """Done when a signal has asked the process to end, or when its nodes were shut down by their lifecycle.
 
-    rclpy's own handlers would take the nodes out of the graph at once, before they can publish their final messages.
-    Python runs no handler while the compiler is at work, nor while an executor waits: a thread hears of signals too. It
-    wakes the executor, and ends a process that goes on loading. No coil has a current then: see `Health.load`.
+    rclpy's own handlers would take the nodes out of the graph at once, before they can publish their final messages. A
+    signal raises nothing: a KeyboardInterrupt out of a library that calls Python comes out as another error, or is
+    lost. A thread hears of it, as Python runs no handler while the compiler is at work. It wakes the executor, and ends
+    a process that goes on loading. No coil has a current then: see `Health.load`.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self._asked = self._deferred = False
+        self._asked = False
         self._nodes: tuple[Node, ...] = ()
         self._executor: SingleThreadedExecutor | None = None
         woken, written = os.pipe2(os.O_CLOEXEC)
@@ -139,26 +140,24 @@ class _Ending(Future):
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
         threading.Thread(target=self._watch, args=(woken,), name="signals", daemon=True).start()
         for which in end_signals():
-            signal.signal(which, self._on_signal)
-        # A KeyboardInterrupt in a function that a C library calls, as to load compiled code, is lost with a traceback
-        # on standard error; the signal is remembered here.
-        report = sys.unraisablehook
-        sys.unraisablehook = lambda lost: None if lost.exc_type is KeyboardInterrupt else report(lost)
+            signal.signal(which, lambda number, frame: None)
 
     def done(self) -> bool:
-        """Return whether the process is to end: it was asked to, or its nodes were shut down by their lifecycle."""
+        """Return whether the process is to end."""
         ended = [isinstance(node, GuardedNode) and node.has_ended for node in self._nodes]
         return self._asked or (bool(ended) and all(ended))
 
     def add_done_callback(self, callback: Callable[..., None]) -> None:
-        """Leave a callback out: an executor adds one in each turn, and `defer` wakes it."""
+        """Leave a callback out: an executor adds one in each turn, and a signal wakes it."""
 
-    def defer(self, executor: SingleThreadedExecutor, nodes: tuple[Node, ...]) -> None:
-        """From now on raise nothing, and wake an executor instead."""
-        self._executor, self._nodes, self._deferred = executor, nodes, True
+    def spin(self, executor: SingleThreadedExecutor, nodes: tuple[Node, ...]) -> None:
+        """Run the callbacks of nodes until the process is to end."""
+        self._executor, self._nodes = executor, nodes
+        executor.spin_until_future_complete(self)
 
     def _watch(self, woken: int) -> None:
         os.read(woken, 1)
+        self._asked = True
         while True:
             if self._executor is not None:
                 with suppress(Exception):  # it is gone already
@@ -167,19 +166,14 @@ class _Ending(Future):
             if Health.loading:
                 os._exit(0)
 
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        # Amid a message that rclpy's library makes in Python, a KeyboardInterrupt would come out as another error.
-        again, self._asked = self._asked, True
-        if not self._deferred and not again:
-            raise KeyboardInterrupt
-
 
 def run(
     make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
 ) -> int:
     """Run a node, or several in one process, until it is interrupted, terminated, hung up, or shut down.
 
-    A node then publishes its final messages while the graph is still there: see `GuardedNode.finish`.
+    A node then publishes its final messages while the graph is still there: see `GuardedNode.finish`. One that is asked
+    to end while it starts ends once it has started, or after `LOADING_GRACE` if it loads or compiles.
 
     Args:
         make: makes the node, or all of them.
@@ -190,17 +184,17 @@ def run(
         0 when it was asked to end, 1 when it could not start.
     """
     nodes: tuple[Node, ...] = ()
-    executor = ended = None
+    executor = None
     try:
-        ended = _Ending()
+        ending = _Ending()
         try:
             init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rclpy raises several kinds, some private, for a broken parameter file.
-            if ended.done():
-                return 0
-            print(f"error: {_one_line(error)}", file=sys.stderr)
-            return 1
-        result = make()
+            result = make()
+        except Exception as error:  # rclpy raises several kinds, some private, for a broken file or parameter
+            if isinstance(error, (MagnetosutureError, ParameterException, ValueError)) or not rclpy.ok():
+                print(f"error: {_one_line(error)}", file=sys.stderr)
+                return 1
+            raise
         nodes = result if isinstance(result, tuple) else (result,)
         made(result)
         # The multi-threaded executor loses messages in the wheels of Jazzy.
@@ -210,26 +204,13 @@ def run(
         # What was loaded stays; to look through it for garbage again and again takes tens of milliseconds.
         gc.collect()
         gc.freeze()
-        ended.defer(executor, nodes)
-        executor.spin_until_future_complete(ended)
+        ending.spin(executor, nodes)
         _finish(nodes)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         _finish(nodes)
     except rclpy_implementation.RCLError:
-        amid_start = not nodes and ended is not None and ended.done()
-        if rclpy.ok() and not amid_start:
-            raise  # else a callback was still at work when the node was asked to end
-    except (MagnetosutureError, ParameterException, ValueError, RuntimeError, SystemError) as error:
-        if not nodes and ended is not None and ended.done():
-            return 0  # amid its start: the library behind rclpy makes other errors of a KeyboardInterrupt
-        if isinstance(error, (MagnetosutureError, ParameterException)):
-            print(f"error: {_one_line(error)}", file=sys.stderr)
-            return 1
-        if nodes or not isinstance(error, ValueError):
-            raise
-        # rclpy's own word for a parameter that has no value, as an empty list.
-        print(f"error: a parameter cannot be declared: {_one_line(error)}", file=sys.stderr)
-        return 1
+        if rclpy.ok():
+            raise  # else a callback was still at work when the context was shut down
     finally:
         if executor is not None:
             executor.shutdown()

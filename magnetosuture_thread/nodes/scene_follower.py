@@ -49,7 +49,7 @@ class SceneFollower:
         self.scene, self.problem = scene, ""
         self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
         self._node, self._health, self._changed = node, health, changed
-        topics.SCENE.subscribe(node, self.on_scene, raw=True, unheard=health.refuse)
+        topics.SCENE.subscribe(node, self.on_scene, raw=True)
 
     @property
     def version(self) -> str:

@@ -10,9 +10,10 @@ from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
 from magnetosuture_thread import MagnetosutureError, Scene
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
+from magnetosuture_thread.messages.markers import packed_scene_markers
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import initial_scene
 from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
@@ -77,8 +78,8 @@ class SceneServerNode(StandbyNode[SceneServerSettings]):
 
     def _publish(self, scene: Scene) -> None:
         stamp = self.get_clock().now().to_msg()
-        self._scenes.publish(MESSAGES.scene_message(stamp, scene))
-        self._markers.publish(MESSAGES.scene_markers(stamp, scene))
+        self._scenes.publish(packed_scene(stamp, scene))
+        self._markers.publish(packed_scene_markers(stamp, scene))
         count = len(scene.shapes)
         text = f"scene {scene.version}: dish of {1e3 * scene.dish.diameter:g} mm, {count} shape{'s' * (count != 1)}"
         self.health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")

@@ -19,17 +19,15 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.forecast import make_forecaster
-from magnetosuture_thread.guidance.follower import PathFollower
-from magnetosuture_thread.guidance.path import prepare_paths
-from magnetosuture_thread.guidance.settings import PathFollowerSettings
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message
+from magnetosuture_thread.messages.markers import packed_forecast_markers
+from magnetosuture_thread.messages.packing import packed_forecast
 from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 
 MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
 MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
@@ -140,10 +138,9 @@ class ThreadForecasts:
             return
         if task.generation != self._generation:
             return
-        when = MESSAGES.time(task.stamp)
-        self._published.publish(forecast_message(MESSAGES, when, forecast))
+        self._published.publish(packed_forecast(task.stamp, forecast))
         if self._markers.get_subscription_count():
-            self._markers.publish(forecast_markers(MESSAGES, when, forecast))
+            self._markers.publish(packed_forecast_markers(task.stamp, forecast))
 
     def on_path(self, request: Any, answer: Any) -> Any:
         """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
@@ -167,7 +164,7 @@ class ThreadForecasts:
         start, slowed = ForecastStart.of_estimate(result.estimate, pose), settings.friction_feedback == "all"
         forecast = forecaster.forecast(start, command, request.horizon, slowed=slowed)
         answer.success = True
-        answer.forecast = forecast_message(MESSAGES, MESSAGES.time(result.stamp), forecast)
+        answer.forecast = topics.FORECAST.decode(packed_forecast(result.stamp, forecast))
         return answer
 
     def _forecaster(self) -> ThreadForecaster | None:
@@ -177,7 +174,7 @@ class ThreadForecasts:
             return self._made[2]
         self._made, self._last, forecaster = (settings, scene, None), None, None
         if scene is not None:
-            forecaster = make_forecaster(settings, scene, workers=1)
+            forecaster = make_forecaster(settings, scene)
             forecaster.warm_up()
             prepare_paths()
         self._made = settings, scene, forecaster

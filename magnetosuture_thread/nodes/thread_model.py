@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -11,20 +12,26 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 
-from magnetosuture_thread import InvalidInputError, NeedlePose, Scene
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene, ThreadEstimate, interface
+from magnetosuture_thread.configuration import configuration_fields
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
-from magnetosuture_thread.model.session import PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
+from magnetosuture_thread.messages.markers import packed_thread_markers
+from magnetosuture_thread.messages.outputs import estimate_outputs, prediction_outputs
+from magnetosuture_thread.model.prediction import STARTED
+from magnetosuture_thread.model.program import SOLVED
+from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
+from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
+from magnetosuture_thread.nodes.parameters import Changeable
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
-from magnetosuture_thread.nodes.thread_health import ThreadHealth, model_text
-from magnetosuture_thread.nodes.thread_outputs import ThreadOutputs
-from magnetosuture_thread.nodes.thread_settings import ThreadSettings
 from magnetosuture_thread.thread_observation import ThreadObservation
+
+UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning
 
 
 class ThreadModelNode(StandbyNode[ThreadModelSettings]):
@@ -43,10 +50,10 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         super().__init__("thread_model", ThreadModelSettings, fixed=FIXED, **options)
         self._scene = SceneFollower(self, self.health, None, self.on_scene)
         self._states = ThreadHealth(self.health)
-        self._changes: ThreadSettings | None = None
+        self._changes: Changeable[ThreadModelSettings] | None = None
         self._forecasts: ThreadForecasts | None = None
         self._material: bytes | None = None  # that came while the node was unconfigured; each is applied once
-        topics.MATERIAL.subscribe(self, self.on_material, raw=True, unheard=self.health.refuse)
+        topics.MATERIAL.subscribe(self, self.on_material, raw=True)
         self._observed = False
         self._listens = listens
         self.start()
@@ -57,11 +64,17 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         with self.health.load("the model's kernels"):
             self._session = ThreadSession(settings, scene)
             self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
-        self._changes = ThreadSettings(self, self._session, self.health)
+        self._changes = Changeable(self, settings, self._prepare)
         if self._material is not None:
-            self._changes.on_material(self._material)
+            self.on_material(self._material)
             self._material = None
-        self._outputs = ThreadOutputs(self, self._session)
+        self._outputs = {
+            interface.PREDICTED_THREAD: self.held(topics.PREDICTED_THREAD.publisher(self)),
+            interface.ESTIMATED_THREAD: self.held(topics.ESTIMATED_THREAD.publisher(self)),
+            interface.MARGINS: self.held(topics.MARGINS.publisher(self)),
+        }
+        self._markers = self.held(topics.THREAD_MARKERS.publisher(self))
+        self._last_margins = 0  # stamp of those that were published [ns]
         if self._listens:
             self._subscribe()
         self.get_logger().info(f"ready: {model_text(settings, scene)}")
@@ -93,11 +106,14 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
             self._subscribe()
 
     def on_material(self, data: bytes) -> None:
-        """Handle a ThreadMaterial message; one that comes before the node is configured waits for that."""
+        """Set the parameters that a ThreadMaterial message names; before the node is configured it waits for that."""
         if self._changes is None:
             self._material = data
-        else:
-            self._changes.on_material(data)
+            return
+        try:
+            self._changes.set(parse_material(topics.MATERIAL.decode(data)))
+        except MagnetosutureError as error:
+            self.health.refuse(error)
 
     def on_scene(self, scene: Scene) -> None:
         """Change the scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
@@ -128,7 +144,7 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
             return
         result = self._session.predict(reading.nanoseconds(stamp), read)
         step_time = time.perf_counter() - began
-        self._outputs.publish_prediction(result, step_time)  # at once, as it is waited for
+        self._publish_prediction(result, step_time)  # at once, as it is waited for
         result = self._session.estimate(result)
         self._report(result, step_time)
         if self._forecasts is not None:
@@ -167,19 +183,121 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         began = time.perf_counter()
         for result in results:
             step_time = time.perf_counter() - began
-            self._outputs.publish_prediction(result, step_time)
+            self._publish_prediction(result, step_time)
             self._report(result, step_time)
             began = time.perf_counter()
         for late in self._session.late_estimates():
             self._report(late, 0.0)
+
+    def _publish_prediction(self, result: PredictionResult, step_time: float) -> None:
+        for channel, data in prediction_outputs(result, self._session.settings.material, step_time):
+            self._outputs[channel].publish(data)
 
     def _report(self, result: PredictionResult, step_time: float) -> None:
         """Publish estimate and margins of a pose or of a late observation, or why there are none."""
         if result.refused is not None:
             self.health.refuse(result.refused)
             return
-        self._outputs.publish_estimate(result)
+        is_newest = result.stamp >= self._last_margins or not result.late
+        for channel, data in estimate_outputs(result):
+            if channel is not interface.MARGINS or is_newest:  # margins of an earlier frame are of no use any more
+                self._outputs[channel].publish(data)
+        if is_newest and (result.estimate is not None or not result.late):
+            self._last_margins = result.stamp
+            if self._markers.get_subscription_count() and (result.prediction or result.estimate):
+                shown = (result.prediction, result.margins, self._session.thread.diameter, result.estimate)
+                self._markers.publish(packed_thread_markers(result.stamp, *shown))
         self._states.show(result, step_time)
+
+    def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
+        """Return what puts other settings in force."""
+        put_in_force = self._session.prepare(settings, self._session.scene)
+
+        def change() -> None:
+            before = self._session.settings
+            put_in_force()
+            names = [about.name for about in configuration_fields(ThreadModelSettings)]
+            changed = [name for name in names if getattr(settings, name) != getattr(before, name)]
+            if changed:
+                self.get_logger().info(f"changed: {', '.join(changed)}")
+
+        return change
+
+
+class ThreadHealth:
+    """Puts prediction and estimate into words: what is wrong, and what the model does not know of.
+
+    Args:
+        health: of the node.
+    """
+
+    def __init__(self, health: Health) -> None:
+        self._health = health
+        self._waiting = True  # for a thread from which the prediction can start
+        self._disturbance: tuple[float, str] | None = None  # when it was put into words [s], and these
+        self._refused_pieces = 0
+
+    def show(self, result: PredictionResult, step_time: float) -> None:
+        """Report what came of a pose or an observation, and how long the prediction took [s]."""
+        if isinstance(result.estimate_problem, InvalidInputError):
+            self._health.refuse(result.estimate_problem)
+            return
+        prediction, estimate = result.prediction, result.estimate
+        self._waiting = self._waiting if result.late else result.waiting
+        figures: dict[str, object] = {}
+        if prediction is not None:
+            figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
+        if estimate is not None:
+            figures |= self._estimate_figures(estimate)
+        if result.problem is not None:
+            self._health.error(str(result.problem), **figures)
+        elif self._waiting:
+            self._health.warn(WAITING if estimate is None else f"estimating; the prediction is {WAITING}", **figures)
+        elif trouble := self._troubles(result):
+            self._health.warn(f"predicting, but {'; '.join(trouble)}", **figures)
+        else:
+            self._health.ok("predicting", **figures)
+
+    def _troubles(self, result: PredictionResult) -> list[str]:
+        """Return what is wrong with prediction and estimate; figures in it change once a second at the most."""
+        found, prediction, estimate = [], result.prediction, result.estimate
+        if prediction is not None and prediction.status not in (SOLVED, STARTED):
+            found.append(prediction.status)
+        if result.estimate_problem is not None:
+            found.append(f"not estimating: {result.estimate_problem}")
+        if estimate is None:
+            return found
+        if not estimate.converged:
+            found.append(result.reason)
+        if estimate.disturbances:
+            if not self._disturbance or abs(estimate.stamp - self._disturbance[0]) >= 1.0:
+                self._disturbance = (estimate.stamp, "; ".join(map(str, estimate.disturbances)))
+            found.append(self._disturbance[1])
+        else:
+            self._disturbance = None
+        if estimate.unmeasured_for >= UNMEASURED_TOO_LONG:
+            why = f" ({estimate.problems[0]})" if estimate.problems else ""
+            found.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
+        return found
+
+    def _estimate_figures(self, estimate: ThreadEstimate) -> dict[str, object]:
+        self._refused_pieces += len(estimate.problems)
+        deviation = 1e3 * float(estimate.deviation.max())
+        figures: dict[str, object] = {
+            "measured": f"{100.0 * (1.0 - estimate.hidden):.0f} %",
+            "deviation": f"{deviation:.3f} mm",
+            "refused_pieces": self._refused_pieces,
+        }
+        if estimate.problems:
+            figures["last_refused_piece"] = estimate.problems[0]
+        return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}
+
+
+def model_text(settings: ThreadModelSettings, scene: Scene | None) -> str:
+    """Return in words which thread is modelled, where and how."""
+    where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
+    thread = f"{settings.segments} segments of {settings.material}"
+    return f"{thread}, {where}, {settings.formulation} by {settings.solver}"
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,62 +1,75 @@
-"""The graph's topics in ROS: message classes and qualities of service."""
+"""The graph's topics in ROS: publishers and subscriptions of the channels in `interface`.
+
+`topics.NEEDLE_POSE` is the topic of `interface.NEEDLE_POSE`, and so for every channel there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_policy_name_from_kind,
-    qos_profile_sensor_data,
-)
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from magnetosuture_thread import InvalidInputError, interface
-from magnetosuture_thread.interface import Channel
+from magnetosuture_thread.interface import Channel, Quality
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.node import GuardedNode
 
-SENSOR = qos_profile_sensor_data
-# Of frames that wait only the newest two: a tracker that was held up would otherwise be late for many more, and coils
-# rest while poses are old.
-FRAMES = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
+QUALITIES = {
+    Quality.SENSOR: qos_profile_sensor_data,
+    Quality.FRAMES: QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT),
+    Quality.NEWEST: QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT),
+    Quality.RELIABLE: QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE),
+    Quality.LATCHED: QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    ),
+}
+# Bytes that a message may have, by its type or package; what is larger is not even decoded.
+MAX_BYTES = {
+    "sensor_msgs/msg/CameraInfo": 1 << 16,
+    "sensor_msgs": MAX_BLOCK_BYTES,
+    "visualization_msgs": 1 << 22,
+    "geometry_msgs": 1 << 12,
+    "std_msgs": 1 << 12,
+    "rosgraph_msgs": 1 << 12,
+}
+MAX_OTHER_BYTES = 1 << 19  # the largest scene has 120 kB
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
-
-# Bytes of a message; what is larger is not even read. A pose or a command has a few hundred.
-SMALL, STATUS, TEXTS, SHAPES, DRAWN = 1 << 12, 1 << 16, 1 << 18, 1 << 19, 1 << 22
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic: its name and type, its quality of service, and how large a message of it may be [bytes]."""
+    """A topic of a channel."""
 
     channel: Channel
-    qos: QoSProfile
-    max_bytes: int = SMALL
-    absolute: bool = False
 
     @property
     def name(self) -> str:
         """Return the name that nodes give to ROS."""
-        return self.channel.recorded if self.absolute else self.channel.name
+        return self.channel.recorded if self.channel.absolute else self.channel.name
+
+    @property
+    def qos(self) -> QoSProfile:
+        """Return the quality of service."""
+        return QUALITIES[self.channel.quality]
+
+    @property
+    def max_bytes(self) -> int:
+        """Return how many bytes a message may have."""
+        kind = self.channel.type_name
+        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], MAX_OTHER_BYTES)
 
     @property
     def message(self) -> Any:
@@ -81,43 +94,18 @@ class Topic:
         try:
             return deserialize_message(data, self.message)
         except (RuntimeError, ValueError):  # rclpy's own kind of it is private
-            wanted = f"a {self.channel.type_name} of our definition"
-            raise InvalidInputError(self.channel.name, f"{len(data)} bytes", wanted) from None
+            expected = f"a {self.channel.type_name} of our definition"
+            raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(
-        self,
-        node: GuardedNode,
-        callback: Callable[[Any], None],
-        *,
-        raw: bool = False,
-        unheard: Callable[[InvalidInputError], None] | None = None,
-    ) -> Subscription:
+    def subscribe(self, node: GuardedNode, callback: Callable[[Any], None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
 
         Args:
             node: that subscribes; it reports messages that are refused.
             callback: called with each message that can be decoded, or with the CDR bytes of each.
             raw: whether with its bytes.
-            unheard: called when there is a publisher whose messages cannot come, as its quality of service is
-                less than ours; by default ROS says so in the log.
         """
-
-        def mismatched(event: Any) -> None:
-            assert unheard is not None
-            policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
-            expected = str(getattr(self.qos, policy).name).lower()
-            unheard(InvalidInputError(f"publisher of {self.channel.name}", f"another {policy}", expected))
-
-        def take(data: bytes) -> None:
-            try:
-                message = self.decode(data)
-            except InvalidInputError as error:
-                node.refuse(error)
-            else:
-                callback(message)
-
-        events = SubscriptionEventCallbacks(incompatible_qos=mismatched) if unheard else None
-        return self._subscribe(node, callback if raw else take, event_callbacks=events)
+        return self._subscribe(node, callback if raw else lambda data: self._decoded(node, data, callback))
 
     def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
@@ -133,81 +121,48 @@ class Topic:
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
                 number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
-            try:
-                message = self.decode(data)
-            except InvalidInputError as error:
-                node.refuse(error)
-            else:
-                callback(message, number)
+            self._decoded(node, data, lambda message: callback(message, number))
 
         subscription = self._subscribe(node, take)
         return subscription
 
-    def _subscribe(self, node: GuardedNode, take: Callable[..., None], **options: Any) -> Subscription:
+    def _decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+        try:
+            message = self.decode(data)
+        except InvalidInputError as error:
+            node.refuse(error)
+        else:
+            callback(message)
+
+    def _subscribe(self, node: GuardedNode, take: Callable[..., None]) -> Subscription:
         """Subscribe to the bytes of the messages: what is too large is not made into a message first."""
-        overriding = QoSOverridingOptions.with_default_policies()
+        options = QoSOverridingOptions.with_default_policies()
         return node.create_subscription(
-            self.message, self.name, take, copy(self.qos), qos_overriding_options=overriding, raw=True, **options
+            self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
         )
 
 
-IMAGE = Topic(interface.IMAGE, FRAMES, MAX_BLOCK_BYTES)
-COMPRESSED_IMAGE = Topic(interface.COMPRESSED_IMAGE, FRAMES, MAX_BLOCK_BYTES)
-CAMERA_INFO = Topic(interface.CAMERA_INFO, SENSOR, STATUS)
-NEEDLE_POSE = Topic(interface.NEEDLE_POSE, SENSOR)
-TRACKER_STATE = Topic(interface.TRACKER_STATE, RELIABLE, STATUS)
-TIP_SETPOINT = Topic(interface.TIP_SETPOINT, RELIABLE)
-GROUND_TRUTH_NEEDLE = Topic(interface.GROUND_TRUTH_NEEDLE, RELIABLE)
-GROUND_TRUTH_THREAD = Topic(interface.GROUND_TRUTH_THREAD, RELIABLE)
-GROUND_TRUTH_PULL = Topic(interface.GROUND_TRUTH_PULL, RELIABLE)
-OPERATOR_COMMAND = Topic(interface.OPERATOR_COMMAND, RELIABLE)
-FILTER_STATE = Topic(interface.FILTER_STATE, RELIABLE, STATUS)
-NEEDLE_COMMAND = Topic(interface.NEEDLE_COMMAND, RELIABLE)
-NEEDLE_SETPOINT = Topic(interface.NEEDLE_SETPOINT, RELIABLE)
-MEASURED_THREAD = Topic(interface.MEASURED_THREAD, RELIABLE, SHAPES)
-THREAD_OBSERVATION = Topic(interface.THREAD_OBSERVATION, RELIABLE, SHAPES)
-PREDICTED_THREAD = Topic(interface.PREDICTED_THREAD, RELIABLE, SHAPES)
-ESTIMATED_THREAD = Topic(interface.ESTIMATED_THREAD, RELIABLE, SHAPES)
-FORECAST = Topic(interface.FORECAST, RELIABLE, SHAPES)
-MARGINS = Topic(interface.MARGINS, RELIABLE, SHAPES)
-THREAD_MARKERS = Topic(interface.THREAD_MARKERS, RELIABLE, DRAWN)
-SCENE = Topic(interface.SCENE, LATCHED, 1 << 17)  # the largest scene has 120 kB
-SCENE_MARKERS = Topic(interface.SCENE_MARKERS, LATCHED, DRAWN)
-MATERIAL = Topic(interface.MATERIAL, LATCHED, TEXTS)
-CURRENTS = Topic(interface.CURRENTS, RELIABLE, STATUS)
-BRIDGE_STATE = Topic(interface.BRIDGE_STATE, LATCHED, STATUS)
-RIG_CURRENTS = Topic(interface.RIG_CURRENTS, RELIABLE, STATUS)
-FAULT_REQUEST = Topic(interface.FAULT_REQUEST, RELIABLE)
-PROCEDURE_STATE = Topic(interface.PROCEDURE_STATE, LATCHED, STATUS)
-PROCEDURE_PLAN = Topic(interface.PROCEDURE_PLAN, LATCHED, SHAPES)
-PROCEDURE_HOLD = Topic(interface.PROCEDURE_HOLD, NEWEST)
-CLOCK = Topic(interface.CLOCK, SENSOR, absolute=True)
-DIAGNOSTICS = Topic(interface.DIAGNOSTICS, RELIABLE, STATUS, absolute=True)
+@cache
+def topic_of(channel: Channel) -> Topic:
+    """Return the topic of a channel."""
+    return Topic(channel)
 
-INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND)
-OUTPUTS = (
-    NEEDLE_POSE,
-    TRACKER_STATE,
-    MEASURED_THREAD,
-    THREAD_OBSERVATION,
-    PREDICTED_THREAD,
-    ESTIMATED_THREAD,
-    FORECAST,
-    MARGINS,
-    THREAD_MARKERS,
-    FILTER_STATE,
-    NEEDLE_SETPOINT,
-    CURRENTS,
-    BRIDGE_STATE,
-    DIAGNOSTICS,
-)
 
-ON_REQUEST = (FORECAST,)  # outputs that nobody publishes unless a parameter asks for them
-SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
-GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
-SIMULATED = (*GROUND_TRUTH, TIP_SETPOINT, FAULT_REQUEST)  # by the rig and who steers it
+def __getattr__(name: str) -> Topic:
+    """Return the topic of the channel of this name."""
+    channel = getattr(interface, name, None)
+    if not isinstance(channel, Channel):
+        raise AttributeError(f"{interface.__name__} has no channel {name}")
+    return topic_of(channel)
 
-PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle planner, where there is one
+
+INPUTS = tuple(map(topic_of, interface.INPUTS))
+OUTPUTS = tuple(map(topic_of, interface.OUTPUTS))
+ON_REQUEST = (topic_of(interface.FORECAST),)  # outputs that nobody publishes unless a parameter asks for them
+SETTINGS = tuple(map(topic_of, interface.SETTINGS))
+GROUND_TRUTH = tuple(map(topic_of, interface.GROUND_TRUTH))
+SIMULATED = (*GROUND_TRUTH, topic_of(interface.TIP_SETPOINT), topic_of(interface.FAULT_REQUEST))
+PROCEDURES = tuple(map(topic_of, interface.PROCEDURES))
 
 
 def lossless(depth: int) -> dict[str, Any]:
@@ -217,10 +172,8 @@ def lossless(depth: int) -> dict[str, Any]:
     judged by every frame.
     """
     overrides = {
-        f"/{topic.channel.name}": {
-            role: {"reliability": "reliable", "depth": depth} for role in ("publisher", "subscription")
-        }
-        for topic in (*INPUTS, *OUTPUTS)
-        if topic.qos is not LATCHED
+        channel.recorded: {role: {"reliability": "reliable", "depth": depth} for role in ("publisher", "subscription")}
+        for channel in (*interface.INPUTS, *interface.OUTPUTS)
+        if channel.quality is not Quality.LATCHED
     }
     return {"/**": {"ros__parameters": {"qos_overrides": overrides}}}

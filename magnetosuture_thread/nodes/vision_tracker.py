@@ -12,24 +12,24 @@ from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from magnetosuture_thread import InvalidInputError, Scene
-from magnetosuture_thread.interface import CAMERA
+from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_observation, packed_path, packed_pose
+from magnetosuture_thread.messages.outputs import Outputs, pose_outputs, thread_outputs
+from magnetosuture_thread.messages.packing import packed_tracker_state
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.nodes.tracker_health import NO_SCENE, TrackerHealth
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.look import State, no_pose
-from magnetosuture_thread.vision.session import TrackerSession
+from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.warm_up import warm_up
 
+NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
 
@@ -67,11 +67,13 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
         with self.health.load("the tracker's kernels"):
             warm_up()
         self._session = self._new_session(settings, self._scene.load(settings.scene))
-        self._camera = CAMERA[settings.image_transport].name
-        self._poses = self.held(topics.NEEDLE_POSE.publisher(self))
+        self._camera = interface.CAMERA[settings.image_transport].name
         self._states = self.held(topics.TRACKER_STATE.publisher(self))
-        self._observations = self.held(topics.THREAD_OBSERVATION.publisher(self))
-        self._threads = self.held(topics.MEASURED_THREAD.publisher(self))
+        self._outputs = {
+            interface.NEEDLE_POSE: self.held(topics.NEEDLE_POSE.publisher(self)),
+            interface.THREAD_OBSERVATION: self.held(topics.THREAD_OBSERVATION.publisher(self)),
+            interface.MEASURED_THREAD: self.held(topics.MEASURED_THREAD.publisher(self)),
+        }
         if settings.image_transport == "compressed":
             self.held(topics.COMPRESSED_IMAGE.subscribe(self, self.while_active(self.on_compressed)))
         else:
@@ -129,7 +131,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
         if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
-            self._states.publish(MESSAGES.tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
+            self._states.publish(packed_tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
             self._words.show_silence(reason)
 
     def _new_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> TrackerSession | None:
@@ -151,7 +153,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             self.health.refuse(error)
             return
         if self._session is None:
-            self._states.publish(MESSAGES.tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
+            self._states.publish(packed_tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
             self.health.warn(NO_SCENE)
             return
         try:
@@ -163,21 +165,66 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             seen = self._session.on_image(reading.seconds(stamp), image)
             taken = time.perf_counter() - began
         track = seen.track
-        when = stamp.sec, stamp.nanosec
         if seen.tracked:
             # Before the pose, so that the thread is estimated once, at the pose of its frame.
             for follower in self._followers:
                 follower.on_observation(stamp, track.observation)
-            self._observations.publish(packed_observation(when, track.observation))
+            self._publish(thread_outputs(stamp, track.observation, seen.centreline))
         if len(track.tail):  # also with a heading that is unknown, which those who need it refuse
-            self._poses.publish(packed_pose(when, track.tail, track.heading, track.covariance))
+            self._publish(pose_outputs(stamp, track.tail, track.heading, track.covariance))
         if seen.tracked:
             for follower in self._followers:
                 follower.on_tracked(stamp, track.tail, track.heading, track.covariance)
-            if len(seen.centreline):
-                self._threads.publish(packed_path(when, seen.centreline))
-        self._states.publish(MESSAGES.tracker_state(stamp, track, 0.0 if seen.problem else taken))
+        self._states.publish(packed_tracker_state(stamp, track, 0.0 if seen.problem else taken))
         self._words.show(seen, self._session)
+
+    def _publish(self, outputs: Outputs) -> None:
+        for channel, data in outputs:
+            self._outputs[channel].publish(data)
+
+
+class TrackerHealth:
+    """Puts what is seen of needle and thread into words.
+
+    Args:
+        health: of the node.
+
+    Attributes:
+        lens_problem: why frames are not corrected for the lens; stays in the state until valid parameters come.
+    """
+
+    def __init__(self, health: Health) -> None:
+        self._health = health
+        self._words = ""
+        self.lens_problem = ""
+
+    def begin(self, session: TrackerSession | None) -> None:
+        """Report that no frame has come yet; without a scene there is no session."""
+        self._words = "nothing seen"
+        self._health.warn("no camera frame yet" if session is not None else NO_SCENE)
+
+    def show(self, measured: FrameMeasurement, session: TrackerSession) -> None:
+        """Report what was seen in a frame."""
+        track = measured.track
+        values: dict[str, Any] = {"frames": session.frames, "tracked": session.tracked}
+        if track.needle_length is not None:
+            values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
+        if measured.problem is not None:
+            self._health.refuse(measured.problem, **values)
+        elif measured.tracked:
+            values["confidence"] = round(track.confidence, 3)
+            self._words = f"tracking; {track.warning}" if track.warning else "tracking"
+            if self.lens_problem:
+                self._health.warn(f"{self._words}; {self.lens_problem}", **values)
+            else:
+                (self._health.warn if track.warning else self._health.ok)(self._words, **values)
+        else:
+            self._words = f"{track.state.value}: {track.reason}"
+            self._health.warn(self._words, **values)
+
+    def show_silence(self, reason: str) -> None:
+        """Report why no frame comes, and what was seen before."""
+        self._health.warn("; ".join(filter(None, (reason, f"before that {self._words}", self.lens_problem))))
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,12 +1,14 @@
-"""Runs a procedure: plans each goal, tracks its path, and notices when the needle does not get on."""
+"""Runs a procedure: plans each goal, tracks its path, and notices when the needle is stalled."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +16,9 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.pending import PathSubmitter, PendingPath, plan_now
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
 from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
-from magnetosuture_thread.planning.rest import RestDetector
-from magnetosuture_thread.planning.tracking import PathTracker
-
-if TYPE_CHECKING:
-    from magnetosuture_thread.planning.predictive import PredictiveController
+from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
 
 Vector = NDArray[np.float64]
 
@@ -33,6 +30,7 @@ PROGRESS = 2e-3  # m; on a new path, or less to go than ever before, after which
 WRAPPED = 0.02  # rad; of a wrap may be left
 MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
+UNLIMITED = 10_000  # nodes under friction: a limit that is none
 
 
 class ProcedureState(Enum):
@@ -43,6 +41,9 @@ class ProcedureState(Enum):
     PAUSED = "paused"
     DONE = "done"
     FAILED = "failed"
+
+
+ENDED = (ProcedureState.DONE, ProcedureState.FAILED)
 
 
 @dataclass(frozen=True)
@@ -69,23 +70,51 @@ class ThreadCondition:
     may_hold: bool = True
 
 
-@dataclass(frozen=True)
-class ProcedureOutput:
-    """What comes of one needle pose.
+class PendingPath(Protocol):
+    """A path that is being planned, as `concurrent.futures.Future` is one."""
+
+    def done(self) -> bool:
+        """Return whether planning has ended."""
+
+    def result(self) -> BodyPath:
+        """Return the path, or raise what planning raised."""
+
+
+PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
+"""Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
+
+
+def plan_now(task: Callable[[], BodyPath]) -> PendingPath:
+    """Plan a path here and now."""
+    pending: Future[BodyPath] = Future()
+    try:
+        pending.set_result(task())
+    except PlanningError as error:
+        pending.set_exception(error)
+    return pending
+
+
+@dataclass
+class Pursuit:
+    """What has come of the present goal.
 
     Attributes:
-        velocity: commanded velocity of the tip, shape (2,) [m/s].
-        state: of the procedure.
-        goal: index of the goal.
-        progress: completed share of the goal's path, 0 to 1.
-        reason: why it is paused or has failed; empty else.
+        replans: new paths without progress since.
+        detours: new paths without less to go than before.
+        misses: paths that ended off the goal's place.
+        left: minimum of the way to go so far [m].
+        aim: from the goal's place to where its path is to end, shape (2,) [m].
+        swept: of a wrap so far [rad].
+        bearing: of the needle about the wrap's shape at the last pose [rad]; NaN before.
     """
 
-    velocity: Vector
-    state: ProcedureState
-    goal: int
-    progress: float
-    reason: str = ""
+    replans: int = 0
+    detours: int = 0
+    misses: int = 0
+    left: float = math.inf
+    aim: Vector = field(default_factory=lambda: np.zeros(2))
+    swept: float = 0.0
+    bearing: float = math.nan
 
 
 class ProcedureExecutor:
@@ -93,18 +122,25 @@ class ProcedureExecutor:
 
     A goal's path is planned when its turn comes, from where the needle is then. Meanwhile, and while the thread is not
     known well enough to go on, the needle is kept where it is: at a zero command the coils are off, and the thread
-    pulls it away. A needle that gets no further while it is commanded (`RestDetector`) backs off, and its goal is
+    pulls it away. A needle that is stalled while it is commanded (`RestDetector`) backs off, and its goal is
     planned anew; one that is off its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a
     turn throws the needle aside, is followed by one that ends as far to the other side. After `MAX_REPLANS`,
     `MAX_DETOURS` or `MAX_MISSES` the goal is given up, and the needle rests; so is a procedure that has waited too long
-    for the thread. Pure: time comes in with the poses.
+    for the thread. A pause for the thread ends by itself once that is known again; one by `pause` lasts until `start`.
+    Pure: time comes in with the poses.
 
     Args:
         procedure: what to do.
         planner: of paths in the scene.
         submit: begins to plan a path; by default that is done at once, while the caller waits.
         max_wait: for a thread that is not known; then the procedure is given up [s].
-        local: tracks the paths by forecasts of the thread; None for the path tracker alone.
+
+    Attributes:
+        state: of the procedure.
+        reason: why it is paused or has failed; empty else.
+        resumes: whether it goes on by itself once the thread is known again.
+        goal: index of the present goal.
+        path: that is tracked, or was tracked last; None before the first.
     """
 
     def __init__(
@@ -113,31 +149,27 @@ class ProcedureExecutor:
         planner: NeedlePlanner,
         submit: PathSubmitter = plan_now,
         max_wait: float = MAX_WAIT,
-        local: PredictiveController | None = None,
     ) -> None:
         self.procedure, self.planner, self._submit = procedure, planner, submit
-        self._max_wait, self._local = max_wait, local
-        self.state, self.reason, self.goal = ProcedureState.READY, "", 0
+        self._max_wait = max_wait
+        self.state, self.reason, self.resumes = ProcedureState.READY, "", False
+        self.goal, self.pursuit = 0, Pursuit()
         self.path: BodyPath | None = None
         self._tracker: PathTracker | None = None
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._pending: PendingPath | None = None
         self._begin: Vector | None = None
         self._rest = RestDetector()
-        self._replans, self._detours, self._misses, self._left = 0, 0, 0, math.inf
-        self._aim = np.zeros(2)  # from the goal's place to where its path is to end [m]
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
-        self._swept, self._bearing = 0.0, math.nan  # of the goal's wrap: so far, and the needle's then [rad]
         self._speed = math.inf
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
-        self._unsure = False  # paused by itself, which goes on by itself once the thread is known again
         self._waits_since = 0.0  # for the thread, since this stamp [s]
 
     @property
     def is_commanding(self) -> bool:
         """Whether its output is to be followed: it runs, or is paused by itself and keeps the needle in place."""
-        return self.state is ProcedureState.RUNNING or (self._unsure and self._holder is not None)
+        return self.state is ProcedureState.RUNNING or (self.resumes and self._holder is not None)
 
     @property
     def is_tracking(self) -> bool:
@@ -149,47 +181,49 @@ class ProcedureExecutor:
         """Way of the tip on the present path [m]; 0 without one."""
         return 0.0 if self._tracker is None else self._tracker.travel
 
-    def plan(self, tail: Vector, heading: Vector) -> tuple[BodyPath, ...]:
-        """Return paths for all goals, from a pose of the needle, without beginning.
-
-        Raises:
-            ConfigurationError: see `NeedlePlanner.check`.
-            PlanningError: there is no way to a goal.
-        """
-        middle, angle = self._pose(tail, heading)
-        return self.planner.plan_all(self.procedure, middle, angle)
+    @property
+    def progress(self) -> float:
+        """Completed share of the goal's path, 0 to 1."""
+        if self.state is ProcedureState.DONE:
+            return 1.0
+        if self._tracker is None or self.path is None:
+            return 0.0
+        before = float(self.path.ends[self._reached - 1]) if self._reached else 0.0
+        way = float(self.path.ends[self._reached]) - before
+        return min(1.0, max(0.0, (self._tracker.travel - before) / way)) if way > 0.0 else 1.0
 
     def start(self) -> None:
         """Begin, or go on after a pause; the goal's path is planned anew with the next pose."""
-        self._unsure = False
         if self.state in (ProcedureState.READY, ProcedureState.PAUSED):
-            self.state, self.reason = ProcedureState.RUNNING, ""
+            self.state, self.reason, self.resumes = ProcedureState.RUNNING, "", False
             self._drop_path()
 
     def pause(self, reason: str) -> None:
-        """Rest until `start` is called again."""
-        self._unsure = False
-        if self.state is ProcedureState.RUNNING:
-            self.state, self.reason = ProcedureState.PAUSED, reason
+        """Rest until `start` is called again, also where the procedure would go on by itself."""
+        if self.resumes:
+            self._drop_path()
+        if self.resumes or self.state is ProcedureState.RUNNING:
+            self.state, self.reason, self.resumes = ProcedureState.PAUSED, reason, False
 
     def abort(self, reason: str) -> None:
         """Rest for good."""
-        self._unsure = False
-        if self.state not in (ProcedureState.DONE, ProcedureState.FAILED):
+        self.resumes = False
+        if self.state not in ENDED:
             self.state, self.reason = ProcedureState.FAILED, reason
 
     def set_planner(self, planner: NeedlePlanner) -> None:
         """Plan in another scene from now on; a procedure that does not fit it fails."""
         self.planner = planner
         self._drop_path()
-        self._holder, self._left, self._aim, self._bearing = None, math.inf, np.zeros(2), math.nan
+        self._holder = None
+        self.pursuit = replace(self.pursuit, left=math.inf, aim=np.zeros(2), bearing=math.nan)
         try:
             planner.check(self.procedure)
         except MagnetosutureError as error:
             self.abort(str(error))
 
-    def update(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> ProcedureOutput:
-        """Return the command for a needle pose.
+    def update(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
+        """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s].
 
         Args:
             stamp: of the pose [s].
@@ -199,25 +233,15 @@ class ProcedureExecutor:
         """
         middle, angle = self._pose(tail, heading)
         self._begin = middle if self._begin is None else self._begin
-        if self.state is ProcedureState.RUNNING and thread.problem:
-            self.pause(thread.problem)
-            self._unsure, self._waits_since = True, stamp
-        elif self._unsure and not thread.problem:
-            self.state, self.reason, self._unsure = ProcedureState.RUNNING, "", False  # on the path of before
-        elif self._unsure:
-            self.reason = thread.problem
-            if not thread.may_hold:
-                self._waits_since = stamp  # for something else than the thread
-            elif stamp - self._waits_since > self._max_wait:
-                self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
+        self._heed(stamp, thread)
         if self.state in (ProcedureState.RUNNING, ProcedureState.PAUSED):
             self._sweep(middle)  # also by hand: else a wrap that was unwound in a pause would count
         if self.state is not ProcedureState.RUNNING:
             self._rest = RestDetector()
-            if self.path is None or not (self._unsure and thread.may_hold):
-                self._holder = None
-                return self._output(np.zeros(2))
-            return self._output(self._hold(stamp, middle, angle, thread))
+            if self.path is not None and self.resumes and thread.may_hold:
+                return self._hold(stamp, middle, angle, thread)
+            self._holder = None
+            return np.zeros(2)
         velocity = None
         try:
             if not self._backs_off(stamp) and (self._tracker is not None or self._plan(middle, angle)):
@@ -225,7 +249,21 @@ class ProcedureExecutor:
                 velocity = self._pursue(stamp, middle, angle, thread)
         except PlanningError as error:
             self.abort(str(error))
-        return self._output(self._wait(stamp, middle, angle, thread) if velocity is None else velocity)
+        return self._wait(stamp, middle, angle, thread) if velocity is None else velocity
+
+    def _heed(self, stamp: float, thread: ThreadCondition) -> None:
+        """Pause for a thread that is not known, and go on, on the path of before, once it is."""
+        if self.state is ProcedureState.RUNNING and thread.problem:
+            self.pause(thread.problem)
+            self.resumes, self._waits_since = True, stamp
+        elif self.resumes and not thread.problem:
+            self.state, self.reason, self.resumes = ProcedureState.RUNNING, "", False
+        elif self.resumes:
+            self.reason = thread.problem
+            if not thread.may_hold:
+                self._waits_since = stamp  # for something else than the thread
+            elif stamp - self._waits_since > self._max_wait:
+                self.abort(f"given up after a wait of {self._max_wait:g} s: {thread.problem}")
 
     def _wait(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
         """Return the command where there is no path to track: to back off, or to keep the needle in place."""
@@ -239,21 +277,20 @@ class ProcedureExecutor:
     def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector | None:
         """Return the command on the path; None where that has ended, and the next one begins with the next pose."""
         goal = self.procedure.goals[self.goal]
-        swept = isinstance(goal, Wrap) and abs(goal.swept) - self._swept * math.copysign(1.0, goal.swept) < WRAPPED
-        if swept or (isinstance(goal, Tighten) and self._is_tight(goal, thread)):
+        is_met = isinstance(goal, Tighten) and self._is_tight(goal, thread)
+        if isinstance(goal, Wrap):
+            is_met = abs(goal.swept) - self.pursuit.swept * math.copysign(1.0, goal.swept) < WRAPPED
+        if is_met:
             self._next_goal()
             return None
         assert self._tracker is not None
         assert self.path is not None
         if self._tracker.travel > PROGRESS:
-            self._replans = 0
-        if (left := self.path.length - self._tracker.travel) < self._left - PROGRESS:
-            self._detours, self._left = 0, left
+            self.pursuit.replans = 0
+        if (left := self.path.length - self._tracker.travel) < self.pursuit.left - PROGRESS:
+            self.pursuit.detours, self.pursuit.left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
-        if self._local is None:
-            command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
-        else:
-            command = self._local.compute_command(self._tracker, *at, thread, self.procedure.limits[self.goal])
+        command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
         if command.done:
             self._at_end(goal, middle)
             return None
@@ -278,14 +315,14 @@ class ProcedureExecutor:
 
     def _miss(self, goal: GoTo | Withdraw, off: Vector) -> None:
         """Plan anew, to the other side of a goal's place, from which the needle has ended off."""
-        self._misses += 1
-        if self._misses > MAX_MISSES:
+        self.pursuit.misses += 1
+        if self.pursuit.misses > MAX_MISSES:
             by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
             self.abort(f"goal {self.goal + 1} is given up: the needle misses its place {by}, however it is planned")
             return
         assert self.path is not None
-        aim, leeway = self._aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
-        self._aim = aim * min(1.0, leeway / max(math.hypot(*aim), 1e-12))
+        aim, leeway = self.pursuit.aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
+        self.pursuit.aim = aim * min(1.0, leeway / max(math.hypot(*aim), 1e-12))
         self._drop_path()
 
     def _plan(self, middle: Vector, angle: float) -> bool:
@@ -293,10 +330,10 @@ class ProcedureExecutor:
         if self._pending is None:
             goals = chain(self.procedure, self.goal)
             assert self._begin is not None
-            left = goals[0].swept - self._swept if isinstance(goals[0], Wrap) else None
+            left = goals[0].swept - self.pursuit.swept if isinstance(goals[0], Wrap) else None
             limits = self.procedure.limits[self.goal]
             if isinstance(goal := goals[0], GoTo | Withdraw):  # the last of its chain
-                x, y = (self._place(goal) + self._aim).tolist()
+                x, y = (self._place(goal) + self.pursuit.aim).tolist()
                 goals = (replace(goal, position=(x, y)) if isinstance(goal, GoTo) else replace(goal, to=(x, y)),)
             task = partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
             self._pending = self._submit(task)
@@ -326,8 +363,9 @@ class ProcedureExecutor:
 
     def _replan(self, stamp: float, stopped: Vector) -> None:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
-        self._replans, self._detours = self._replans + 1, self._detours + 1
-        if self._replans > MAX_REPLANS or self._detours > MAX_DETOURS:
+        self.pursuit.replans += 1
+        self.pursuit.detours += 1
+        if self.pursuit.replans > MAX_REPLANS or self.pursuit.detours > MAX_DETOURS:
             self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
             return
         self._drop_path()
@@ -343,8 +381,7 @@ class ProcedureExecutor:
             self._begin_goal(self.goal + 1)
 
     def _begin_goal(self, goal: int) -> None:
-        self.goal, self._replans, self._detours, self._misses, self._left = goal, 0, 0, 0, math.inf
-        self._swept, self._bearing, self._aim = 0.0, math.nan, np.zeros(2)
+        self.goal, self.pursuit = goal, Pursuit()
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:
         """Return the speed at which tension and friction stay within the goal's limits [m/s]."""
@@ -353,7 +390,7 @@ class ProcedureExecutor:
             self._speed = max(0.0, self._speed * TENSION_SHARE * limits.tension / thread.tension)
         self._speed = min(limits.speed, max(self._speed * 1.03, 0.02 * limits.speed))
         crowded = thread.friction_nodes - limits.friction_nodes
-        is_free = crowded < 0 or not thread.friction_nodes or limits.friction_nodes >= 10_000
+        is_free = crowded < 0 or not thread.friction_nodes or limits.friction_nodes >= UNLIMITED
         return self._speed if is_free else 0.3 * self._speed
 
     def _is_tight(self, goal: Tighten, thread: ThreadCondition) -> bool:
@@ -370,9 +407,9 @@ class ProcedureExecutor:
         if not isinstance(goal, Wrap):
             return
         bearing = self.planner.bearing(goal.around, middle)
-        if math.isfinite(self._bearing):
-            self._swept += math.remainder(bearing - self._bearing, 2.0 * math.pi)
-        self._bearing = bearing
+        if math.isfinite(self.pursuit.bearing):
+            self.pursuit.swept += math.remainder(bearing - self.pursuit.bearing, 2.0 * math.pi)
+        self.pursuit.bearing = bearing
 
     def _pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
         middle, angle = self.planner.pose(tail, heading)
@@ -380,11 +417,3 @@ class ProcedureExecutor:
             angle = self._unwrapped + math.remainder(angle - self._unwrapped, 2.0 * math.pi)
         self._unwrapped = angle
         return middle, angle
-
-    def _output(self, velocity: Vector) -> ProcedureOutput:
-        progress = 1.0 if self.state is ProcedureState.DONE else 0.0
-        if self._tracker is not None and self.path is not None:
-            before = float(self.path.ends[self._reached - 1]) if self._reached else 0.0
-            way = float(self.path.ends[self._reached]) - before
-            progress = min(1.0, max(0.0, (self._tracker.travel - before) / way)) if way > 0.0 else 1.0
-        return ProcedureOutput(velocity, self.state, self.goal, progress, self.reason)

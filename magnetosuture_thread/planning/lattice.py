@@ -1,4 +1,4 @@
-"""The shortest way of the needle's body through a scene: A* over a lattice of its positions and headings.
+"""The clearance of the needle's body in a scene, and its shortest way: A* over a lattice of positions and headings.
 
 The needle is driven along its chord and turned about the chord's middle (`NeedleKinematics`), so a way is a sequence of
 straight drives, ahead or back, and of turns on the spot. The lattice has the middles on a square grid and 32 directions
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,13 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_without_gil
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clearance
+from magnetosuture_thread.safety.packed_scene import measure, pack_scene
+from magnetosuture_thread.scene import Scene
 
+CELLS = 400  # of the clearance map across the dish
 STRIDE = 2  # of the clearance map's grid between two points of the lattice
 REVERSE_COST = 1.5  # of a way driven back, in that of the same way ahead
+MAX_STATES = 20_000_000  # to look at
 NEAR_COST = 3.0  # of a way at the required clearance, more than at the preferred one
 _QUARTER = np.array([(1, 0), (3, 1), (2, 1), (3, 2), (1, 1), (2, 3), (1, 2), (1, 3)])
 _TURNS = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
@@ -27,6 +31,78 @@ MOVES = np.concatenate([_QUARTER @ np.array(turn).T for turn in _TURNS])
 """Points ahead for each direction, counterclockwise from the x axis, shape (32, 2)."""
 DIRECTIONS = np.unwrap(np.arctan2(MOVES[:, 1], MOVES[:, 0]))
 """Their angles, rising from 0, shape (32,) [rad]."""
+
+
+class ClearanceMap(NamedTuple):
+    """The signed distance to the nearest of wall and shapes, at the points of a square grid over the dish.
+
+    Attributes:
+        origin: x and y of the first point [m].
+        step: between points [m].
+        distance: shape (m, m), rows along y [m].
+    """
+
+    origin: float
+    step: float
+    distance: NDArray[np.float64]
+
+
+@lru_cache(maxsize=16)  # a plan asks for each of a few maps many times
+def map_clearance(scene: Scene, shapes: tuple[str, ...] | None = None) -> ClearanceMap:
+    """Return the distances from the wall and all shapes of a scene; from some shapes alone, if they are named.
+
+    It is computed once for each scene and shapes, and not to be changed.
+
+    Args:
+        scene: dish and shapes.
+        shapes: names of the shapes to measure from, without the wall; None for wall and all shapes.
+    """
+    packed = pack_scene(scene)
+    radius = scene.dish.radius
+    at = np.linspace(-radius, radius, CELLS + 1)
+    wanted = [k for k in range(len(packed.shapes)) if shapes is None or scene.names[packed.shapes[k]] in shapes]
+    distance = np.full((len(at), len(at)), np.inf)
+    found, normal = np.empty((len(at), len(packed.shapes))), np.empty((len(at), len(packed.shapes), 2))
+    for row, y in enumerate(at):
+        points = np.column_stack([at, np.full(len(at), y)])
+        measure(points, packed, found, normal)
+        distance[row] = found[:, wanted].min(axis=1, initial=np.inf)
+        if shapes is None:
+            distance[row] = np.minimum(distance[row], radius - np.hypot(points[:, 0], points[:, 1]))
+    return ClearanceMap(-radius, float(at[1] - at[0]), distance)
+
+
+@compiled
+def clearance_at(x: float, y: float, near: ClearanceMap) -> float:
+    """Return the distance at a point, interpolated between the four around it; negative outside of the grid [m]."""
+    count = len(near.distance)
+    u, v = (x - near.origin) / near.step, (y - near.origin) / near.step
+    i, j = math.floor(u), math.floor(v)
+    if i < 0 or j < 0 or i >= count - 1 or j >= count - 1:
+        return -1.0
+    p, q = u - i, v - j
+    low = (1.0 - p) * near.distance[j, i] + p * near.distance[j, i + 1]
+    high = (1.0 - p) * near.distance[j + 1, i] + p * near.distance[j + 1, i + 1]
+    return float((1.0 - q) * low + q * high)
+
+
+@compiled
+def body_clearance(x: float, y: float, angle: float, body: Points, near: ClearanceMap) -> float:
+    """Return the least distance of the needle's points from wall and shapes [m].
+
+    Args:
+        x: of the middle of its chord [m].
+        y: of the same [m].
+        angle: of its chord against the x axis [rad].
+        body: points of the needle's axis about the middle of its chord, the chord along x, shape (m, 2) [m].
+        near: the distances.
+    """
+    c, s = math.cos(angle), math.sin(angle)
+    least = np.inf
+    for k in range(len(body)):
+        px, py = body[k, 0], body[k, 1]
+        least = min(least, clearance_at(x + c * px - s * py, y + s * px + c * py, near))
+    return float(least)
 
 
 class LatticeGoal(NamedTuple):
@@ -93,9 +169,6 @@ def search_lattice(
     preferred: float,
     goal: LatticeGoal,
     near: ClearanceMap,
-    moves: NDArray[np.int64],
-    directions: NDArray[np.float64],
-    max_states: int,
 ) -> NDArray[np.float64]:
     """Return the cheapest way from a point of the lattice to the goal: x, y and direction of each state.
 
@@ -110,14 +183,12 @@ def search_lattice(
         preferred: clearance beyond which more is not worth a longer way [m].
         goal: where the way may end.
         near: distances from wall and shapes.
-        moves: `MOVES`.
-        directions: `DIRECTIONS`.
-        max_states: to look at.
 
     Returns:
         Shape (k, 3): x, y [m] and direction [rad]; empty where there is no way, or none was found
-        within `max_states`.
+        within `MAX_STATES`.
     """
+    moves, directions = MOVES, DIRECTIONS
     count, size, step = len(directions), len(goal.places), STRIDE * near.step
     sheets = math.ceil(abs(goal.swept) / (2.0 * math.pi)) + 2 if goal.swept != 0.0 else 1
     cells = size * size * count
@@ -134,7 +205,7 @@ def search_lattice(
     cost[first] = 0.0
     heap = [(0.0, first)]
     looked, last = 0, -1
-    while len(heap) > 0 and looked < max_states:
+    while len(heap) > 0 and looked < MAX_STATES:
         _, state = heapq.heappop(heap)
         if done[state]:
             continue

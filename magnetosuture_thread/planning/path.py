@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from magnetosuture_thread.compiled import compiled_without_gil
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.clearance_map import ClearanceMap, body_clearance
+from magnetosuture_thread.planning.lattice import ClearanceMap, body_clearance
 
 SPACING = 1.0e-4  # m; of the tip's way between two poses
 PASSES = 400  # of the smoothing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,9 +14,17 @@ from scipy import ndimage
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.checks import check_procedure
-from magnetosuture_thread.planning.clearance_map import CELLS, body_clearance, clearance_at, map_clearance
-from magnetosuture_thread.planning.lattice import DIRECTIONS, MOVES, STRIDE, LatticeGoal, search_lattice, turn_of
+from magnetosuture_thread.planning.lattice import (
+    CELLS,
+    DIRECTIONS,
+    STRIDE,
+    LatticeGoal,
+    body_clearance,
+    clearance_at,
+    map_clearance,
+    search_lattice,
+    turn_of,
+)
 from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
 from magnetosuture_thread.planning.procedure import (
     HEADING_TOLERANCE,
@@ -35,7 +44,6 @@ Vector = NDArray[np.float64]
 
 MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
 VIEW_SAMPLES = 24
-MAX_STATES = 20_000_000
 MAX_WAYS = 32  # that are kept
 PLACE_SHARE, PLACE_STEPS = 0.7, 0.75  # of a goal's tolerance, and of the lattice: how far from its place a way may end
 GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
@@ -118,9 +126,10 @@ class NeedlePlanner:
         """Refuse what can be seen to be impossible without planning.
 
         Raises:
-            ConfigurationError: see `check_procedure`.
+            ConfigurationError: a name is not of the scene, a place is not free, a gap is too narrow or not there, the
+                thread is too short for wraps that follow each other, or a tension is over the goal's own limit.
         """
-        check_procedure(procedure, self)
+        _check_procedure(procedure, self)
 
     def plan(
         self,
@@ -186,15 +195,12 @@ class NeedlePlanner:
         self.check(procedure)
         start = middle
         paths: list[BodyPath] = []
-        index = 0
-        while index < len(procedure.goals):
-            goals = chain(procedure, index)
+        for index, goals in chains(procedure):
             try:
                 paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
             except PlanningError as error:
                 raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
             middle, angle = paths[-1].middles[-1], float(paths[-1].angles[-1])
-            index += len(goals)
         return tuple(paths)
 
     def gaps(self, goal: PassThrough) -> list[Gap]:
@@ -259,16 +265,7 @@ class NeedlePlanner:
             if len(self._ways) >= MAX_WAYS:
                 self._ways.clear()
             found = self._ways[key] = search_lattice(
-                start,
-                self.body,
-                self.lever,
-                kept,
-                kept + PREFERRED,
-                goal,
-                self.near,
-                MOVES,
-                DIRECTIONS,
-                MAX_STATES,
+                start, self.body, self.lever, kept, kept + PREFERRED, goal, self.near
             )
         return found  # kept or not: another thread may have cleared what is kept
 
@@ -373,3 +370,85 @@ def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:
             break
         last += 1
     return procedure.goals[index : last + 1]
+
+
+def chains(procedure: Procedure) -> list[tuple[int, tuple[Goal, ...]]]:
+    """Return all chains of goals of a procedure, each with the index of its first goal; see `chain`."""
+    found, index = [], 0
+    while index < len(procedure.goals):
+        found.append((index, chain(procedure, index)))
+        index += len(found[-1][1])
+    return found
+
+
+def planned_duration(procedure: Procedure, paths: Sequence[BodyPath]) -> float:
+    """Return the time of planned paths at the speeds of their goals, without friction [s]."""
+    return sum(
+        path.length / procedure.limits[index].speed for (index, _), path in zip(chains(procedure), paths, strict=True)
+    )
+
+
+def _check_procedure(procedure: Procedure, planner: NeedlePlanner) -> None:
+    wrapped: defaultdict[str, float] = defaultdict(float)  # about each shape, by the wraps one after the other
+    for index, (goal, limits) in enumerate(zip(procedure.goals, procedure.limits, strict=True)):
+        where, required = f"goals[{index}].{goal.GROUP}", max(planner.keep_out, limits.clearance)
+        if not isinstance(goal, Wrap):
+            wrapped.clear()  # another goal may unwind the thread
+        if isinstance(goal, PassThrough):
+            _check_gap(planner, where, goal, required)
+        elif isinstance(goal, Wrap):
+            _check_name(planner, f"{where}.around", goal.around)
+            wrapped[goal.around] += goal.swept
+            needed = sum(abs(angle) / (2.0 * math.pi) * planner.girth(name) for name, angle in wrapped.items())
+            if needed > planner.thread_length:
+                before = ", with the wraps before it" if index and isinstance(procedure.goals[index - 1], Wrap) else ""
+                expected = f"an angle for which {1e3 * planner.thread_length:.3g} mm of thread are enough{before}"
+                raise ConfigurationError(f"{where}.angle", goal.angle, expected)
+        elif isinstance(goal, Tighten):
+            if goal.around:
+                _check_name(planner, f"{where}.around", goal.around)
+            if goal.tension > limits.tension:
+                expected = f"at most the limit of the tension, {limits.tension:.3g} N"
+                raise ConfigurationError(f"{where}.tension", goal.tension, expected)
+            _check_place(planner, f"{where}.toward", goal.toward, required)
+        elif isinstance(goal, GoTo):
+            _check_place(planner, f"{where}.position", goal.position, required)
+            if goal.heading:
+                _check_place(planner, f"{where}.position", goal.position, required, goal.heading[0])
+        elif isinstance(goal, Withdraw) and goal.to:
+            _check_place(planner, f"{where}.to", goal.to, required)
+
+
+def _check_gap(planner: NeedlePlanner, where: str, goal: PassThrough, required: float) -> None:
+    for name in goal.between:
+        _check_name(planner, f"{where}.between", name)
+    between = planner.gaps_between(*goal.between)
+    if not between:
+        expected = "two shapes with a gap between them, in which no other shape lies"
+        raise ConfigurationError(f"{where}.between", list(goal.between), expected)
+    gaps = planner.gaps(goal)
+    if not gaps:
+        x, y = np.round(min(between, key=lambda gap: gap.width).along, 2) + 0.0
+        expected = f"one along a gap between them, as [{x:g}, {y:g}] or [{0.0 - x:g}, {0.0 - y:g}]"
+        raise ConfigurationError(f"{where}.direction", list(goal.direction), expected)
+    width = max(gap.width for gap in gaps)
+    if width <= 2.0 * required:
+        expected = f"a gap wider than {2e3 * required:.3g} mm, twice the needle's clearance"
+        raise ConfigurationError(f"{where}.between", f"a gap of {1e3 * width:.3g} mm", expected)
+
+
+def _check_name(planner: NeedlePlanner, where: str, name: str) -> None:
+    names = planner.scene.names
+    if name not in names:
+        raise ConfigurationError(where, name, f"a shape of the scene: {', '.join(names) or 'it has none'}")
+
+
+def _check_place(
+    planner: NeedlePlanner, where: str, place: tuple[float, ...], required: float, heading: float | None = None
+) -> None:
+    (x, y), directions, words = place, DIRECTIONS, "in some direction"
+    if heading is not None:
+        directions, words = DIRECTIONS[np.abs(turn_of(DIRECTIONS - heading)) <= HEADING_TOLERANCE], "at its heading"
+    if not any(body_clearance(x, y, angle, planner.body, planner.near) >= required for angle in directions):
+        expected = f"a place with {1e3 * required:.3g} mm around the needle {words}"
+        raise ConfigurationError(where, [x, y], expected)

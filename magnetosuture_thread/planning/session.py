@@ -3,24 +3,195 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.clearance_map import body_clearance
-from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, Vector
-from magnetosuture_thread.planning.loop_state import LoopState
+from magnetosuture_thread.planning.executor import (
+    ENDED,
+    PathSubmitter,
+    ProcedureExecutor,
+    ProcedureState,
+    ThreadCondition,
+    Vector,
+    plan_now,
+)
+from magnetosuture_thread.planning.lattice import body_clearance
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.pending import PathSubmitter, plan_now
-from magnetosuture_thread.planning.planner import NeedlePlanner, chain
+from magnetosuture_thread.planning.planner import NeedlePlanner, chains, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.scene import Dish, Scene
 
-ENDED = (ProcedureState.DONE, ProcedureState.FAILED)
+NO_POSE, NO_THREAD, NO_MARGINS = "no needle pose yet", "no thread yet", "no margins of the thread yet"
+MAX_NAMED = 3  # forces, in a reason
+NOT_HELD = "nobody holds the page"
+
+
+class _Margins(NamedTuple):
+    time: float
+    reason: str  # why they are not valid; empty if they are
+    friction_nodes: int
+    slowdown: float
+    scene_version: str
+
+
+class LoopState:
+    """Collects what the nodes of the loop report, and returns why a procedure cannot go on.
+
+    Pure: `now` is a monotonic time [s].
+
+    Args:
+        settings: of the planner.
+
+    Attributes:
+        scene_version: of the planner's scene; empty for none.
+        hold_to_run: whether a procedure goes on only while somebody holds the page.
+    """
+
+    def __init__(self, settings: NeedlePlannerSettings) -> None:
+        self._settings = settings
+        self.scene_version, self.hold_to_run = "", False
+        self._pose, self._outside = -math.inf, ""
+        self._tracker = ""
+        self._margins: _Margins | None = None
+        self._tension = self._drift = 0.0
+        self._vertices: Callable[[], Points | None] | None = None
+        self._estimated, self._estimate_problem = -math.inf, ""
+        self._disturbances: dict[float, str] = {}
+        self._accepted: set[float] = set()
+        self._held = -math.inf
+        self._graph_problem = ""
+        self._last_problem, self._last_problem_time = NO_POSE, -math.inf
+
+    def on_pose(self, now: float, distance: float, dish_radius: float) -> None:
+        """Register a needle pose, with the distance of its tail from the dish's centre [m]."""
+        self._pose = now
+        self._outside = "" if distance <= dish_radius else "the needle is outside of the dish"
+
+    def on_tracker(self, problem: str) -> None:
+        """Register why the tracker has no needle in a frame; empty if it has."""
+        self._tracker = problem and f"the needle is not tracked: {problem}"
+
+    def on_prediction(self, now: float, tension: float, vertices: Callable[[], Points | None]) -> None:
+        """Register a predicted thread: the peak of its tension [N], and what returns its vertices.
+
+        Where no thread is estimated any more, nothing of the last estimate counts.
+        """
+        self._tension = tension
+        if now - self._estimated > self._settings.thread_timeout:
+            self._vertices, self._estimate_problem, self._disturbances = vertices, "", {}
+
+    def on_estimate(
+        self,
+        now: float,
+        unmeasured_for: float,
+        disturbances: Mapping[float, str],
+        vertices: Callable[[], Points | None],
+    ) -> None:
+        """Register an estimated thread.
+
+        Args:
+            now: a monotonic time [s].
+            unmeasured_for: time since the thread was measured [s].
+            disturbances: forces on it that the model does not know of, as texts, each by when it was found first [s].
+            vertices: returns them, shape (n + 1, 2) [m]; None where they are not valid.
+        """
+        self._estimated, self._vertices, self._estimate_problem = now, vertices, ""
+        if not unmeasured_for <= self._settings.unmeasured_timeout:  # also where it is no number
+            self._estimate_problem = f"the thread has not been measured for {unmeasured_for:.1f} s"
+        self._accepted &= disturbances.keys()
+        self._disturbances = dict(disturbances)
+
+    def accept_disturbances(self) -> None:
+        """Go on in spite of the forces that are known now, as a person who begins or resumes wants; new ones count."""
+        self._accepted = set(self._disturbances)
+
+    def on_bridge(self, drift: float) -> None:
+        """Register the velocity across the needle's chord that the bridge compensates [m/s]; 0 if it is no number."""
+        self._drift = drift if math.isfinite(drift) else 0.0
+
+    def on_margins(self, now: float, reason: str, friction_nodes: int, slowdown: float, scene_version: str) -> None:
+        """Register the thread's margins, or the reason why they are not valid."""
+        self._margins = _Margins(now, reason, friction_nodes, slowdown, scene_version)
+
+    def on_hold(self, now: float) -> None:
+        """Register that somebody holds the page."""
+        self._held = now
+
+    def on_graph(self, problem: str) -> None:
+        """Register what is wrong with the graph: nobody follows the commands, or another node commands too."""
+        self._graph_problem = problem
+
+    def shift(self, duration: float) -> None:
+        """Take what is known to be younger by a time in which nothing was heard, as while a path is planned [s]."""
+        self._pose += duration
+        self._estimated += duration
+        self._held += duration
+        self._last_problem_time += duration
+        if self._margins is not None:
+            self._margins = self._margins._replace(time=self._margins.time + duration)
+
+    def has_pose(self, now: float) -> bool:
+        """Return whether the needle's pose is known now."""
+        return now - self._pose <= self._settings.pose_timeout
+
+    def condition(self, now: float) -> ThreadCondition:
+        """Return what is known, with the reason why a procedure cannot go on; that of before until it has settled.
+
+        Where the thread alone is the reason, or all is known and has to settle, the needle may be kept in place.
+        """
+        needle, page = self._needle_problem(now), self._page_problem(now)
+        may_hold = not (needle or page)
+        problem = needle or self._thread_problem(now) or page
+        if problem:
+            self._last_problem, self._last_problem_time = problem, now
+        elif now - self._last_problem_time < self._settings.settle:
+            problem = self._last_problem
+        margins = self._margins
+        return ThreadCondition(
+            None if self._vertices is None else self._vertices(),
+            self._tension,
+            0 if margins is None else margins.friction_nodes,
+            1.0 if margins is None or self._settings.friction_feedback != "all" else margins.slowdown,
+            problem,
+            self._drift,
+            may_hold,
+        )
+
+    def _page_problem(self, now: float) -> str:
+        held = now - self._held <= self._settings.hold_timeout
+        return NOT_HELD if self.hold_to_run and not held else ""
+
+    def _needle_problem(self, now: float) -> str:
+        """Return the first reason why the needle cannot be commanded; empty for none."""
+        if not self.has_pose(now):
+            if not math.isfinite(self._pose):
+                return NO_POSE
+            return self._tracker or f"no needle pose for more than {self._settings.pose_timeout:g} s"
+        return self._outside or self._graph_problem  # in a frame or two it may be missed
+
+    def _thread_problem(self, now: float) -> str:
+        margins = self._margins
+        if self._vertices is None:
+            return NO_THREAD
+        if margins is None:
+            return NO_MARGINS
+        if margins.reason:
+            return f"the thread is not known: {margins.reason}"
+        if now - margins.time > self._settings.thread_timeout:
+            return f"no margins of the thread for more than {self._settings.thread_timeout:g} s"
+        if margins.scene_version != self.scene_version:
+            return "thread_model goes by another scene"
+        if self._estimate_problem:
+            return self._estimate_problem
+        new = [text for since, text in self._disturbances.items() if since not in self._accepted]
+        return f"an unmodelled contact: the thread is {'; '.join(new[:MAX_NAMED])}" if new else ""
 
 
 @dataclass(frozen=True)
@@ -67,24 +238,41 @@ class ProcedureSession:
 
     Attributes:
         known: what the loop's nodes report.
-        status: of the procedure.
         planned_duration: of what was planned last, at the allowed speed, without friction [s].
     """
 
     def __init__(self, settings: NeedlePlannerSettings, scene: Scene | None, submit: PathSubmitter = plan_now) -> None:
         self._settings, self._submit = settings, submit
         self.known = LoopState(settings)
-        self.status = ProcedureStatus()
         self.planned_duration = 0.0
         self._planner: NeedlePlanner | None = None
         self._executor: ProcedureExecutor | None = None
         self._planned: list[tuple[int, BodyPath]] = []  # each with the index of its first goal
         self._shown: BodyPath | None = None
         self._pose: tuple[float, Vector, Vector] | None = None  # stamp, tail and heading
-        self._by_person, self._armed = False, True
-        self._clearance, self._progress = math.inf, 0.0
+        self._armed, self._clearance = True, math.nan
         if scene is not None:
             self.set_scene(scene)
+
+    @property
+    def status(self) -> ProcedureStatus:
+        """What the procedure does now."""
+        executor = self._executor
+        if executor is None:
+            return ProcedureStatus()
+        goals = tuple(goal.GROUP for goal in executor.procedure.goals)
+        return ProcedureStatus(
+            state=executor.state,
+            procedure=executor.procedure.name,
+            goals=goals,
+            goal=executor.goal,
+            goals_met=len(goals) if executor.state is ProcedureState.DONE else executor.goal,
+            progress=executor.progress,
+            reason=executor.reason,
+            resumes=executor.resumes,
+            hold_to_run=self.known.hold_to_run,
+            clearance=self._clearance,
+        )
 
     @property
     def is_running(self) -> bool:
@@ -116,7 +304,6 @@ class ProcedureSession:
         if self._executor.state is ProcedureState.READY:
             self._executor.abort("the scene has changed since it was planned")
         self._executor.set_planner(self._planner)
-        self._update_status()
 
     def plan(self, procedure: Procedure, now: float, *, hold_to_run: bool = False) -> tuple[BodyPath, ...]:
         """Plan a procedure from where the needle is; nothing moves before `resume`.
@@ -132,23 +319,19 @@ class ProcedureSession:
             PlanningError: there is no way to a goal.
         """
         if self.is_active:
-            at = f"{self.status.procedure}, at goal {self.status.goal + 1} of {len(self.status.goals)}"
+            status = self.status
+            at = f"{status.procedure}, at goal {status.goal + 1} of {len(status.goals)}"
             raise InvalidInputError("procedure", procedure.name, f"none while another is executed: {at}")
         if self._planner is None:
             raise InvalidInputError("procedure", procedure.name, "a scene first, as a parameter or on its topic")
         if self._pose is None or not self.known.has_pose(now):
             raise InvalidInputError("procedure", procedure.name, "a needle that is tracked")
-        executor = ProcedureExecutor(procedure, self._planner, self._submit, self._settings.thread_wait)
-        paths = executor.plan(*self._pose[1:])
-        self._planned, self.planned_duration, index = [], 0.0, 0
-        for path in paths:
-            self._planned.append((index, path))
-            self.planned_duration += path.length / procedure.limits[index].speed
-            index += len(chain(procedure, index))
-        self._executor, self._shown = executor, None
-        self._clearance, self._progress = math.inf, 0.0
-        self.known.hold_to_run, self._by_person = hold_to_run, False
-        self._update_status()
+        paths = self._planner.plan_all(procedure, *self._planner.pose(*self._pose[1:]))
+        self._planned = [(index, path) for (index, _), path in zip(chains(procedure), paths, strict=True)]
+        self.planned_duration = planned_duration(procedure, paths)
+        self._executor = ProcedureExecutor(procedure, self._planner, self._submit, self._settings.thread_wait)
+        self._shown, self._clearance = None, math.nan
+        self.known.hold_to_run = hold_to_run
         return paths
 
     def resume(self) -> None:
@@ -164,8 +347,6 @@ class ProcedureSession:
         self.check_armed()
         self.known.accept_disturbances()
         executor.start()
-        self._by_person = False
-        self._update_status()
 
     def check_armed(self) -> None:
         """Refuse to begin or to go on while the coil bridge is not armed.
@@ -180,11 +361,7 @@ class ProcedureSession:
         """Rest until `resume`; return whether there was anything to pause."""
         if self._executor is None or not self.is_active:
             return False
-        if self._executor.state is ProcedureState.PAUSED and not self._by_person:
-            self._executor.start()  # it would go on by itself
         self._executor.pause(reason)
-        self._by_person = True
-        self._update_status()
         return True
 
     def abort(self, reason: str) -> bool:
@@ -192,7 +369,6 @@ class ProcedureSession:
         if self._executor is None or self._executor.state in ENDED:
             return False
         self._executor.abort(reason)
-        self._update_status()
         return True
 
     def on_bridge(self, armed: bool, drift: float) -> None:
@@ -204,7 +380,7 @@ class ProcedureSession:
         """
         self.known.on_bridge(drift)
         self._armed = armed
-        if not armed and not self._by_person:
+        if not armed and (self.is_running or (self._executor is not None and self._executor.resumes)):
             self.pause("the coil bridge is not armed")
 
     def on_pose(self, stamp: float, tail: Vector, heading: Vector, now: float) -> Vector | None:
@@ -224,17 +400,15 @@ class ProcedureSession:
         self._pose = stamp, tail, heading
         if executor is None or planner is None or not self.is_active:
             return None
-        if executor.path is None and not self._by_person:
+        if executor.path is None and (self.is_running or executor.resumes):
             # The needle has not been moved yet: what is found only now was there when a person began.
             self.known.accept_disturbances()
-        output = executor.update(stamp, tail, heading, self.known.condition(now))
-        self._progress = output.progress
+        velocity = executor.update(stamp, tail, heading, self.known.condition(now))
         if self.is_running:
             middle, angle = planner.pose(tail, heading)
             near = body_clearance(float(middle[0]), float(middle[1]), angle, planner.body, planner.near)
-            self._clearance = min(self._clearance, near)
-        self._update_status()
-        return output.velocity if executor.is_commanding else None
+            self._clearance = near if math.isnan(self._clearance) else min(self._clearance, near)
+        return velocity if executor.is_commanding else None
 
     @property
     def setpoint(self) -> tuple[Vector, float] | None:
@@ -252,7 +426,6 @@ class ProcedureSession:
         condition = self.known.condition(now)
         if condition.problem:
             self._executor.update(*self._pose, condition)
-            self._update_status()
 
     def new_plan(self) -> Points | None:
         """Return where the middle of the needle is to go, shape (m, 2) [m]; None if that is as it was."""
@@ -268,23 +441,6 @@ class ProcedureSession:
         else:
             ahead = [current, *(path for first, path in self._planned if first > executor.goal)]
         return np.vstack([path.middles for path in ahead])
-
-    def _update_status(self) -> None:
-        executor = self._executor
-        assert executor is not None
-        state, goals = executor.state, tuple(goal.GROUP for goal in executor.procedure.goals)
-        self.status = ProcedureStatus(
-            state,
-            executor.procedure.name,
-            goals,
-            executor.goal,
-            len(goals) if state is ProcedureState.DONE else executor.goal,
-            self._progress,
-            executor.reason,
-            state is ProcedureState.PAUSED and not self._by_person,
-            self.known.hold_to_run,
-            self._clearance if math.isfinite(self._clearance) else math.nan,
-        )
 
 
 @cache

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.dish_camera import Cover
+from magnetosuture_thread.rig.camera import Cover
 
 GLARE, HAND, TOOL = "glare", "hand", "tool"
 DIM, OVEREXPOSED = "dim", "overexposed"

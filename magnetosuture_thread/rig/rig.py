@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import InvalidInputError, SolverError
-from magnetosuture_thread.rig.camera.dish_camera import Cover, DishCamera, Image
+from magnetosuture_thread.rig.camera import Cover, DishCamera, Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, find_collision

@@ -15,15 +15,14 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import LOOK_OF_KIND, LOOKS, CameraScene, Lighting, Look
+from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.rig.mechanics.thread import NeedleJoint, ThreadProperties
-from magnetosuture_thread.rig.power.process import StageProcess
+from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
+from magnetosuture_thread.rig.power.stage import StageProcess
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared_parameter
 
@@ -133,6 +132,8 @@ class RigSettings(Configuration):
         if self.power_stage == "roboclaw" and (not ports or 2 * ports != len(self.coil_angles)):
             expectation = f"a path for two of the {len(self.coil_angles)} coils"
             raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
+        if self.needle_length < 2.0 * self.needle_width:
+            raise ConfigurationError(f"{self.GROUP}.needle_length", self.needle_length, "at least two widths [m]")
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         for fault in self.faults:
             Fault.parse(fault)

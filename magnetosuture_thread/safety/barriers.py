@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.half_planes import project_onto_half_planes
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
-from magnetosuture_thread.geometry.obstacles.search import search_edges
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.safety.certificate import NOTHING, WALL, PosedNeedle, safe_time
-from magnetosuture_thread.safety.packed_scene import PackedScene, polygon_distance
+from magnetosuture_thread.safety.packed_scene import search_block, shape_distance
 
 LEAN, DEPTH = 0.1, 1e-5  # rad and m; so far beyond its bound, a point that slides leaves at this angle
 MAX_ROWS = 2048
+BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
 PASSES = 4  # of the projection, each with what the motion of the one before bends into and meets
 STUCK = 1e-9  # of the velocity commanded; less is none
 ACTIVE = 1e-6  # of the speed; a barrier that leaves less room than this is active
@@ -44,100 +43,75 @@ class AddedRows(NamedTuple):
     barrier: NDArray[np.int64]
 
 
-NO_ROWS = AddedRows(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
-
-
 @compiled
-def measure(
-    points: Points,
-    scene: PackedScene,
-    distances: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> None:
-    """Write the signed distance of each point from each disc, then polygon, (m, s), and its gradient, (m, s, 2)."""
-    nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
-    discs = len(scene.discs)
-    for s in range(distances.shape[1]):
-        guess = -1
-        for i in range(len(points)):
-            x, y = points[i, 0], points[i, 1]
-            if s < discs:
-                qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
-                away = math.hypot(qx, qy)
-                distances[i, s] = away - scene.discs[s, 2]
-                normal[i, s, 0], normal[i, s, 1] = (qx / away, qy / away) if away > 0.0 else (1.0, 0.0)
-            else:
-                found = polygon_distance(x, y, s - discs, guess, scene, nowhere, none, nor)
-                distances[i, s], normal[i, s, 0], normal[i, s, 1], guess = found
+def no_rows() -> AddedRows:
+    """Return no rows, for a filter without barriers of a user."""
+    return AddedRows(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))
 
 
-@compiled
-def find_rows(
-    needle: PosedNeedle,
-    reach: float,
-    band: float,
-    scene: PackedScene,
-    margin: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    bend: NDArray[np.float64],
-    who: NDArray[np.int64],
-) -> int:
-    """Write a row for every local minimum of a point's distance to the wall or a shape within reach.
+class Rows(NamedTuple):
+    """Arrays for the rows of wall and shapes, written by `find_rows`.
 
-    Args:
-        needle: in its pose.
-        reach: greatest margin of a row [m].
-        band: by which the margin is counted from farther away than the certificate asks for [m].
-        scene: packed.
+    Attributes:
         margin: h, shape (k,) [m].
         gradient: of h by the point, unit vectors, shape (k, 2).
         bend: second derivative of h along the boundary, shape (k,) [1/m].
-        who: index of the point and of the shape, or `WALL`, shape (k, 2).
+        point: index of the point, shape (k,).
+        shape: index of the shape, or `WALL`, shape (k,).
+    """
+
+    margin: NDArray[np.float64]
+    gradient: Points
+    bend: NDArray[np.float64]
+    point: NDArray[np.int64]
+    shape: NDArray[np.int64]
+
+
+@compiled
+def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
+    """Write a row for every local minimum of a point's distance to the wall or a shape within reach [m].
 
     Returns:
         The number of rows. Where there is no room for more, a shape's nearest points are left.
     """
-    nowhere = np.empty(0, np.int32)
-    found, ways = np.empty(32), np.empty((32, 2))
-    points, distances, keep, keep_wall = needle.points, needle.distances, needle.keep + band, needle.keep_wall + band
-    rows, discs, count = 0, len(scene.discs), len(points)
+    data, scene = needle.data, needle.data.scene
+    distance, normal = np.empty(32), np.empty((32, 2))
+    points, keep, keep_wall = needle.points, data.keep + BAND, data.keep_wall + BAND
+    used, discs, count, room = 0, len(scene.discs), len(points), len(rows.margin)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
         away = math.hypot(x, y)
-        at_end = not needle.ends_only or i == 0 or i == count - 1
-        if at_end and scene.radius - away - keep_wall <= reach and rows < len(margin) and away > 1e-9:
-            margin[rows], bend[rows] = scene.radius - away - keep_wall, -1.0 / away
-            gradient[rows, 0], gradient[rows, 1] = -x / away, -y / away
-            who[rows, 0], who[rows, 1] = i, WALL
-            rows += 1
-        for s in range(distances.shape[1]):
-            distance = distances[i, s]
-            if distance - keep > reach:
+        at_end = not data.body.straight or i == 0 or i == count - 1
+        if at_end and scene.radius - away - keep_wall <= reach and used < room and away > 1e-9:
+            rows.margin[used], rows.bend[used] = scene.radius - away - keep_wall, -1.0 / away
+            rows.gradient[used, 0], rows.gradient[used, 1] = -x / away, -y / away
+            rows.point[used], rows.shape[used] = i, WALL
+            used += 1
+        for s in range(len(scene.shapes)):
+            nearest = needle.distances[i, s]
+            if nearest - keep > reach:
                 continue
             local = 0
-            if s >= discs and distance > 0.0:
-                polygon, far = s - discs, reach + keep
-                for block in range(scene.polygons[polygon, 0], scene.polygons[polygon, 1]):
+            if s >= discs and nearest > 0.0:
+                far = reach + keep
+                for block in range(scene.polygons[s - discs, 0], scene.polygons[s - discs, 1]):
                     bx, by = x - scene.circles[block, 0], y - scene.circles[block, 1]
                     near = far + scene.circles[block, 2]
                     if bx * bx + by * by > near * near:
                         continue
-                    base, edges = scene.ranges[block, 0] * EDGE_WIDTH, scene.ranges[block, 1]
-                    least = local
-                    got = search_edges(x, y, far, scene.edges, base, nowhere, -1, edges, least, found, ways)
-                    local = got.rows if got.rows >= 0 else least
-            if local == 0 or distance <= 0.0:
-                found[0], ways[0, 0], ways[0, 1], local = distance, needle.normal[i, s, 0], needle.normal[i, s, 1], 1
-            for k in range(local):
-                if rows >= len(margin):
-                    break
-                margin[rows] = found[k] - keep
-                gradient[rows, 0], gradient[rows, 1] = ways[k, 0], ways[k, 1]
+                    found = search_block(x, y, far, block, scene, local, distance, normal)
+                    local = found.rows if found.rows >= 0 else local
+            if local == 0:
+                distance[0], local = nearest, 1
+                normal[0, 0], normal[0, 1] = needle.normal[i, s, 0], needle.normal[i, s, 1]
+            for k in range(min(local, room - used)):
+                rows.margin[used] = distance[k] - keep
+                rows.gradient[used, 0], rows.gradient[used, 1] = normal[k, 0], normal[k, 1]
                 # A disc, or a corner for all that is known here, bends away from the point: that is left out.
-                bend[rows] = 0.0
-                who[rows, 0], who[rows, 1] = i, scene.shapes[s]
-                rows += 1
-    return rows
+                rows.bend[used] = 0.0
+                rows.point[used], rows.shape[used] = i, scene.shapes[s]
+                used += 1
+    return used
 
 
 @compiled
@@ -190,35 +164,22 @@ def _all_hold(
 
 
 @compiled
-def _tangent(x: float, y: float, what: int, needle: PosedNeedle, scene: PackedScene) -> tuple[float, float, float]:
+def _tangent(x: float, y: float, what: int, needle: PosedNeedle) -> tuple[float, float, float]:
     """Return the way out (2) at a point that meets the wall or a shape, and its margin there [m]."""
+    data, scene = needle.data, needle.data.scene
     if what == WALL:
         away = math.hypot(x, y)
-        return -x / away, -y / away, scene.radius - away - needle.keep_wall
-    discs = len(scene.discs)
-    for s in range(len(scene.shapes)):
-        if scene.shapes[s] != what:
-            continue
-        if s < discs:
-            qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
-            away = max(math.hypot(qx, qy), 1e-12)
-            return qx / away, qy / away, away - scene.discs[s, 2] - needle.keep
-        nowhere, none, nor = np.empty(0, np.int32), np.empty(0), np.empty((0, 2))
-        distance, gx, gy, _ = polygon_distance(x, y, s - discs, -1, scene, nowhere, none, nor)
-        return gx, gy, distance - needle.keep
-    return 1.0, 0.0, 0.0
+        return -x / away, -y / away, scene.radius - away - data.keep_wall
+    s = 0
+    while scene.shapes[s] != what:
+        s += 1
+    distance, gx, gy, _ = shape_distance(x, y, s, -1, scene)
+    return gx, gy, distance - data.keep
 
 
 @compiled
 def nearest_clear(
-    vx: float,
-    vy: float,
-    needle: PosedNeedle,
-    rate: float,
-    band: float,
-    scene: PackedScene,
-    added: AddedRows,
-    touched: NDArray[np.bool_],
+    vx: float, vy: float, needle: PosedNeedle, added: AddedRows, touched: NDArray[np.bool_]
 ) -> tuple[float, float]:
     """Return the velocity nearest to (vx, vy) that the barriers let through and that is certified for the hold.
 
@@ -232,33 +193,30 @@ def nearest_clear(
         vx: velocity of the tip commanded [m/s].
         vy: velocity of the tip commanded [m/s].
         needle: in its pose.
-        rate: share of the margin by which a point may approach [1/s].
-        band: by which the barriers keep farther away than the certificate asks for [m].
-        scene: packed.
         added: rows of the barriers that a user has added.
         touched: set for each shape, then each added barrier, then the wall, that changed the velocity.
     """
-    speed, hold, turning = math.hypot(vx, vy), needle.hold, needle.turning
+    speed, hold, rate, turning = math.hypot(vx, vy), needle.data.hold, needle.data.rate, needle.turning
     points, chord_x, chord_y = needle.points, needle.chord_x, needle.chord_y
-    time, what, where = safe_time(vx, vy, needle, scene)
+    time, what, where = safe_time(vx, vy, needle)
     swiftest = 0.0
     for i in range(len(points)):
         swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
     reach = math.hypot(1.0, swiftest) * speed / rate
     margin, gradient, bend = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2)), np.empty(MAX_ROWS)
-    who = np.empty((MAX_ROWS + len(added.margin) + PASSES, 2), np.int64)
-    count = find_rows(needle, reach, band, scene, margin, gradient, bend, who)
+    point, shape = np.empty(MAX_ROWS, np.int64), np.empty(MAX_ROWS, np.int64)
+    count = find_rows(needle, reach, Rows(margin, gradient, bend, point, shape))
     fixed = count + len(added.margin)
     room = fixed + PASSES
-    rows, least, depth = np.empty((room, 2)), np.empty(room), np.empty(room)
+    rows, least, depth, who = np.empty((room, 2)), np.empty(room), np.empty(room), np.empty(room, np.int64)
     for k in range(count):
-        i = who[k, 0]
+        i, who[k] = point[k], shape[k]
         along = gradient[k, 0] * chord_x + gradient[k, 1] * chord_y
         aside = gradient[k, 0] * turning[i, 0] + gradient[k, 1] * turning[i, 1]
         rows[k, 0], rows[k, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
     rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0) - added.drift
-    depth[count:fixed], who[count:fixed, 0], who[count:fixed, 1] = -added.margin, 0, added.barrier
+    depth[count:fixed], who[count:fixed] = -added.margin, added.barrier
     if time >= hold and _all_hold(vx, vy, rows, least, depth, fixed):
         return vx, vy
     bounded = least.copy()
@@ -274,7 +232,7 @@ def nearest_clear(
                 break
         if not holds:
             break
-        time, ended, where = safe_time(x, y, needle, scene)
+        time, ended, where = safe_time(x, y, needle)
         share = 1.0 if time >= hold else SURE * time / hold
         off = (share * x - vx) ** 2 + (share * y - vy) ** 2
         if off < best:
@@ -283,10 +241,10 @@ def nearest_clear(
         if share >= 1.0:
             break
         across, forwards = -x * chord_y + y * chord_x, x * chord_x + y * chord_y
-        omega = needle.turn * across
+        omega = needle.data.body.turn * across
         # What the motion bends into within the hold.
         for k in range(count):
-            i = who[k, 0]
+            i = point[k]
             px, py = forwards * chord_x + across * turning[i, 0], forwards * chord_y + across * turning[i, 1]
             gx, gy = gradient[k, 0], gradient[k, 1]
             aside = -px * gy + py * gx
@@ -300,14 +258,14 @@ def nearest_clear(
             way = time * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
             c, s = math.cos(half), math.sin(half)
             dx, dy = way * (c * px - s * py), way * (s * px + c * py)
-            gx, gy, left = _tangent(points[where, 0] + dx, points[where, 1] + dy, ended, needle, scene)
+            gx, gy, left = _tangent(points[where, 0] + dx, points[where, 1] + dy, ended, needle)
             along, aside = gx * chord_x + gy * chord_y, gx * turning[where, 0] + gy * turning[where, 1]
             rows[total, 0], rows[total, 1] = along * chord_x - aside * chord_y, along * chord_y + aside * chord_x
             bent = 0.5 * hold * omega * (-gx * py + gy * px)
-            missing = band - left if left > -band else 0.0  # nothing beyond but to get no nearer
+            missing = BAND - left if left > -BAND else 0.0  # nothing beyond but to get no nearer
             bounded[total] = min((gx * dx + gy * dy + missing) / hold - min(bent, 0.0), LEAN * speed)
             least[total], depth[total] = bounded[total], 0.0
-            who[total, 0], who[total, 1] = where, ended
+            who[total] = ended
             total += 1
     touched[:] = False
     if bx == vx and by == vy:
@@ -322,7 +280,7 @@ def nearest_clear(
         left = rows[k, 0] * ux + rows[k, 1] * uy - bounded[k]
         leans = depth[k] > 0.0 and least[k] < LEAN * speed * math.hypot(rows[k, 0], rows[k, 1])
         if leans or (least[k] < 0.0 and left <= ACTIVE * speed):
-            touched[who[k, 1]] = True
+            touched[who[k]] = True
     if worst >= 0 and not touched.any():
-        touched[who[worst, 1]] = True
+        touched[who[worst]] = True
     return bx, by

@@ -11,7 +11,7 @@ With m = tan(omega t / 2) / (omega / 2), which is t where omega = 0, and v' = v_
 
 so that the time at which the point meets a line or a circle is the root of a quadratic in m, in closed form and
 without steps in time. Points closer to an obstacle than f lie in the discs of radius f around its corners and in the
-strips of width f along its edges; whoever comes from outside enters one of them first.
+strips of width f along its edges; a point that comes from outside crosses one of these first.
 
 Source: none; the discs and strips are the Minkowski sum of a polygon's boundary and a disc.
 """
@@ -37,32 +37,72 @@ WALL, NOTHING = -1, -2
 """In the place of a shape's index."""
 
 
-class PosedNeedle(NamedTuple):
-    """The needle in one pose, what it keeps from, and how far everything is from it, for compiled code.
+class BodyData(NamedTuple):
+    """The needle's body, in the frame of its tail with its heading along x; for compiled code.
 
     Attributes:
         points: that stand for the needle, shape (m, 2) [m].
         turning: velocity of each for a tip velocity of 1 m/s across the chord, shape (m, 2).
-        ends_only: whether the first and the last point are the ones nearest to the wall, as of a straight needle.
-        chord_x: unit vector along the chord.
-        chord_y: unit vector along the chord.
+        straight: whether the needle is; its first and last point are then the ones nearest to the wall.
+        chord: distance from tail to tip, 0 of a needle that is a point [m].
+        chord_x: unit vector from tail to tip.
+        chord_y: unit vector from tail to tip.
         turn: rate of turning for that velocity [rad/m].
-        hold: for which a motion has to keep clear [s].
-        keep: least distance of a point from shapes [m].
-        keep_wall: least distance of a point from the wall [m].
-        distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
-        normal: its gradient, shape (m, s, 2).
     """
 
     points: Points
     turning: Points
-    ends_only: bool
+    straight: bool
+    chord: float
     chord_x: float
     chord_y: float
     turn: float
+
+
+class FilterData(NamedTuple):
+    """A safety filter without barriers of a user, for compiled code. Not to be written to.
+
+    Attributes:
+        body: of the needle.
+        hold: for which a motion has to keep clear [s].
+        keep: minimum distance of a point of the needle from shapes [m].
+        keep_wall: minimum distance of a point from the wall [m].
+        keep_out: minimum distance of the needle's axis from both [m].
+        rate: share of a margin by which the needle may approach [1/s].
+        max_speed: of the tip [m/s].
+        max_acceleration: maximum change of the velocity before the barriers [m/s^2].
+        scene: packed.
+    """
+
+    body: BodyData
     hold: float
     keep: float
     keep_wall: float
+    keep_out: float
+    rate: float
+    max_speed: float
+    max_acceleration: float
+    scene: PackedScene
+
+
+class PosedNeedle(NamedTuple):
+    """The needle in one pose, and how far everything is from it, for compiled code.
+
+    Attributes:
+        data: the needle, and what it keeps from.
+        points: that stand for the needle, shape (m, 2) [m].
+        turning: velocity of each for a tip velocity of 1 m/s across the chord, shape (m, 2).
+        chord_x: unit vector along the chord.
+        chord_y: unit vector along the chord.
+        distances: signed distance of each point from each disc, then polygon, shape (m, s) [m].
+        normal: its gradient, shape (m, s, 2).
+    """
+
+    data: FilterData
+    points: Points
+    turning: Points
+    chord_x: float
+    chord_y: float
     distances: NDArray[np.float64]
     normal: NDArray[np.float64]
 
@@ -166,14 +206,13 @@ def _strip_time(
 
 
 @compiled
-def _polygon_time(
-    needle: PosedNeedle, i: int, s: int, vx: float, vy: float, omega: float, limit: float, scene: PackedScene
-) -> float:
+def _polygon_time(needle: PosedNeedle, i: int, s: int, vx: float, vy: float, omega: float, limit: float) -> float:
     """Return when a point gets nearer to a polygon than `keep`, or than it is if that is nearer; `limit` for later [s].
 
     A point inside must leave by the nearest side: it goes no deeper than it is, and by at most `keep` beyond it.
     """
-    x, y, distance, keep = needle.points[i, 0], needle.points[i, 1], needle.distances[i, s], needle.keep
+    scene, keep = needle.data.scene, needle.data.keep
+    x, y, distance = needle.points[i, 0], needle.points[i, 1], needle.distances[i, s]
     best, polygon = limit, s - len(scene.discs)
     if distance <= INSIDE:
         gx, gy = needle.normal[i, s, 0], needle.normal[i, s, 1]
@@ -206,9 +245,7 @@ def _polygon_time(
 
 
 @compiled
-def safe_time(
-    vx: float, vy: float, needle: PosedNeedle, scene: PackedScene, drift: float = 0.0
-) -> tuple[float, int, int]:
+def safe_time(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.0) -> tuple[float, int, int]:
     """Return for how long a motion keeps the needle clear, at most `hold`, what ends it, and which point meets it.
 
     No point of the needle gets closer than `keep` to a shape or `keep_wall` to the wall; one that is closer already
@@ -218,16 +255,16 @@ def safe_time(
         vx: velocity of the tip [m/s].
         vy: velocity of the tip [m/s].
         needle: in its pose.
-        scene: packed.
         drift: part of the tip's velocity across the chord, to its left, that the whole needle has [m/s].
 
     Returns:
         The time [s]; the index of the shape in the scene, `WALL` or `NOTHING`; the index of the point, and -1 for none.
     """
-    best, what, where = needle.hold, NOTHING, -1
+    data, scene = needle.data, needle.data.scene
+    best, what, where = data.hold, NOTHING, -1
     points, distances, chord_x, chord_y = needle.points, needle.distances, needle.chord_x, needle.chord_y
     along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x - drift
-    omega = needle.turn * across
+    omega = data.body.turn * across
     count, discs = len(points), len(scene.discs)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
@@ -236,21 +273,21 @@ def safe_time(
         speed = math.hypot(px, py)
         if speed == 0.0:
             continue
-        if not needle.ends_only or i == 0 or i == count - 1:
+        if not data.body.straight or i == 0 or i == count - 1:
             away = math.hypot(x, y)
-            radius = max(scene.radius - needle.keep_wall, away) + ROUNDING
+            radius = max(scene.radius - data.keep_wall, away) + ROUNDING
             if radius - away <= speed * best:
                 t = circle_exit(x, y, radius - away, radius, px, py, omega, False)
                 if t < best:
                     best, what, where = t, WALL, i
         for s in range(distances.shape[1]):
-            if distances[i, s] - needle.keep > speed * best:
+            if distances[i, s] - data.keep > speed * best:
                 continue
             if s < discs:
                 disc = scene.discs[s]
-                t = _disc_time(x - disc[0], y - disc[1], disc[2], needle.keep, px, py, omega)
+                t = _disc_time(x - disc[0], y - disc[1], disc[2], data.keep, px, py, omega)
             else:
-                t = _polygon_time(needle, i, s, px, py, omega, best, scene)
+                t = _polygon_time(needle, i, s, px, py, omega, best)
             if t < best:
                 best, what, where = t, int(scene.shapes[s]), i
     return best, what, where

@@ -11,32 +11,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.barrier import Barrier, check_barriers
+from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
-from magnetosuture_thread.safety.added_barriers import AddedNeedleBarriers
-from magnetosuture_thread.safety.barriers import NO_ROWS, SURE, measure, nearest_clear
-from magnetosuture_thread.safety.certificate import NOTHING, PosedNeedle, safe_time
+from magnetosuture_thread.safety.barriers import SURE, AddedRows, nearest_clear, no_rows
+from magnetosuture_thread.safety.certificate import NOTHING, BodyData, FilterData, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.safety.limits import FINITE, checked_velocity, limit_norm, rate_limit
-from magnetosuture_thread.safety.motion import BodyData, FilterData
+from magnetosuture_thread.safety.motion import STUCK, limit_velocity, needle_margin, pose_needle
 from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
 
+EAST = np.array([1.0, 0.0])
+FINITE = Quantity("", "m/s")
 COARSEST = 5e-4  # m; distance at most between the points that stand for the needle, where that are not too many
 MAX_POINTS = 129
-BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
 MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
-STUCK = 1e-3  # of the speed commanded; a needle that is left less rests
 SIDESTEP_MARGIN = 2e-4  # m; beyond keep_out, within which the needle is taken off sideways
 SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
 SIDESTEP_BALANCE = 1e-6  # m; of depth on both sides, from which on the needle is in a gap
 POSITION = bounded("m", -1.0, 1.0)  # no dish is larger
 WALL_NAME = "wall"
 SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
+CHECKS = 8  # instants of a hold at which an added barrier is checked
+BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,97 @@ class FilteredCommand:
     slowdown: float = 1.0
     active: tuple[str, ...] = ()
     reason: str = ""
+
+
+class AddedNeedleBarriers:
+    """The barriers that a user adds to a safety filter, see there.
+
+    Args:
+        barriers: in their order.
+        kinematics: of the needle.
+        data: of the filter.
+        first: index of the first barrier among the names of constraints.
+
+    Attributes:
+        barriers: in their order.
+        time: now, by the clock of the poses' stamps; None before it is known [s].
+        first_time: of the needle's first pose by that clock [s].
+    """
+
+    def __init__(self, barriers: Sequence[Barrier], kinematics: NeedleKinematics, data: FilterData, first: int) -> None:
+        self.barriers = tuple(barriers)
+        check_barriers(self.barriers)
+        self.time: float | None = 0.0
+        self.first_time = 0.0
+        self._kinematics, self._data, self._first = kinematics, data, first
+
+    def __bool__(self) -> bool:
+        """Return whether there are any."""
+        return bool(self.barriers)
+
+    def rows(self, needle: PosedNeedle) -> AddedRows:
+        """Return the rows of the added barriers on the tip's velocity, each over the size of its gradient."""
+        along = np.array([needle.chord_x, needle.chord_y])
+        left = np.array([-along[1], along[0]])
+        found: list[AddedRows] = []
+        ahead = self._data.hold / CHECKS
+        for index, barrier in enumerate(self.barriers, start=self._first):
+            self.set_time(ahead)
+            later = np.asarray(barrier.value(needle.points), np.float64)
+            self.set_time()
+            rows = barrier.rows(needle.points)
+            # What appears meanwhile is left to the checks.
+            drift = (later - rows.value) / ahead if later.shape == rows.value.shape else np.zeros(len(rows.value))
+            slope = np.sqrt(np.einsum("rkd,rkd->r", rows.gradient, rows.gradient))
+            size = np.where(slope > 0.0, slope, 1.0)
+            gradient = rows.gradient / size[:, None, None]
+            drive = np.einsum("rkd,d->r", gradient, along)
+            turn = np.einsum("rkd,rkd->r", gradient, needle.turning[rows.nodes])
+            rate, which = np.full(len(size), min(barrier.gain, self._data.rate)), np.full(len(size), index, np.int64)
+            on_tip = drive[:, None] * along + turn[:, None] * left
+            found.append(AddedRows(on_tip, rows.value / size, rate, drift / size, which))
+        return AddedRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+    def checked_share(self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0) -> tuple[float, str]:
+        """Return the share of a velocity with which every added barrier holds at every check, and what it is for."""
+        broken = self._broken(velocity, tail, heading, drift)
+        if not broken:
+            return 1.0, ""
+        low, high = 0.0, 1.0
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_broken = bool(self._broken(middle * velocity, tail, heading, middle * drift))
+            low, high = (low, middle) if is_broken else (middle, high)
+        return low, broken
+
+    def _broken(self, velocity: Vector, tail: Vector, heading: Vector, drift: float) -> str:
+        """Return the first added barrier that gets below 0, and lower than for a needle at rest; empty for none."""
+        heading = np.asarray(heading) / math.hypot(float(heading[0]), float(heading[1]))
+        along, across = self._kinematics.body_velocity(heading, velocity)
+        begin = self.points_at(np.asarray(tail), heading)
+        times = [check / CHECKS * self._data.hold for check in range(1, CHECKS + 1)]
+        points = [self.points_at(*self._kinematics.moved(tail, heading, along, across, time, drift)) for time in times]
+        for time, where in zip(times, points, strict=True):
+            self.set_time(time)
+            for barrier in self.barriers:
+                least, value = np.minimum(barrier.value(begin), 0.0) - 1e-12, barrier.value(where)
+                # But for rounding. Where the number of rows changes with the place, every one of them has to be safe.
+                if not (value >= (least if value.shape == least.shape else -1e-12)).all():
+                    return barrier.name
+        return ""
+
+    def set_time(self, ahead: float = 0.0) -> None:
+        """Set the time of the barriers' next evaluation, ahead of now [s]."""
+        for barrier in self.barriers:
+            if self.time is not None:
+                barrier.move_to(self.time + ahead, self.first_time)
+            elif barrier.moves:
+                raise InvalidInputError("time", None, f"the time now [s], as the barrier {barrier.name} moves")
+
+    def points_at(self, tail: Vector, heading: Vector) -> Vector:
+        """Return the points that stand for the needle, from tail to tip, shape (m, 2) [m]."""
+        c, s = float(heading[0]), float(heading[1])
+        return np.asarray(self._data.body.points @ np.array([[c, s], [-s, c]]) + tail)
 
 
 class NeedleSafetyFilter:
@@ -125,34 +217,38 @@ class NeedleSafetyFilter:
         self.kinematics = NeedleKinematics(needle_length, needle_curvature)
         chord = self.kinematics.chord
         check_needle("safety filter", needle_length, needle_curvature)
-        least = chord + 2.0 * keep_out
-        if scene.dish.diameter <= least:
-            expected = f"more than {least:g} m, room for the needle and keep_out on both sides"
+        room = chord + 2.0 * keep_out
+        if scene.dish.diameter <= room:
+            expected = f"more than {room:g} m, room for the needle and keep_out on both sides"
             raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
-        self._rate = min(approach_rate, 1.0 / hold_time)
-        self._max_speed, self._max_acceleration = max_speed, max_acceleration
-        self._straight = abs(needle_curvature) * needle_length < 1e-9
+        points, turning, spacing = np.zeros((1, 2)), np.array([[0.0, 1.0]]), 0.0
         if needle_length > 0.0:
             spacing = max(min(COARSEST, 0.5 * keep_out), needle_length / (MAX_POINTS - 1))
             body = needle_points(needle_length, needle_curvature, spacing)
-            spacing = needle_length / (len(body.points) - 1)
-            self._points, self._turning, self._turn = body.points, body.turning, 2.0 / chord
-        else:
-            spacing = 0.0
-            self._points, self._turning, self._turn = np.zeros((1, 2)), np.array([[0.0, 1.0]]), 0.0
+            points, turning, spacing = body.points, body.turning, needle_length / (len(body.points) - 1)
+        x, y = self.kinematics.chord_direction(EAST).tolist()
         bend = abs(needle_curvature)
-        self._keep = math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out))
-        self._keep_wall = keep_out + 0.125 * bend * spacing**2
-        self._packed = pack_scene(scene)
-        added = self.kinematics, self._points, hold_time, self._rate, len(scene.names)
-        self._added = AddedNeedleBarriers(barriers, *added)
+        is_straight, turn = bend * needle_length < 1e-9, 2.0 / chord if needle_length > 0.0 else 0.0
+        self._data = FilterData(
+            BodyData(points, turning, is_straight, chord, x, y, turn),
+            hold_time,
+            math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out)),
+            keep_out + 0.125 * bend * spacing**2,
+            keep_out,
+            min(approach_rate, 1.0 / hold_time),
+            min(max_speed, MAX_SPEED),
+            max_acceleration,
+            pack_scene(scene),
+        )
+        self._added = AddedNeedleBarriers(barriers, self.kinematics, self._data, len(scene.names))
         self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall
-        self._touched = np.zeros(len(self._names), np.bool_)
         self._pose: tuple[tuple[float, ...], PosedNeedle] | None = None  # the last one, by tail and heading
         # Compiled now, not in the first step.
-        middle, east = np.array([-0.5 * chord, 0.0]), np.array([1.0, 0.0])
-        self.nearest_clear(np.array([1e-3, 0.0]), middle, east)
-        self.safe_share(np.array([1e-3, 0.0]), middle, east)
+        middle = np.array([-0.5 * chord, 0.0])
+        self._added.time = 0.0
+        self.filter(1e-3 * EAST, middle, EAST, time=0.0)
+        self.safe_share(1e-3 * EAST, middle, EAST)
+        self.kinematics.moved(middle, EAST, 1e-3, 0.0, hold_time)
         self._added.time = None
 
     def compiled_data(self) -> FilterData:
@@ -165,11 +261,7 @@ class NeedleSafetyFilter:
             raise ConfigurationError(
                 "barriers of the safety filter", self._names[-2], "none: compiled code has its own"
             )
-        x, y = self.kinematics.chord_direction(np.array([1.0, 0.0])).tolist()
-        body = BodyData(self._points, self._turning, self._straight, self.kinematics.chord, x, y, float(self._turn))
-        keep, rate = (self._keep, self._keep_wall, float(self.keep_out)), float(self._rate)
-        limits = min(float(self._max_speed), MAX_SPEED), float(self._max_acceleration), STUCK
-        return FilterData(body, float(self.hold_time), *keep, rate, BAND, *limits, self._packed, NO_ROWS)
+        return self._data
 
     @checked_arguments("command", InvalidInputError)
     def filter(
@@ -203,26 +295,22 @@ class NeedleSafetyFilter:
         """
         self._added.time, self._added.first_time = time, first_time
         self._added.set_time()
-        commanded = checked_velocity(commanded)
-        speed = math.hypot(*commanded)
-        if speed == 0.0:
+        commanded = _checked_velocity(commanded)
+        if not commanded.any():
             return FilteredCommand(commanded, np.zeros(2), slowdown)
-        active = [FRICTION] if slowdown < 1.0 else []
-        largest = min(self._max_speed, max_speed, MAX_SPEED)
-        velocity = limit_norm(slowdown * commanded, largest)
-        if slowdown * speed > largest * (1.0 + 1e-12):
-            active.append(SPEED)
-        if previous is not None and math.isfinite(self._max_acceleration):
-            previous, change = finite_array("previous", previous, (2,), FINITE), self._max_acceleration * elapsed
-            if math.hypot(*(velocity - previous)) > change * (1.0 + 1e-12):
-                velocity = rate_limit(previous, velocity, change)
-                active.append(ACCELERATION)
-        passed, touched = self.nearest_clear(velocity, tail, heading)
-        active += touched
-        if math.hypot(*passed) <= STUCK * math.hypot(*velocity):
-            named = [name for name in active if name not in (SPEED, ACCELERATION)] or active
-            return FilteredCommand(commanded, np.zeros(2), slowdown, tuple(active), rest_reason(named))
-        return FilteredCommand(commanded, passed, slowdown, tuple(active))
+        change, before = math.inf, np.zeros(2)
+        if previous is not None:
+            before, change = finite_array("previous", previous, (2,), FINITE), self._data.max_acceleration * elapsed
+        (x, y), (u, v) = commanded.tolist(), before.tolist()
+        largest = min(self._data.max_speed, max_speed)
+        x, y, is_fast, is_abrupt = limit_velocity((x, y), slowdown, largest, (u, v), change)
+        flags = {FRICTION: slowdown < 1.0, SPEED: is_fast, ACCELERATION: is_abrupt}
+        passed, touched = self.nearest_clear(np.array([x, y]), tail, heading)
+        active = tuple([name for name, is_active in flags.items() if is_active] + touched)
+        if math.hypot(*passed) <= STUCK * math.hypot(x, y):
+            named = [name for name in active if name not in (SPEED, ACCELERATION)] or list(active)
+            return FilteredCommand(commanded, np.zeros(2), slowdown, active, rest_reason(named))
+        return FilteredCommand(commanded, passed, slowdown, active)
 
     def nearest_clear(self, velocity: Vector, tail: Vector, heading: Vector) -> tuple[Vector, list[str]]:
         """Return the velocity nearest to one that keeps clear for the hold, and what changed it.
@@ -235,23 +323,19 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        velocity, needle = checked_velocity(velocity), self._at(tail, heading)
+        velocity, needle = _checked_velocity(velocity), self._at(tail, heading)
         if not velocity.any():
             return velocity, []
-        self._touched[:] = False
-        added = self._added.rows(needle) if self._added else NO_ROWS
-        x, y = nearest_clear(
-            float(velocity[0]), float(velocity[1]), needle, self._rate, BAND, self._packed, added, self._touched
-        )
+        touched = np.zeros(len(self._names), np.bool_)
+        added = self._added.rows(needle) if self._added else no_rows()
+        x, y = nearest_clear(float(velocity[0]), float(velocity[1]), needle, added, touched)
         clear = velocity if x == velocity[0] and y == velocity[1] else np.array([x, y])
         if self._added:
             share, name = self._added.checked_share(clear, tail, heading)
             if share < 1.0:
                 clear = share * clear
-                self._touched[self._names.index(name)] = True
-        if clear is velocity:
-            return velocity, []
-        return clear, [self._names[k] for k in np.flatnonzero(self._touched)]
+                touched[self._names.index(name)] = True
+        return clear, [] if clear is velocity else [self._names[k] for k in np.flatnonzero(touched)]
 
     def safe_share(self, velocity: Vector, tail: Vector, heading: Vector, drift: float = 0.0) -> tuple[float, str]:
         """Return the share of a velocity that keeps clear while it is held for the whole hold time: the guarantee.
@@ -272,9 +356,8 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        velocity = checked_velocity(velocity)
-        x, y = float(velocity[0]), float(velocity[1])
-        time, what, _ = safe_time(x, y, self._at(tail, heading), self._packed, drift)
+        velocity = _checked_velocity(velocity)
+        time, what, _ = safe_time(float(velocity[0]), float(velocity[1]), self._at(tail, heading), drift)
         found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
         if not self._added:
             return found
@@ -286,9 +369,7 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        needle = self._at(tail, heading)
-        wall = self.scene.dish.radius - float(np.hypot(needle.points[:, 0], needle.points[:, 1]).max())
-        return min(wall, float(needle.distances.min(initial=math.inf)))
+        return needle_margin(self._data, self._at(tail, heading))[0] + self.keep_out
 
     def sidestep(self, tail: Vector, heading: Vector) -> float:
         """Return the velocity across the chord, to its left, that takes the needle off what it is close to [m/s].
@@ -320,34 +401,15 @@ class NeedleSafetyFilter:
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
         tail, heading = finite_array("tail", tail, (2,), POSITION), finite_array("heading", heading, (2,), FINITE)
-        key = (float(tail[0]), float(tail[1]), float(heading[0]), float(heading[1]))
+        key = (*tail.tolist(), *heading.tolist())
         last = self._pose  # read once, as forecasts have the same filter in a thread of their own
         if last is not None and last[0] == key:
             return last[1]
-        size = math.hypot(key[2], key[3])
+        x, y, c, s = key
+        size = math.hypot(c, s)
         if not size > 0.0:
             raise InvalidInputError("heading", heading.tolist(), "a direction")
-        c, s = key[2] / size, key[3] / size
-        turn = np.array([[c, s], [-s, c]])  # of rows
-        e = self.kinematics.chord_direction(np.array([c, s]))
-        points = self._points @ turn + tail
-        shapes = len(self._packed.shapes)
-        distances, normal = np.empty((len(points), shapes)), np.empty((len(points), shapes, 2))
-        measure(points, self._packed, distances, normal)
-        chord_x, chord_y = float(e[0]), float(e[1])
-        needle = PosedNeedle(
-            points,
-            self._turning @ turn,
-            self._straight,
-            chord_x,
-            chord_y,
-            self._turn,
-            self.hold_time,
-            self._keep,
-            self._keep_wall,
-            distances,
-            normal,
-        )
+        needle: PosedNeedle = pose_needle(self._data, x, y, c / size, s / size)
         self._pose = key, needle
         return needle
 
@@ -355,3 +417,7 @@ class NeedleSafetyFilter:
 def rest_reason(names: list[str]) -> str:
     """Return the reason of a needle that rests at constraints."""
     return f"stopped by {', '.join(dict.fromkeys(names))}"
+
+
+def _checked_velocity(velocity: Vector) -> Vector:
+    return finite_array("velocity", velocity, (2,), FINITE)

@@ -9,9 +9,41 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_chord
 
 Vector = NDArray[np.float64]
+
+
+@compiled
+def move_pose(
+    chord: tuple[float, float, float], pose: Vector, along: float, left: float, turn_rate: float, duration: float
+) -> None:
+    """Move a needle whose motion is constant in the frame of its body.
+
+    Args:
+        chord: its length [m], and cosine and sine of its angle against the heading.
+        pose: tail [m] and heading, written, shape (4,).
+        along: velocity of the chord's middle along the chord [m/s].
+        left: velocity of the middle across the chord, to its left [m/s].
+        turn_rate: [rad/s].
+        duration: [s].
+    """
+    length, c0, s0 = chord
+    x, y, heading_x, heading_y = pose[0], pose[1], pose[2], pose[3]
+    ex, ey = c0 * heading_x - s0 * heading_y, c0 * heading_y + s0 * heading_x
+    lever, half = 0.5 * length, 0.5 * turn_rate * duration
+    reach = duration * (math.sin(half) / half if half != 0.0 else 1.0)
+    c, s = math.cos(half), math.sin(half)
+    ux, uy = c * ex - s * ey, s * ex + c * ey  # the chord's direction halfway
+    middle_x = x + lever * ex + reach * (along * ux - left * uy)
+    middle_y = y + lever * ey + reach * (along * uy + left * ux)
+    c, s = c * c - s * s, 2.0 * c * s
+    hx, hy = c * heading_x - s * heading_y, s * heading_x + c * heading_y
+    size = math.hypot(hx, hy)
+    hx, hy = hx / size, hy / size
+    pose[0], pose[1] = middle_x - lever * (c0 * hx - s0 * hy), middle_y - lever * (c0 * hy + s0 * hx)
+    pose[2], pose[3] = hx, hy
 
 
 @dataclass(frozen=True)
@@ -22,9 +54,9 @@ class NeedleKinematics:
         x_middle(t) = x_middle + t sinc(omega t / 2) R(omega t / 2) (u e + w n),    heading(t) = R(omega t) heading
 
     with the tip's velocity v when the motion begins, the unit vector e from tail to tip and n to its left, and the
-    velocity w at which the whole needle drifts across its chord, if it does. The
-    velocity is constant as the needle has it, in the frame of its body: currents that do not change pull and turn
-    the needle with it. A needle of length 0 is a point, which goes straight.
+    velocity w at which the whole needle drifts across its chord, if it does. The velocity is constant in the frame of
+    the needle's body: currents that do not change pull and turn the needle with it. A needle of length 0 is a point,
+    which goes straight.
 
     Attributes:
         length: of the needle along its body; 0 for a point [m].
@@ -74,19 +106,10 @@ class NeedleKinematics:
             duration: of the motion [s].
             drift: as much of that part is of the whole needle; the rest turns it [m/s].
         """
-        ex, ey = self.chord_direction(heading).tolist()
+        pose = np.array([tail[0], tail[1], heading[0], heading[1]], np.float64)
         if self.length == 0.0:
-            return tail + duration * np.array([along * ex - across * ey, along * ey + across * ex]), heading
-        lever = 0.5 * self.chord
-        half = 0.5 * (across - drift) / lever * duration
-        reach = duration * (math.sin(half) / half if half else 1.0)
-        c, s = math.cos(half), math.sin(half)
-        half_x, half_y = c * ex - s * ey, s * ex + c * ey  # the chord's direction halfway
-        middle_x = float(tail[0]) + lever * ex + reach * (along * half_x - drift * half_y)
-        middle_y = float(tail[1]) + lever * ey + reach * (along * half_y + drift * half_x)
-        c, s = c * c - s * s, 2.0 * c * s
-        x, y = c * float(heading[0]) - s * float(heading[1]), s * float(heading[0]) + c * float(heading[1])
-        size = math.hypot(x, y)
-        turned = np.array([x / size, y / size])
-        ex, ey = self.chord_direction(turned).tolist()
-        return np.array([middle_x - lever * ex, middle_y - lever * ey]), turned
+            move_pose(self._chord, pose, float(along), float(across), 0.0, float(duration))
+        else:
+            turn_rate = (across - drift) / (0.5 * self.chord)
+            move_pose(self._chord, pose, float(along), float(drift), float(turn_rate), float(duration))
+        return pose[:2], pose[2:]

@@ -12,7 +12,10 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, edges_of
 from magnetosuture_thread.geometry.obstacles.search import Nearest, search_edges
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene import Scene
+
+Vector = NDArray[np.float64]
 
 BLOCK = 12
 """Edges of a polygon that follow one another and share a bounding circle, so that those far away cost one test."""
@@ -29,6 +32,7 @@ class PackedScene(NamedTuple):
         circles: centre and radius of the circle around each block of edges, shape (b, 3) [m].
         ranges: first edge of each block and the number of its edges, shape (b, 2).
         edges: rows of `EDGE_WIDTH` numbers, flat, see `features.edges_of`.
+        cells: empty; the search of a block takes no entries of cells.
     """
 
     radius: float
@@ -38,6 +42,7 @@ class PackedScene(NamedTuple):
     circles: NDArray[np.float64]
     ranges: NDArray[np.int64]
     edges: NDArray[np.float64]
+    cells: NDArray[np.int32]
 
 
 def pack_scene(scene: Scene) -> PackedScene:
@@ -74,48 +79,60 @@ def pack_scene(scene: Scene) -> PackedScene:
         np.ascontiguousarray(np.concatenate(circles)),
         np.ascontiguousarray(np.concatenate(ranges)),
         np.concatenate(numbers).ravel(),
+        np.empty(0, np.int32),
     )
 
 
 @compiled
-def polygon_distance(
-    x: float,
-    y: float,
-    polygon: int,
-    guess: int,
-    scene: PackedScene,
-    nowhere: NDArray[np.int32],
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-) -> tuple[float, float, float, int]:
-    """Return the signed distance of a point from a polygon, its gradient (2), and the block that is nearest.
+def search_block(
+    x: float, y: float, reach: float, block: int, scene: PackedScene, count: int, distance: Vector, normal: Points
+) -> Nearest:
+    """Return the nearest of a block's edges, and write rows within reach from `count` on; see `search_edges`."""
+    base, last = scene.ranges[block, 0] * EDGE_WIDTH, scene.ranges[block, 1]
+    return search_edges(x, y, reach, scene.edges, base, scene.cells, -1, last, count, distance, normal)
+
+
+@compiled
+def shape_distance(x: float, y: float, s: int, guess: int, scene: PackedScene) -> tuple[float, float, float, int]:
+    """Return the signed distance of a point from a shape, its gradient (2), and the block that is nearest.
 
     Exact however far the point is, inside and outside: the edge or corner that is nearest of all tells the side.
 
     Args:
         x: coordinate of the point [m].
         y: coordinate of the point [m].
-        polygon: index in `scene.polygons`.
+        s: index in `scene.shapes`.
         guess: a block that may be near, which saves looking at others; -1 for none.
         scene: packed.
-        nowhere: an empty array.
-        distance: an empty array.
-        normal: an empty array of shape (0, 2).
     """
-    first, last = scene.polygons[polygon, 0], scene.polygons[polygon, 1]
+    discs = len(scene.discs)
+    if s < discs:
+        qx, qy = x - scene.discs[s, 0], y - scene.discs[s, 1]
+        away = math.hypot(qx, qy)
+        gx, gy = (qx / away, qy / away) if away > 0.0 else (1.0, 0.0)
+        return away - scene.discs[s, 2], gx, gy, -1
+    none, nor = scene.edges[:0], scene.circles[:0]
+    first, last = scene.polygons[s - discs, 0], scene.polygons[s - discs, 1]
     best, block = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0.0), -1
     if first <= guess < last:
-        base, count = scene.ranges[guess, 0] * EDGE_WIDTH, scene.ranges[guess, 1]
-        best = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, normal)
-        block = guess
+        best, block = search_block(x, y, -1.0, guess, scene, 0, none, nor), guess
     reach = math.sqrt(best.square)
     for k in range(first, last):
-        dx, dy, radius = x - scene.circles[k, 0], y - scene.circles[k, 1], scene.circles[k, 2]
-        far = reach + radius
+        dx, dy = x - scene.circles[k, 0], y - scene.circles[k, 1]
+        far = reach + scene.circles[k, 2]
         if k == guess or dx * dx + dy * dy >= far * far:
             continue
-        base, count = scene.ranges[k, 0] * EDGE_WIDTH, scene.ranges[k, 1]
-        found = search_edges(x, y, -1.0, scene.edges, base, nowhere, -1, count, 0, distance, normal)
+        found = search_block(x, y, -1.0, k, scene, 0, none, nor)
         if found.square < best.square:
             best, block, reach = found, k, math.sqrt(found.square)
     return best.signed, best.x, best.y, block
+
+
+@compiled
+def measure(points: Points, scene: PackedScene, distances: NDArray[np.float64], normal: NDArray[np.float64]) -> None:
+    """Write the signed distance of each point from each disc, then polygon, (m, s), and its gradient, (m, s, 2)."""
+    for s in range(distances.shape[1]):
+        guess = -1
+        for i in range(len(points)):
+            found = shape_distance(points[i, 0], points[i, 1], s, guess, scene)
+            distances[i, s], normal[i, s, 0], normal[i, s, 1], guess = found

@@ -15,7 +15,6 @@ from typing import Any
 import shapely
 import shapely.geometry
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene.mapping import (
     DISH_FIELDS,
@@ -28,18 +27,7 @@ from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape
 
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
-PROPERTIES = (
-    "name",
-    "kind",
-    "corner_radius",
-    "friction",
-    "radius",
-    "diameter",
-    "depth",
-    "wall_friction",
-    "self_contact",
-    "definition",
-)
+PROPERTIES = ("name", "kind", "corner_radius", "friction", "radius", "definition", *DISH_FIELDS)
 
 
 def scene_to_geojson(scene: Scene) -> dict[str, Any]:
@@ -76,11 +64,25 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
     dishes = [dish_from_mapping(content[DISH], source)] if DISH in content else []
     shapes: list[SceneShape] = []
     for index, feature in enumerate(features):
-        part = _FeatureReader(f"features[{index}]", feature, source)
-        if part.properties.get("kind") == DISH:
-            dishes.append(part.dish())
+        where = f"features[{index}]"
+        if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
+            raise scene_error(where, feature, "a Feature", source)
+        properties, geometry = feature.get("properties"), feature.get("geometry")
+        if not isinstance(properties, Mapping):
+            raise scene_error(f"{where}.properties", properties, "properties, of which name is needed", source)
+        for given in properties:
+            close = difflib.get_close_matches(given[:40], PROPERTIES, n=1, cutoff=0.85)
+            if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
+                expectation = f"no such property: {close[0]}?"
+                raise scene_error(f"{where}.properties.{given}", properties[given], expectation, source)
+        if not isinstance(geometry, Mapping):
+            raise scene_error(f"{where}.geometry", geometry, "a Point, Polygon or MultiPolygon", source)
+        if properties.get("kind") == DISH:
+            dishes.append(_dish(properties, geometry, source))
+        elif isinstance(name := properties.get("name"), str):
+            shapes += _shapes(name, properties, geometry, source)
         else:
-            shapes += part.shapes()
+            raise scene_error(f"{where}.properties.name", name, "a name", source)
     if len(dishes) != 1:
         expectation = f"one: the member {DISH}, or a feature of kind {DISH}"
         raise scene_error(DISH, f"{len(dishes)} dishes" if dishes else "no dish", expectation, source)
@@ -104,91 +106,45 @@ def _feature(shape: SceneShape) -> dict[str, Any]:
     return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(solid)}
 
 
-class _FeatureReader:
-    """One feature of a file.
+def _dish(properties: Mapping[str, Any], geometry: Mapping[str, Any], source: str) -> Dish:
+    if geometry.get("type") != "Point" or _planar(geometry.get("coordinates")) != [0.0, 0.0]:
+        raise scene_error(f"{DISH}.geometry", geometry, "a Point at 0, 0, the dish's centre", source)
+    return dish_from_mapping(
+        {name: properties[name] for name in DISH_FIELDS if properties.get(name) is not None}, source
+    )
 
-    Args:
-        where: it stands in the file.
-        feature: as the file has it.
-        source: the file.
 
-    Attributes:
-        properties: of the feature.
-    """
+def _shapes(name: str, properties: Mapping[str, Any], geometry: Mapping[str, Any], source: str) -> Iterator[SceneShape]:
+    """Yield the shapes of a feature: one, or one for each part of a MultiPolygon."""
+    kind, coordinates = geometry.get("type"), geometry.get("coordinates")
+    common = {"kind": properties.get("kind") or "tissue"}
+    common |= {key: properties[key] for key in ("friction", "corner_radius") if properties.get(key) is not None}
+    if kind == "Point":
+        common.pop("corner_radius", None)
+        fields = {"center": _planar(coordinates), "radius": properties.get("radius")}
+        yield _defined(shape_from_mapping(name, {**common, "disc": fields}, source), properties, source)
+        return
+    if kind not in ("Polygon", "MultiPolygon"):
+        raise scene_error(f"{name}.geometry.type", kind, "Point, Polygon or MultiPolygon", source)
+    parts: Any = [coordinates] if kind == "Polygon" else coordinates
+    if not (_is_list(parts) and 0 < len(parts) <= MAX_SHAPES and all(_is_list(part) and part for part in parts)):
+        raise scene_error(f"{name}.geometry.coordinates", parts, "lists of rings of points", source)
+    for number, rings in enumerate(parts, 1):
+        outline, *holes = ([_planar(p) for p in ring] if _is_list(ring) else ring for ring in rings)
+        own = name if len(parts) == 1 else f"{name}_{number}"
+        shape = shape_from_mapping(own, {**common, "polygon": {"outline": outline, "holes": holes}}, source)
+        yield _defined(shape, properties, source) if len(parts) == 1 else shape
 
-    def __init__(self, where: str, feature: Any, source: str) -> None:
-        self._source = source
-        if not isinstance(feature, Mapping) or feature.get("type") != "Feature":
-            raise scene_error(where, feature, "a Feature", source)
-        properties, geometry = feature.get("properties"), feature.get("geometry")
-        if not isinstance(properties, Mapping):
-            raise scene_error(f"{where}.properties", properties, "properties, of which name is needed", source)
-        self.properties: Mapping[str, Any] = properties
-        if properties.get("kind") != DISH:
-            name = properties.get("name")
-            if not isinstance(name, str):
-                raise scene_error(f"{where}.properties.name", name, "a name", source)
-            where = name
-        self._where = where
-        for given in properties:
-            close = difflib.get_close_matches(given[:40], PROPERTIES, n=1, cutoff=0.85)
-            if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
-                raise self._error(f"properties.{given}", properties[given], f"no such property: {close[0]}?")
-        if not isinstance(geometry, Mapping):
-            raise self._error("geometry", geometry, "a Point, Polygon or MultiPolygon")
-        self._type, self._coordinates = geometry.get("type"), geometry.get("coordinates")
 
-    def dish(self) -> Dish:
-        """Return the dish."""
-        if self._type != "Point" or _planar(self._coordinates) != [0.0, 0.0]:
-            raise self._error("geometry", [self._type, self._coordinates], "a Point at 0, 0, the dish's centre")
-        given = self.properties
-        fields = {name: given[name] for name in DISH_FIELDS if given.get(name) is not None}
-        if "diameter" not in fields and "radius" in given:
-            raise self._error("properties.radius", given["radius"], "diameter, for a dish")
-        return dish_from_mapping(fields, self._source)
-
-    def shapes(self) -> Iterator[SceneShape]:
-        """Yield the shapes of the feature: one, or one for each part of a MultiPolygon."""
-        common = {"kind": self.properties.get("kind") or "tissue"}
-        if self.properties.get("friction") is not None:
-            common["friction"] = self.properties["friction"]
-        if self._type == "Point":
-            fields = {"center": _planar(self._coordinates), "radius": self.properties.get("radius")}
-            yield self._from_definition(self._shape(self._where, {**common, "disc": fields}))
-            return
-        parts: Any = [self._coordinates] if self._type == "Polygon" else self._coordinates
-        if self._type not in ("Polygon", "MultiPolygon"):
-            raise self._error("geometry.type", self._type, "Point, Polygon or MultiPolygon")
-        if (
-            not _is_list(parts)
-            or not 0 < len(parts) <= MAX_SHAPES
-            or not all(_is_list(part) and part for part in parts)
-        ):
-            raise self._error("geometry.coordinates", parts, "lists of rings of points")
-        if self.properties.get("corner_radius") is not None:
-            common["corner_radius"] = self.properties["corner_radius"]
-        for number, rings in enumerate(parts, 1):
-            outline, *holes = ([_planar(p) for p in ring] if _is_list(ring) else ring for ring in rings)
-            name = self._where if len(parts) == 1 else f"{self._where}_{number}"
-            shape = self._shape(name, {**common, "polygon": {"outline": outline, "holes": holes}})
-            yield self._from_definition(shape) if len(parts) == 1 else shape
-
-    def _shape(self, name: str, description: Mapping[str, Any]) -> SceneShape:
-        return shape_from_mapping(name, description, self._source)
-
-    def _error(self, part: str, value: Any, expectation: str) -> ConfigurationError:
-        return scene_error(f"{self._where}.{part}", value, expectation, self._source)
-
-    def _from_definition(self, shape: SceneShape) -> SceneShape:
-        """Return the shape of the property `definition`, where it still matches the geometry."""
-        definition = self.properties.get("definition")
-        if definition is None:
-            return shape
-        if not isinstance(definition, Mapping):
-            raise self._error("properties.definition", definition, "a shape as in a scene file")
-        defined = self._shape(shape.name, {**definition, "kind": shape.kind, "friction": shape.friction})
-        return defined if _same(defined.geometry, shape.geometry) else shape
+def _defined(shape: SceneShape, properties: Mapping[str, Any], source: str) -> SceneShape:
+    """Return the shape of the property `definition`, where it still matches the geometry."""
+    definition = properties.get("definition")
+    if definition is None:
+        return shape
+    if not isinstance(definition, Mapping):
+        raise scene_error(f"{shape.name}.properties.definition", definition, "a shape as in a scene file", source)
+    defined = shape_from_mapping(shape.name, {**definition, "kind": shape.kind, "friction": shape.friction}, source)
+    return defined if _same(defined.geometry, shape.geometry) else shape
 
 
 def _is_list(value: Any) -> bool:

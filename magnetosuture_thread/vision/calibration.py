@@ -18,19 +18,15 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.dish.find import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
-from magnetosuture_thread.vision.needle.size import FRAMES, SET_TOLERANCE
+from magnetosuture_thread.vision.needle.arc import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
-STRAIGHT_RATIO = (
-    2.0  # of the residuals of a similarity and a homography; beyond, and beyond `STRAIGHT_PX`, it is tilted
-)
-STRAIGHT_PX = 0.3
+STRAIGHT_PX = 0.3  # residual of a similarity; beyond, and beyond twice that of a homography, the camera is tilted
 MAX_TILT = math.radians(35.0)
 MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
-SHARE_WITH_DISH = 0.5  # of the frames must show the dish
 
 
 @dataclass(frozen=True)
@@ -114,7 +110,7 @@ def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Cal
     """
     grays = _grays(images)
     views = [view for view in (find_dish(gray, dish_diameter) for gray in grays) if view is not None]
-    if not views or len(views) < SHARE_WITH_DISH * len(grays):
+    if not views or len(views) < 0.5 * len(grays):
         raise InvalidInputError("frames", f"{len(views)} of {len(grays)} with a dish", "a dish in at least half")
     circles = np.array([(*view.centre_px, 0.5 * dish_diameter / view.metres_per_pixel) for view in views])
     u, v, radius = np.median(circles, axis=0) if len(circles) > 2 else circles.mean(axis=0)
@@ -169,7 +165,7 @@ def calibrate_by_markers(
     view, residual = _similarity(points, pixels)
     homography = None
     tilted = _homography(points, pixels) if residual > STRAIGHT_PX else None
-    if tilted is not None and tilted[2] < residual / STRAIGHT_RATIO:
+    if tilted is not None and tilted[2] < 0.5 * residual:
         view, homography, residual = tilted
     if residual > MAX_RESIDUAL_PX:
         expected = f"at most {MAX_RESIDUAL_PX} px, from a camera above markers at these distances"

@@ -1,21 +1,26 @@
-"""Images: from bytes to pixels, and what of them is measured on."""
+"""Images: from bytes to pixels, and what of them is measured on.
+
+Size and orientation are read from the first bytes, before anything is decoded: a megabyte may decode to gigabytes.
+"""
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.untrusted import MAX_PIXELS
-from magnetosuture_thread.vision.image_header import image_header
-from magnetosuture_thread.vision.sampling import distances, median_of_windows, sample_inside
+from magnetosuture_thread.vision.sampling import distances, sample_inside
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
+JPEG_SIZES = (*range(0xC0, 0xC4), *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # segments with a size
+MAX_SEGMENTS = 10_000  # of a JPEG or PNG before its pixels
+ORIENTATION = 274  # TIFF's tag, which EXIF has too
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
 FLOOR_CELLS = 9  # side of the median window on that grid: wider than a needle, a thread, a speck
@@ -66,13 +71,6 @@ class Picture:
     mask: SceneMask | None
     image: np.ndarray
 
-    @cached_property
-    def luminance(self) -> Layer:
-        """How bright each pixel looks: of the three colours the mean by which a JPEG is coded, with the least noise."""
-        if self.image.ndim == 2:
-            return self.darkest
-        return _channel(cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY), self.factor, self.mask)
-
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
@@ -114,8 +112,7 @@ def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:
     rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
     if mask is not None:
         rough = mask.show_floor(rough)
-    floor = np.empty_like(rough)
-    median_of_windows(np.ascontiguousarray(rough), FLOOR_CELLS // 2, floor)
+    floor = cv2.medianBlur(rough, FLOOR_CELLS)
     return Layer(pixels, small, cv2.resize(floor, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
@@ -249,3 +246,109 @@ def check_image(image: np.ndarray) -> None:
 def measured_channel(image: np.ndarray) -> np.ndarray:
     """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
     return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
+
+
+class ImageHeader(NamedTuple):
+    """What a picture says of itself.
+
+    Attributes:
+        width: columns.
+        height: rows.
+        orientation: by EXIF, 1 to 8; 1 is upright, and what a picture without any has.
+    """
+
+    width: int
+    height: int
+    orientation: int = 1
+
+
+def image_header(data: bytes | memoryview) -> ImageHeader | None:
+    """Return size and orientation of a JPEG, PNG, BMP, TIFF or WebP; None where the bytes are none of them."""
+    view = memoryview(data)
+    begin = bytes(view[:32])
+    try:
+        if begin.startswith(b"\xff\xd8"):
+            return _jpeg(view)
+        if begin.startswith(b"\x89PNG\r\n\x1a\n"):
+            width, height = struct.unpack_from(">II", view, 16)
+            return ImageHeader(width, height, _png_orientation(view))
+        if begin.startswith(b"BM"):
+            width, height = struct.unpack_from("<ii", view, 18)
+            return ImageHeader(abs(width), abs(height))
+        if begin[:4] in (b"II*\0", b"MM\0*"):
+            tags = _tags(view)
+            return ImageHeader(tags[256], tags[257], tags.get(ORIENTATION, 1))
+        if begin.startswith(b"RIFF") and begin[8:12] == b"WEBP":
+            return _webp(view, begin[12:16])
+    except (struct.error, LookupError, ValueError):
+        pass
+    return None
+
+
+def _jpeg(view: memoryview) -> ImageHeader | None:
+    at, orientation = 2, 1
+    for _ in range(MAX_SEGMENTS):
+        window = bytes(view[at : at + 4096])
+        at += window.index(b"\xff")  # as decoders do: what is between segments is skipped
+        window = window[window.index(b"\xff") :]
+        at += len(window) - len(window.lstrip(b"\xff"))
+        kind = view[at]
+        at += 1
+        if kind in (0x01, *range(0xD0, 0xD9)):  # without a length
+            continue
+        (length,) = struct.unpack_from(">H", view, at)
+        if kind in JPEG_SIZES:
+            height, width = struct.unpack_from(">HH", view, at + 3)
+            return ImageHeader(width, height, orientation)
+        if kind == 0xE1 and bytes(view[at + 2 : at + 8]) == b"Exif\0\0":
+            orientation = _exif_orientation(view[at + 8 : at + length])
+        if kind == 0xDA:
+            return None
+        at += max(length, 2)
+    return None
+
+
+def _png_orientation(view: memoryview) -> int:
+    at = 8
+    for _ in range(MAX_SEGMENTS):
+        if at + 8 > len(view):
+            break
+        length, kind = struct.unpack_from(">I4s", view, at)
+        if kind == b"eXIf":
+            return _exif_orientation(view[at + 8 : at + 8 + length])
+        at += 12 + length
+    return 1
+
+
+def _webp(view: memoryview, kind: bytes) -> ImageHeader | None:
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(view[at : at + 3], "little") + 1 for at in (24, 27))
+        return ImageHeader(width, height)
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", view, 21)
+        return ImageHeader((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", view, 26)
+        return ImageHeader(width & 0x3FFF, height & 0x3FFF)
+    return None
+
+
+def _exif_orientation(exif: memoryview) -> int:
+    try:
+        return _tags(exif).get(ORIENTATION, 1)
+    except (struct.error, LookupError):
+        return 1
+
+
+def _tags(view: memoryview) -> dict[int, int]:
+    """Return the numbers in the first directory of a TIFF, by tag."""
+    order = {b"II": "<", b"MM": ">"}[bytes(view[:2])]
+    (start,) = struct.unpack_from(f"{order}I", view, 4)
+    (count,) = struct.unpack_from(f"{order}H", view, start)
+    tags = {}
+    for index in range(min(count, 1000)):
+        at = start + 2 + 12 * index
+        tag, kind, number = struct.unpack_from(f"{order}HHI", view, at)
+        if kind in (1, 3, 4) and number == 1:
+            (tags[tag],) = struct.unpack_from(order + " B HI"[kind], view, at + 8)
+    return tags

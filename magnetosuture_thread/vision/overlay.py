@@ -19,10 +19,7 @@ from magnetosuture_thread.vision.scene_mask import mask_outlines
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
-NEEDLE, TIP, THREAD, DISH = (40, 140, 255), (40, 200, 255), (70, 190, 60), (200, 170, 60)
-UNPLACED, HIDDEN = (60, 60, 220), (170, 130, 170)  # a piece of unknown place; what hides the thread
-DASH_PX, GAP_PX = 4.0, 8.0  # of the line between two pieces, and from one dash to the next
-SHAPE = (190, 90, 170)
+NEEDLE, THREAD, DISH = (40, 140, 255), (70, 190, 60), (200, 170, 60)
 PLATES = {State.TRACKED: (70, 150, 50), State.LOST: (50, 50, 200), State.SEARCHING: (160, 120, 40)}
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -57,7 +54,7 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
         axis = view.to_pixels(points)
         _line(drawn, axis, NEEDLE, unit)
         _circle(drawn, axis[0], 4.0 * unit, NEEDLE, unit)
-        _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, TIP, -1)
+        _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, (40, 200, 255), -1)
     _plate(drawn, track, title, unit)
     return drawn
 
@@ -67,7 +64,7 @@ def draw_scene(image: np.ndarray, view: DishView, scene: Scene) -> None:
     _circle(image, np.asarray(view.centre_px), scene.dish.radius / view.metres_per_pixel, DISH, 1)
     for geometry in scene.obstacles:
         for ring in mask_outlines(geometry):
-            _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), SHAPE, 1)
+            _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), (190, 90, 170), 1)
 
 
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:
@@ -140,12 +137,12 @@ def _pieces(image: np.ndarray, view: DishView, observation: ThreadObservation, u
     """Draw what is seen of the thread, and what may hide the rest of it."""
     if not observation.complete:
         for outline in observation.hidden:
-            _line(image, view.to_pixels(np.vstack([outline, outline[:1]])), HIDDEN, 1)
+            _line(image, view.to_pixels(np.vstack([outline, outline[:1]])), (170, 130, 170), 1)
     before: np.ndarray | None = None
     for piece in observation.pieces:
         line = view.to_pixels(piece.points)
         placed = bool(np.isfinite(piece.arc_length[0]))
-        colour = THREAD if placed else UNPLACED
+        colour = THREAD if placed else (60, 60, 220)
         if placed and before is not None:
             _dashes(image, before, line[0], THREAD, unit)
         before = line[-1] if placed else None
@@ -158,8 +155,8 @@ def _pieces(image: np.ndarray, view: DishView, observation: ThreadObservation, u
 def _dashes(image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int], unit: int) -> None:
     length = float(np.hypot(*(end - start)))
     along = (end - start) / max(length, 1e-9)
-    for at in np.arange(0.0, length, GAP_PX * unit):
-        _line(image, start + along * np.array([[at], [min(at + DASH_PX * unit, length)]]), colour, unit)
+    for at in np.arange(0.0, length, 8.0 * unit):
+        _line(image, start + along * np.array([[at], [min(at + 4.0 * unit, length)]]), colour, unit)
 
 
 def _plate(image: np.ndarray, track: Track, title: str, unit: int) -> None:

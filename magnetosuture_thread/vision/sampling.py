@@ -1,4 +1,4 @@
-"""Compiled loops over pixels: a point between pixels, a straightened strip, the rim along rays."""
+"""Compiled loops over pixels: medians, a point between pixels, a straightened strip."""
 
 from __future__ import annotations
 
@@ -15,42 +15,6 @@ def middle(values: np.ndarray) -> float:
     """Return the median of values of any shape, the upper one of two; numpy's own takes ten times as long."""
     half = values.size // 2
     return float(np.partition(values, half, axis=None)[half])
-
-
-@compiled
-def median_of_windows(image, half, result):
-    """Fill in the median of a square window around each pixel of a small image, as OpenCV's in two thirds of its time.
-
-    Args:
-        image: shape (rows, columns), uint8; outside, the nearest pixel of its border.
-        half: the window's side is 2 half + 1.
-        result: filled, of the same shape.
-    """
-    rows, columns = image.shape
-    rank = (2 * half + 1) ** 2 // 2
-    counts = np.empty(256, np.int32)
-    for row in range(rows):
-        counts[:] = 0
-        for i in range(-half, half + 1):
-            for j in range(-half, half + 1):
-                counts[image[min(max(row + i, 0), rows - 1), min(max(j, 0), columns - 1)]] += 1
-        below, level = 0, 0  # pixels of the window that are darker than the level
-        for column in range(columns):
-            if column > 0:
-                left, right = max(column - half - 1, 0), min(column + half, columns - 1)
-                for i in range(-half, half + 1):
-                    at = min(max(row + i, 0), rows - 1)
-                    old, new = image[at, left], image[at, right]
-                    counts[old] -= 1
-                    counts[new] += 1
-                    below += (new < level) - (old < level)
-            while below > rank:
-                level -= 1
-                below -= counts[level]
-            while below + counts[level] <= rank:
-                below += counts[level]
-                level += 1
-            result[row, column] = level
 
 
 @compiled
@@ -173,75 +137,3 @@ def straighten_both(one, other, start, first, aside, strip, other_strip):
         ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
         x, y = x + chord * ahead, y + chord * down
         ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
-
-
-@compiled
-def _small_median(values, count, ordered):
-    """Return the median of the first few of some values, put in order into `ordered`, shape (count,)."""
-    for index in range(count):
-        place = index
-        while place > 0 and ordered[place - 1] > values[index]:
-            ordered[place] = ordered[place - 1]
-            place -= 1
-        ordered[place] = values[index]
-    return 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
-
-
-@compiled
-def rim_along_rays(gray, circle, reach, step, band, minimum, contrast, edges, darkest):
-    """Find a dish's rim along rays from its centre.
-
-    Args:
-        gray: shape (rows, columns), uint8.
-        circle: u, v and radius, about [px].
-        reach: how far inside and outside of the radius to look [px].
-        step: between samples [px].
-        band: how far beyond its inner edge the rim is darkest [px].
-        minimum: and `contrast`: the rim is darker than the floor by this in grey levels, and by that share.
-        contrast: see `least`.
-        edges: filled with where the light falls half-way to the rim's dark, shape (rays, 2).
-        darkest: filled with the rim's darkest points, shape (rays, 2).
-
-    Returns:
-        How many edges were found, and how many darkest points.
-    """
-    u, v, radius = circle
-    rays, count = len(edges), int(2.0 * reach / step)
-    profile = np.empty(count)
-    ahead = int(band / step) + 1
-    edge_count, dark_count = 0, 0
-    inner = max(3, count // 8)
-    ordered = np.empty(inner)
-    for ray in range(rays):
-        angle = 2.0 * math.pi * ray / rays
-        x, y = math.cos(angle), math.sin(angle)
-        for index in range(count):
-            r = radius - reach + index * step
-            profile[index] = within(gray, u + r * x, v + r * y)
-        inside = _small_median(profile, inner, ordered)
-        dark = profile.min()
-        if inside - dark < max(minimum, contrast * inside):
-            continue
-        half, index = 0.5 * (inside + dark), 0
-        while profile[index] >= half:
-            index += 1
-        if index == 0:
-            continue
-        part = (profile[index - 1] - half) / (profile[index - 1] - profile[index])
-        r = radius - reach + (index - 1 + part) * step
-        edges[edge_count, 0], edges[edge_count, 1] = u + r * x, v + r * y
-        edge_count += 1
-        end = min(index + ahead, count - 1)
-        lowest = index
-        for other in range(index, end + 1):
-            if profile[other] < profile[lowest]:
-                lowest = other
-        if 0 < lowest < end:
-            left, low, right = profile[lowest - 1], profile[lowest], profile[lowest + 1]
-            bend = left - 2.0 * low + right
-            # Beyond its darkest ring a rim is brighter again; a plain edge has no such ring.
-            if bend > 0.0 and profile[lowest : end + 1].max() > low + 0.5 * minimum:
-                r = radius - reach + (lowest + 0.5 * (left - right) / bend) * step
-                darkest[dark_count, 0], darkest[dark_count, 1] = u + r * x, v + r * y
-                dark_count += 1
-    return edge_count, dark_count

@@ -22,10 +22,7 @@ from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.scene.scene import Scene
 
-DISC_VERTICES = 128
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
-COVERED_SHARE = 0.1  # of a cell, covered by shapes, from which it does not show the floor
-RIM_STEP_PX = 4.0
 OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
 Mask = NDArray[np.uint8]
@@ -138,7 +135,7 @@ def scene_mask(
         tolerance_px,
         _rim(scene, view),
         factor,
-        _nearest_uncovered(cells > COVERED_SHARE * 255.0),
+        _nearest_uncovered(cells > 0.1 * 255.0),
         cell,
     )
 
@@ -146,7 +143,7 @@ def scene_mask(
 def mask_outlines(geometry: Disc | Polygon) -> list[Points]:
     """Return the rings of a shape, a disc as a polygon, each of shape (m, 2) [m]."""
     if isinstance(geometry, Disc):
-        turn = np.linspace(0.0, 2.0 * np.pi, DISC_VERTICES, endpoint=False)
+        turn = np.linspace(0.0, 2.0 * np.pi, 128, endpoint=False)
         return [np.asarray(geometry.centre) + geometry.radius * np.column_stack([np.cos(turn), np.sin(turn)])]
     return geometry.rings
 
@@ -171,7 +168,7 @@ def _rim(scene: Scene, view: DishView) -> Points:
     for index, geometry in enumerate(scene.obstacles):
         for ring in mask_outlines(geometry):
             closed = view.to_pixels(np.vstack([ring, ring[:1]]))
-            points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], RIM_STEP_PX))
+            points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], 4.0))
             parts.append(np.column_stack([points, np.full(len(points), float(index))]))
     return np.vstack(parts)
 

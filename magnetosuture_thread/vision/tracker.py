@@ -10,44 +10,21 @@ import numpy as np
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.vision.dish.watch import DishWatch
-from magnetosuture_thread.vision.images import (
-    FLOOR_FACTOR,
-    Picture,
-    check_image,
-    shrunk,
-)
+from magnetosuture_thread.vision.dish.watch import DishWatch, FoundDish
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, shrunk
 from magnetosuture_thread.vision.lens import Lens
-from magnetosuture_thread.vision.look import (
-    FoundDish,
-    State,
-    Track,
-    centreline_of,
-    look_once,
-    mask_of,
-    needles_in,
-    no_pose,
-    picture_of,
-    tilted,
-    tracked,
-    why_none,
-    with_thread,
-)
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.needle.size import LengthEstimator
+from magnetosuture_thread.vision.look import FrameReader, State, Track, look_once, mask_of, no_pose, why_none
+from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was wound back
-GATE_PX = 3.0  # that a needle may be off its prediction, beside what its greatest speed allows
-GATE_ANGLE = math.radians(6.0)
+GATE_PX, GATE_ANGLE = 3.0, math.radians(6.0)  # off the prediction, beside what the needle's greatest speed allows
 MAX_PREDICTION = 0.2  # s; a motion is not extrapolated farther
 SMOOTHING = 0.5  # weight of the newest velocity
-MARGIN_PX = 32.0  # around the needle and the thread, that is looked at
-BORDER_PX = 20.0  # a thread that ends so near to the region's border may go on
+MARGIN_PX, BORDER_PX = 32.0, 20.0  # around needle and thread, that is looked at; from its border, where one may go on
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
-MASKS = 8  # kept
-MIN_SHARE = 0.9  # of the thread seen before; if less is seen in the region, the whole frame is looked at
+MIN_SHARE = 0.9  # of the thread before; if less is visible in the region, the whole frame is looked at
 
 
 @dataclass(frozen=True)
@@ -198,15 +175,17 @@ class VisionTracker:
             return no_pose(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
+        assert self._dish.found is not None
         mask = self._mask_for(image, view)
-        chosen, picture, reason = self._choose(image, view, mask, time_s)
+        reader = FrameReader(self._settings, self._dish.found, self._scene.dish.radius, mask)
+        chosen, picture, reason = self._choose(image, reader, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
         whole = picture.shape == image.shape[:2]
-        found = self._tracked(picture, view, chosen, search=whole)
+        found = self._read(reader, picture, chosen, search=whole)
         if not whole and self._is_cut(found, picture):
-            picture, chosen = _in_whole(picture, chosen, picture_of(image, view, self._settings, mask))
-            found = self._tracked(picture, view, chosen, search=True)
+            chosen, picture = chosen.shifted(picture.origin), reader.picture(image)
+            found = self._read(reader, picture, chosen, search=True)
         if not chosen.heading_known:
             return found
         if chosen.size_measured:
@@ -216,13 +195,9 @@ class VisionTracker:
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
 
-    def _tracked(self, picture: Picture, view: DishView, needle: MeasuredNeedle, *, search: bool) -> Track:
+    def _read(self, reader: FrameReader, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> Track:
         """Return what a frame shows whose needle is known."""
-        diameter = self._scene.dish.diameter
-        walk, _ = centreline_of(picture, view, self._settings, diameter, needle)
-        assert self._dish.found is not None
-        found = tracked(picture, view, self._settings, needle, walk, diameter, self._missing(), search=search)
-        return tilted(found, self._dish.found, self._scene.dish.radius)
+        return reader.track(picture, needle, reader.centreline(picture, needle), self._missing(), search=search)
 
     def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
@@ -234,9 +209,9 @@ class VisionTracker:
         rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
         key = (rounded, image.shape[:2])
         if key not in self._masks:
-            if len(self._masks) >= MASKS:
+            if len(self._masks) >= 8:
                 self._masks.clear()
-            self._masks[key] = mask_of(image, rounded, self._settings, self._scene)
+            self._masks[key] = mask_of(image.shape, rounded, self._settings, self._scene)
         return self._masks[key]
 
     def _advance(self, time_s: float) -> None:
@@ -267,37 +242,34 @@ class VisionTracker:
         return State.LOST if self._last is not None else State.SEARCHING
 
     def _choose(
-        self, image: np.ndarray, view: DishView, mask: SceneMask | None, time: float
+        self, image: np.ndarray, reader: FrameReader, time: float
     ) -> tuple[MeasuredNeedle | None, Picture | None, str]:
         """Return the needle of this frame and the picture it is in, or why there is none."""
-        diameter = self._scene.dish.diameter
-        if self._last is not None:
-            _, angle = self._last.at(time)
+        view, last = reader.dish.view, self._last
+        if last is not None:
+            _, angle = last.at(time)
             toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = picture_of(image, view, self._settings, mask, self._region(image, view, time))
-            needles, _ = needles_in(picture, view, self._settings, diameter, toward, self._length)
+            picture = reader.picture(image, self._region(image, view, time))
+            needles, _ = reader.needles(picture, self._length, toward)
             needles = [self._as_before(needle, picture, view, time) for needle in needles]
-            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
+            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), last)]
             if len(within) == 1:
-                self._take(_pose(within[0], picture, view, time), self._last)
+                self._take(_pose(within[0], picture, view, time), last)
                 return within[0], picture, ""
-        picture = picture_of(image, view, self._settings, mask)
-        needles, refused = needles_in(picture, view, self._settings, diameter, estimator=self._length)
+        picture = reader.picture(image)
+        needles, refused = reader.needles(picture, self._length)
         needles = [self._as_before(needle, picture, view, time) for needle in needles]
-        if self._last is not None and len(needles) > 1:
-            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), self._last)]
-            needles = within if len(within) == 1 else needles
+        within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), last)]
         if not needles:
             self._anew = []
             return None, None, why_none(refused)
-        chosen: MeasuredNeedle | None = needles[0]
-        chosen, reason = self._one_of(needles, picture, view, time)
+        chosen, _, reason = (within[0], None, "") if len(within) == 1 else reader.with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
             return chosen, picture, reason
         pose = _pose(chosen, picture, view, time)
-        if self._last is not None and self._fits(pose, self._last):
-            self._take(pose, self._last)
+        if self._fits(pose, last):
+            self._take(pose, last)
             return chosen, picture, ""
         if self._anew and not self._fits(pose, self._anew[-1]):
             self._anew = []
@@ -305,7 +277,7 @@ class VisionTracker:
         if len(self._anew) >= self._settings.confirm_frames:
             self._take(pose, self._anew[-2] if len(self._anew) > 1 else None)
             return chosen, picture, ""
-        if self._last is not None:
+        if last is not None:
             return None, None, "a needle farther from the last one than it can move"
         return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
 
@@ -323,21 +295,10 @@ class VisionTracker:
         fits = [self._fits(_pose(each, picture, view, time), self._last) for each in (needle, other)]
         return other if fits == [False, True] else needle
 
-    def _one_of(
-        self, needles: list[MeasuredNeedle], picture: Picture, view: DishView, time: float
-    ) -> tuple[MeasuredNeedle | None, str]:
-        """Return the needle that is where the last one was, or that a thread leaves; or why there is none."""
-        if (
-            self._last is not None
-            and len(needles) == 1
-            and self._fits(_pose(needles[0], picture, view, time), self._last)
-        ):
-            return needles[0], ""
-        chosen, _, reason = with_thread(picture, view, self._settings, self._scene.dish.diameter, needles)
-        return chosen, reason
-
-    def _fits(self, pose: _Pose, last: _Pose) -> bool:
+    def _fits(self, pose: _Pose, last: _Pose | None) -> bool:
         """Say whether a needle can have come from where it was last."""
+        if last is None:
+            return False
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
         assert self._dish.view is not None
@@ -387,11 +348,6 @@ def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float)
     heading = view.directions_to_dish(needle.direction_px)
     tail = view.to_dish(needle.tail_edge_px + picture.origin)
     return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear)
-
-
-def _in_whole(part: Picture, needle: MeasuredNeedle, whole: Picture) -> tuple[Picture, MeasuredNeedle]:
-    """Return the whole frame, and a needle of a part of it in the whole frame's pixels."""
-    return whole, needle.shifted(part.origin)
 
 
 def _length(points: np.ndarray) -> float:

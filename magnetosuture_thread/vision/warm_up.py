@@ -10,12 +10,10 @@ from magnetosuture_thread.vision.dish.ellipse import find_ellipse
 from magnetosuture_thread.vision.dish.find import rim_shift
 from magnetosuture_thread.vision.images import Wall
 from magnetosuture_thread.vision.look import look_once
-from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
+from magnetosuture_thread.vision.needle.measure import axis_guesses
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.cross_section import BEND_PRICE, MAX_CHANGE, smoothest
-from magnetosuture_thread.vision.thread.forks import worth
 from magnetosuture_thread.vision.thread.pieces import fresh_parts
-from magnetosuture_thread.vision.thread.walk import walk_on
+from magnetosuture_thread.vision.thread.walk import Ridge, walk_on, worth
 
 
 def warm_up() -> bool:
@@ -43,18 +41,17 @@ def warm_up() -> bool:
 def _run_rare(image: np.ndarray) -> None:
     """Run the compiled functions that a plain frame does not reach.
 
-    They are for a dish without a rim, a needle at the wall or in one dark thing with its thread, a pale or wide thread,
-    crossings, and pieces behind covers.
+    They are for a dish without a rim, a needle at the wall or in one dark thing with its thread, crossings, and pieces
+    behind covers.
     """
     find_ellipse(image)
     Wall((320.0, 240.0), 218.0).distances((slice(0, 2), slice(0, 2)))
     core = np.zeros((60, 60), np.uint8)
     core[10, 5:55] = core[10:50, 54] = core[49, 5:55] = 1  # long and winding
     axis_guesses(cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0, 30.0, 5.0)
-    smoothest(np.zeros((2, 3)), BEND_PRICE, MAX_CHANGE)
     line = np.array([[0.0, 0.0], [30.0, 0.0]])
     fresh_parts(line, [line])
     path, strong = np.zeros((8, 6)), np.zeros(8, np.bool_)
     nothing = np.zeros((16, 16), np.uint8)
-    walk_on(nothing, nothing, 1, 1.0, 1.0, 1.0, (8.0, 8.0, 8.0), 4.0, path, strong, 1, 9.0, np.empty((0, 3)))
+    walk_on(Ridge(nothing, nothing, 1, 1.0, 1.0), (8.0, 8.0, 8.0), 4.0, path, strong, 1, 9.0, np.empty((0, 3)))
     worth(path, strong, 1)

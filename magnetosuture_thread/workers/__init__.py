@@ -1,12 +1,12 @@
 """Many independent tasks on several processors: processes of this machine, or the workers of a Dask cluster.
 
 Without a scheduler's address the process pool runs them, not a local Dask cluster: it takes less processor time to
-start (docs/results.md), needs no further packages, and its processes end with this one however that ends.
+start, needs no further packages, and its processes end with this one however that ends.
 """
 
 from __future__ import annotations
 
-from magnetosuture_thread.workers.runner import Log, Progress, TaskRunner, Work, WorkerDiedError
+from magnetosuture_thread.workers.pool import Log, Progress, TaskRunner, Work, WorkerDiedError, WorkerPool
 
 __all__ = ["Log", "Progress", "TaskRunner", "Work", "WorkerDiedError", "make_runner"]
 
@@ -23,6 +23,4 @@ def make_runner(work: Work, workers: int, scheduler: str = "") -> TaskRunner:
         from magnetosuture_thread.workers.cluster import ClusterRunner  # which needs the extra `cluster`
 
         return ClusterRunner(work, scheduler)
-    from magnetosuture_thread.workers.pool import WorkerPool
-
     return WorkerPool(work, workers)

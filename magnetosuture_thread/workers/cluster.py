@@ -15,9 +15,10 @@ import dask
 from distributed import Client, KilledWorker, as_completed, get_worker
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.workers.runner import Log, Progress, Work, WorkerDiedError
+from magnetosuture_thread.workers.pool import Log, Progress, Work, WorkerDiedError
 
-CONNECT_TIMEOUT = 20.0  # s
+CONNECT_TIMEOUT = 20.0  # s to reach the scheduler
+WORKERS_TIMEOUT = 60.0  # s for its first worker, which may still start
 # A result has the same bits only where these are the same. OpenCV comes by pip or as Ubuntu's package.
 SOFTWARE = ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp")
 MAX_WORK_BYTES = "1 GB"  # of the work, sent once; Dask warns beyond 10 MB, which a few recorded runs have
@@ -27,19 +28,18 @@ _ONE_AT_A_TIME = threading.Lock()  # in a worker of several threads: matplotlib 
 class ClusterRunner:
     """Workers of a Dask cluster that run tasks; implements `TaskRunner`.
 
-    A worker that is lost takes nothing with it: Dask repeats its tasks on others. Dask gives up a task that was on
-    four lost workers, whichever task ended them: each such task is repeated alone, and gives a `WorkerDiedError` only
-    where it ends workers then too. Log lines of a task come when it ends. Whatever ends the context cancels what has
-    not begun; what a worker has begun it still ends, for nobody. The software of a worker is compared with this
-    process's on entering and again with each task, as a worker may join later, or come back with another version.
+    Dask repeats the tasks of a worker that is lost on others, and gives up a task that was on as many lost workers as
+    the scheduler allows, whichever task ended them: each such task is repeated alone, and gives a `WorkerDiedError`
+    only where it ends workers then too. Log lines of a task come when it ends. Whatever ends the context cancels what
+    has not begun; what a worker has begun it still ends. Each task compares the software of its worker with this
+    process's, as a worker may join later or come back with another version.
 
     Args:
         work: called with task, log and progress; can be pickled.
         address: of the scheduler.
 
     Raises:
-        ConfigurationError: on entering: there is no scheduler or no worker, or a worker has other software than this
-            process (`SOFTWARE`, or another minor version of Python), so that its results may differ.
+        ConfigurationError: on entering: there is no scheduler, or it has no workers.
     """
 
     def __init__(self, work: Work, address: str) -> None:
@@ -52,15 +52,14 @@ class ClusterRunner:
             self._client = Client(self._address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, asyncio.TimeoutError) as error:
             raise self._refused("the address of a running Dask scheduler", error) from None
-        self._software = _software()
         try:
-            self._check_workers()
+            self._client.wait_for_workers(1, timeout=WORKERS_TIMEOUT)
             with dask.config.set({"distributed.admin.large-graph-warning-threshold": MAX_WORK_BYTES}):
                 # A task of its own and not scattered data, which would be lost with the workers that hold it.
                 self._loaded = self._client.submit(pickle.loads, self._work, pure=False)
-        except BaseException:
+        except TimeoutError as error:
             self._client.close()
-            raise
+            raise self._refused("a scheduler with workers", error) from None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -73,26 +72,26 @@ class ClusterRunner:
         """Run tasks; see `TaskRunner`.
 
         Raises:
-            ConfigurationError: the scheduler is gone, or a worker that joined has other software.
+            ConfigurationError: the scheduler is gone, or a worker has other software than this process (`SOFTWARE`, or
+                another minor version of Python), so that its results may differ.
         """
-        done, suspects = 0, list[int]()
-        for index, result in self._run_at_once(tasks, range(len(tasks)), log):
+        done, lost = 0, list[int]()
+        for index, result in self._run_together(tasks, range(len(tasks)), log):
             if isinstance(result, WorkerDiedError):
-                suspects.append(index)
+                lost.append(index)
                 continue
             done += 1
             progress(done / len(tasks))
             yield index, result
-        for suspect in suspects:
-            for index, result in self._run_at_once(tasks, [suspect], log):
-                done += 1
-                progress(done / len(tasks))
-                yield index, result
+        for suspect in lost:  # alone, as another task may have ended their workers
+            yield from self._run_together(tasks, [suspect], log)
+            done += 1
+            progress(done / len(tasks))
 
-    def _run_at_once(self, tasks: Sequence[Any], indices: Sequence[int], log: Log) -> Iterator[tuple[int, Any]]:
+    def _run_together(self, tasks: Sequence[Any], indices: Sequence[int], log: Log) -> Iterator[tuple[int, Any]]:
+        software = _software()
         futures = {
-            self._client.submit(_run_task, self._loaded, tasks[index], self._software, pure=False): index
-            for index in indices
+            self._client.submit(_run_task, self._loaded, tasks[index], software, pure=False): index for index in indices
         }
         try:
             for future in as_completed(list(futures), loop=self._client.loop):
@@ -105,6 +104,8 @@ class ClusterRunner:
             result, lines = future.result()
         except _OtherSoftwareError as error:
             raise self._refused(*error.args) from None
+        except ModuleNotFoundError as error:
+            raise self._refused("workers with the same packages as here", error) from None
         except KilledWorker as error:
             return WorkerDiedError(" ".join(str(error).split()))
         except (asyncio.CancelledError, OSError) as error:
@@ -114,21 +115,6 @@ class ClusterRunner:
         for line in lines:
             log(line)
         return result
-
-    def _check_workers(self) -> None:
-        try:
-            self._client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
-        except TimeoutError as error:
-            raise self._refused("a scheduler with workers", error) from None
-        try:
-            found = self._client.run(_software)
-        except ModuleNotFoundError as error:
-            raise self._refused("workers with the same packages as here", error) from None
-        for worker, theirs in found.items():
-            try:
-                _require_same(self._software, theirs, worker)
-            except _OtherSoftwareError as error:
-                raise self._refused(*error.args) from None
 
     def _refused(self, expectation: str, problem: object) -> ConfigurationError:
         words = " ".join(str(problem).split())
@@ -150,21 +136,18 @@ def _run_task(work: Work, task: Any, software: Mapping[str, str]) -> tuple[Any, 
     Raises:
         _OtherSoftwareError: that of this worker is another.
     """
-    _require_same(software, _software_of_process(), get_worker().address)
+    for name, expected in software.items():
+        if (found := _software().get(name)) != expected:
+            problem = f"worker {get_worker().address} has {found or 'none'}"
+            raise _OtherSoftwareError(f"workers with {name} {expected}, as here", problem)
     lines: list[str] = []
     with _ONE_AT_A_TIME:
         return work(task, lines.append, lambda share: None), lines
 
 
-def _require_same(ours: Mapping[str, str], theirs: Mapping[str, str], worker: str) -> None:
-    for name, own in ours.items():
-        if theirs.get(name) != own:
-            raise _OtherSoftwareError(
-                f"workers with {name} {own}, as here", f"worker {worker} has {theirs.get(name) or 'none'}"
-            )
-
-
+@cache
 def _software() -> dict[str, str]:
+    """Return the versions of a process's software, looked up once: what is imported stays."""
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}
     for name in SOFTWARE:
         try:
@@ -172,9 +155,3 @@ def _software() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = ""
     return found
-
-
-@cache
-def _software_of_process() -> dict[str, str]:
-    """Return the software of a worker's process, looked up once: that takes 5 ms, and what is imported stays."""
-    return _software()

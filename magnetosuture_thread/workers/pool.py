@@ -7,28 +7,54 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, Protocol
 
-from magnetosuture_thread.workers.runner import Log, Progress, Work, WorkerDiedError
+Log = Callable[[str], None]
+Progress = Callable[[float], None]
+Work = Callable[[Any, Log, Progress], Any]
 
 # A worker is one of as many as there are processors for: what it uses must not start a thread for each of them.
 ONE_THREAD = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
     "OPENCV_FOR_THREADS_NUM",
 )
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # meant for the parent, which ends its workers itself
 
 
+class WorkerDiedError(Exception):
+    """A worker's process ended in the middle of a task, as when memory runs out."""
+
+
+class TaskRunner(Protocol):
+    """Runs tasks, each by one call of the same function; used as a context."""
+
+    def __enter__(self) -> TaskRunner:
+        """Return the runner."""
+
+    def __exit__(self, *_: object) -> None:
+        """End what still runs, whatever ended the context."""
+
+    def run(
+        self, tasks: Sequence[Any], log: Log = lambda text: None, progress: Progress = lambda share: None
+    ) -> Iterator[tuple[int, Any]]:
+        """Run tasks; yield the index and the result of each, or a `WorkerDiedError`, in the order in which they end.
+
+        An exception that a task raises is raised here.
+
+        Args:
+            tasks: can be pickled, like their results.
+            log: called with a line for a person.
+            progress: called with the share of all tasks done, 0 to 1.
+        """
+
+
 class WorkerPool:
-    """Processes of this machine that run tasks, each by one call of the same function; implements `TaskRunner`.
+    """Processes of this machine that run tasks; implements `TaskRunner`.
 
     With one worker or one task everything runs in this process. Else processes are started afresh (`spawn`): a fork
     would take along threads and locks of numba and OpenCV. Whatever ends the context, as Ctrl-C, ends the processes at
@@ -50,24 +76,15 @@ class WorkerPool:
 
     def __exit__(self, *_: object) -> None:
         """End the processes, whatever they are doing."""
-        for process in self._processes.values():
-            process.kill()
         for line, process in self._processes.items():
+            process.kill()
             process.join()
             line.close()
 
     def run(
         self, tasks: Sequence[Any], log: Log = lambda text: None, progress: Progress = lambda share: None
     ) -> Iterator[tuple[int, Any]]:
-        """Run tasks; give the index and the result of each, or a `WorkerDiedError`, in the order in which they end.
-
-        An exception that a task raises is raised here.
-
-        Args:
-            tasks: can be pickled, like their results.
-            log: called with a line for a person.
-            progress: called with the share of all tasks done, 0 to 1.
-        """
+        """Run tasks; see `TaskRunner`."""
         shares = [0.0] * len(tasks)
 
         def set_share(index: int, share: float) -> None:
@@ -98,7 +115,7 @@ class WorkerPool:
                     raise content
                 else:
                     index = busy.pop(ready)
-                    if ready in self._processes:
+                    if kind == "done":
                         idle.append(ready)
                     set_share(index, 1.0)
                     yield index, content
@@ -126,17 +143,14 @@ class WorkerPool:
 @contextmanager
 def _environment_of_workers() -> Iterator[None]:
     """Block `STOPS` and set `ONE_THREAD`; a process keeps both as they are when it starts."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    before = dict(os.environ)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        os.environ.clear()
+        os.environ.update(before)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 

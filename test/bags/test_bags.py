@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import Reader
 
@@ -63,27 +62,6 @@ def test_another_tool_reads_it_whole(good: Path):
         assert sum(1 for _ in reader.messages()) == COUNT
 
 
-def test_metadata_names_types_and_counts(good: Path):
-    information = yaml.safe_load((good.parent / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    assert information["storage_identifier"] == "mcap"
-    assert information["message_count"] == COUNT
-    assert information["relative_file_paths"] == [good.name]
-    assert [entry["message_count"] for entry in information["topics_with_message_count"]] == [200, 100]
-
-
-def test_own_messages_are_known(tmp_path: Path):
-    with BagWriter(tmp_path / "own") as bag:
-        for name in ("PredictedThread", "SafetyMargins", "CoilCurrents", "BarrierMargin"):
-            bag.add_topic(f"/{name}", f"magnetosuture_msgs/msg/{name}")
-        types = typestore().types
-        bag.write_message(
-            "/BarrierMargin", 5, types["magnetosuture_msgs/msg/BarrierMargin"]("obstacle", 7, 1, 0.5, 0.25, 0.2)
-        )
-    record = next(Bag(tmp_path / "own").records())
-    assert record.type_name == "magnetosuture_msgs/msg/BarrierMargin"
-    assert (record.decode().node, record.decode().clearance) == (7, 0.25)
-
-
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
 def test_bags_of_other_writers_are_read_and_their_damage_is_found(tmp_path: Path, compression: CompressionType):
     path = tmp_path / "other.mcap"
@@ -111,21 +89,6 @@ def test_bags_of_other_writers_are_read_and_their_damage_is_found(tmp_path: Path
     assert refused > 20
 
 
-def test_a_topic_with_two_types_is_refused_where_it_is_asked_for(tmp_path: Path):
-    path = tmp_path / "two.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2")
-        for name in (HEADER, "std_msgs/msg/String"):
-            channel = writer.register_channel("/one", "cdr", writer.register_schema(name, "ros2msg", b""))
-            writer.add_message(channel, 0, b"\0\1\0\0", 0)
-        writer.finish()
-    bag = Bag(path)
-    for ask in (lambda: bag.records({"/one"}), lambda: bag.require("/one", HEADER)):
-        with pytest.raises(BagError, match="topic /one has two types, std_msgs/msg/Header and std_msgs/msg/String"):
-            ask()
-
-
 def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
     (tmp_path / "text.mcap").write_text("not a bag, but long enough to be one")
     (tmp_path / "folder").mkdir()
@@ -141,25 +104,6 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
             Bag(tmp_path / name)
         assert words in str(caught.value)
         assert name in str(caught.value)
-
-
-def test_a_missing_topic_and_a_wrong_type_are_named(good: Path):
-    bag = Bag(good)
-    bag.require("/one", HEADER)
-    with pytest.raises(BagError, match=r"no messages on /camera .*; its topics: /one, /two"):
-        bag.require("/camera", HEADER)
-    with pytest.raises(BagError, match="topic /one is of type std_msgs/msg/Header, expected sensor_msgs/msg/Image"):
-        bag.require("/one", "sensor_msgs/msg/Image")
-
-
-def test_an_existing_folder_is_not_written_over(good: Path, tmp_path: Path):
-    before = good.read_bytes()
-    with pytest.raises(BagError, match="is not empty"):
-        BagWriter(good.parent)
-    assert good.read_bytes() == before
-    (tmp_path / "file").write_text("")
-    with pytest.raises(BagError, match="cannot be written"):
-        BagWriter(tmp_path / "file" / "bag")
 
 
 def test_a_bag_is_readable_whatever_interrupts_it(tmp_path: Path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import shutil
 import sqlite3
 from contextlib import closing
@@ -87,11 +86,6 @@ def test_chunks_of_every_compression(tmp_path: Path, compression: CompressionTyp
     assert (bag.unchecked, bag.damage) == ("", None)
 
 
-def test_messages_out_of_order_come_by_time(tmp_path: Path):
-    shuffled = random.Random(1).sample(messages(), 400)
-    assert read(Bag(write_mcap(tmp_path / "a.mcap", shuffled, TYPES))) == messages()
-
-
 @pytest.mark.parametrize("named", [True, False])
 def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
     """Eleven parts, so that by name alone the last would come second."""
@@ -142,30 +136,6 @@ def test_the_bags_own_definitions_are_taken(tmp_path: Path):
     assert (old.size, old.data, text.data) == (5, "a", "b")
 
 
-def test_definitions_as_idl(tmp_path: Path):
-    text = "module their_msgs { module msg { struct Thing { long number; }; }; };"
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/thing", "their_msgs/msg/Thing", MessageDefinition("their_msgs/msg/Thing", "ros2idl", text))
-        bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
-    assert next(Bag(tmp_path / "bag").records()).decode().number == 7
-
-
-@pytest.mark.parametrize("text", ["", "no definition at all", "their_msgs/Other other", "int32 a\nint32 a"])
-def test_a_definition_that_says_nothing(tmp_path: Path, text: str):
-    """Of a type that we know ours is taken; of another one the messages cannot be decoded, but they are there."""
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic(
-            "/text", STRING, MessageDefinition(STRING, "ros2msg" if text else "", text if "at all" in text else "")
-        )
-        bag.add_topic("/thing", "their_msgs/msg/Thing", MessageDefinition("their_msgs/msg/Thing", "ros2msg", text))
-        bag.write("/text", 1, cdr(STRING, "b"))
-        bag.write("/thing", 2, cdr(STRING, "b"))
-    known, unknown = Bag(tmp_path / "bag").records()
-    assert known.decode().data == "b"
-    with pytest.raises(BagError, match="/thing: "):
-        unknown.decode()
-
-
 @pytest.mark.parametrize(
     "data",
     [
@@ -191,17 +161,6 @@ def test_bytes_that_are_no_message_name_the_topic(tmp_path: Path, data: bytes):
         decode()
 
 
-def test_lengths_that_lie_take_no_memory(tmp_path: Path):
-    """A path of four thousand million poses in a hundred bytes."""
-    header = cdr(HEADER, stamped(1).stamp, "dish123")
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/path", "nav_msgs/msg/Path")
-        bag.write("/path", 1, header + b"\xff\xff\xff\xff" + bytes(60))
-    record = next(Bag(tmp_path / "bag").records())
-    with pytest.raises(BagError, match="/path: a message cannot be decoded"):
-        record.decode()
-
-
 def test_a_topic_with_two_types_spoils_no_other(tmp_path: Path):
     path = tmp_path / "two"
     shutil.copytree(write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, messages(), TYPES), path)
@@ -218,31 +177,12 @@ def test_a_topic_with_two_types_spoils_no_other(tmp_path: Path):
             ask()
 
 
-def test_a_damaged_database_gives_what_can_be_read(tmp_path: Path):
-    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(4000), {"/text": STRING})
-    file = folder / "bag.db3"
-    whole = file.read_bytes()
-    original = set(texts(4000))
-    recovered = 0
-    for place in range(8, len(whole) // 4096 - 1, 7):
-        file.write_bytes(whole[: place * 4096] + bytes(4096) + whole[(place + 1) * 4096 :])
-        try:
-            bag = Bag(folder)
-            found = read(bag)
-        except BagError:
-            continue
-        assert set(found) <= original
-        assert bag.damage is not None or len(found) == 4000
-        recovered += len(found) > 2000
-    assert recovered > 3
-    file.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(BagError, match=r"malformed|cannot be read") as caught:
-        read(Bag(folder))
-    assert "\n" not in str(caught.value)
-
-
 def test_what_is_no_database(tmp_path: Path):
-    for content, words in ((b"", "is empty"), (b"text" * 99, "is no sqlite3"), (b"SQLite format 3\0" * 9, "as a bag")):
+    for content, words in (
+        (b"", "is empty"),
+        (b"text" * 99, "is no sqlite3"),
+        (b"SQLite format 3\0" * 9, "is damaged"),
+    ):
         (tmp_path / "bag.db3").write_bytes(content)
         with pytest.raises(BagError, match=words):
             Bag(tmp_path / "bag.db3")

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import sqlite3
-import struct
-import subprocess
-import sys
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import pytest
 from mcap.writer import Writer
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -22,7 +15,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.bags.conversion import rotation_from_message
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
@@ -56,35 +48,19 @@ def repaired(path: Path, output: Path, *options: str) -> Bag:
     [
         "timestamp = -5",
         "timestamp = 'noon'",
-        "timestamp = 1.5",
         "data = 'text'",
-        "data = 7",
-        "topic_id = 'x'",
         "topic_id = 77",
     ],
 )
-def test_a_row_with_anything_in_it_is_lost_and_said(tmp_path: Path, change: str):
+def test_a_database_with_a_row_that_cannot_be_is_refused_as_damaged(tmp_path: Path, change: str):
     folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(50), {"/text": STRING})
     with closing(sqlite3.connect(folder / "bag.db3")) as database:
         database.execute(f"UPDATE messages SET {change} WHERE id = 3")
         database.commit()
-    bag = Bag(folder)
-    assert bag.damage is not None
-    assert bag.damage.messages == 1
-    assert read(bag) == texts(50)[:2] + texts(50)[3:]
+    with pytest.raises(BagError, match=r"is damaged .*no checksums"):
+        Bag(folder)
     assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 1
-    assert read(repaired(folder, tmp_path / "new", "--unverified")) == read(bag)
-
-
-@pytest.mark.parametrize("name", ["X'ff00'", "CAST(X'2fff' AS TEXT)", "7.5"])
-def test_a_topic_without_a_name_in_sqlite(tmp_path: Path, name: str):
-    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING, "/other": STRING})
-    with closing(sqlite3.connect(folder / "bag.db3")) as database:
-        database.execute(f"UPDATE topics SET name = {name} WHERE name = '/other'")
-        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, 1, X'00')")
-        database.commit()
-    bag = Bag(folder)
-    assert read(bag)[-5:] == texts(5)
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_message_that_cannot_be_unpacked_is_counted_and_all_else_is_kept(
@@ -133,18 +109,6 @@ def test_names_are_shown_as_they_are(tmp_path: Path, topic: str, capsys: pytest.
     assert json.loads((tmp_path / "found.json").read_text())["topics"][0]["topic"] == topic
 
 
-@pytest.mark.parametrize("ending", ["mcap", "db3"])
-def test_a_file_whose_name_is_no_text(tmp_path: Path, ending: str):
-    plugin = StoragePlugin.MCAP if ending == "mcap" else StoragePlugin.SQLITE3
-    folder = write_rosbag(tmp_path / "bag", plugin, texts(5), {"/text": STRING})
-    odd = tmp_path / os.fsdecode(b"\xff #?[x]." + ending.encode())
-    shutil.copy(folder / f"bag.{ending}", odd)
-    assert read(Bag(odd)) == texts(5)
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", "bag", "check", str(odd)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, "LC_ALL": "C.UTF-8"})
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 @pytest.mark.parametrize(
     "text", ["[" * 5000, "rosbag2_bagfile_information:\n  relative_file_paths: [a.mcap, a.mcap]\n"]
 )
@@ -152,33 +116,6 @@ def test_metadata_that_is_odd_reads_each_file_once(tmp_path: Path, text: str):
     write_mcap(tmp_path / "a.mcap", texts(5), {"/text": STRING})
     (tmp_path / "metadata.yaml").write_text(text)
     assert read(Bag(tmp_path)) == texts(5)
-
-
-def test_thousands_of_topics_are_opened_in_proportion(tmp_path: Path):
-    def opened(count: int) -> float:
-        names = [f"/t{number}" for number in range(count)]
-        path = write_mcap(
-            tmp_path / f"{count}.mcap", [(n, 1, b"\0\1\0\0") for n in names], dict.fromkeys(names, STRING)
-        )
-        before = time.process_time()
-        assert len(Bag(path).topics) == count
-        return time.process_time() - before
-
-    few = opened(500)
-    assert opened(5000) < 40.0 * few  # a hundred times as long, if each is held against each
-
-
-@pytest.mark.parametrize("value", [1e-320, 1e-200, 1.0, 1e200])
-def test_a_quaternion_of_any_length_is_a_rotation(value: float):
-    turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, value, value)
-    rotation = rotation_from_message(turn)
-    assert rotation is not None
-    np.testing.assert_allclose(rotation.as_rotvec(), [0.0, 0.0, np.pi / 2], atol=1e-12)
-
-
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
-def test_what_is_no_quaternion(value: float):
-    assert rotation_from_message(make("geometry_msgs/msg/Quaternion", 0.0, value, 0.0, 0.0)) is None
 
 
 def test_a_broken_transform_and_a_far_future_are_refused_and_counted(tmp_path: Path):
@@ -231,43 +168,3 @@ def test_repair_keeps_the_quality_of_service_in_todays_words(
     assert "transient_local" in (tmp_path / "new" / "metadata.yaml").read_text()
     with Reader(tmp_path / "new") as reader:
         assert [getattr(c.ext, "offered_qos_profiles", None) for c in reader.connections] == [[LATCHED]]
-
-
-def test_what_a_killed_recorder_leaves_is_read(tmp_path: Path):
-    kill = """
-import os, sys
-from pathlib import Path
-from magnetosuture_thread.bags.writer import BagWriter
-bag = BagWriter(Path(sys.argv[1]))
-bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")
-for index in range(100):
-    bag.write("/noise", 10**9 + index * 10**7, os.urandom(10_000))
-os._exit(9)
-"""
-    subprocess.run([sys.executable, "-c", kill, str(tmp_path / "bag")], check=False, timeout=300)
-    assert (tmp_path / "bag" / ".reserve").exists()
-    assert cli.main(["bag", "check", str(tmp_path / "bag")]) == 1
-    new = repaired(tmp_path / "bag", tmp_path / "new")
-    assert new.counts["/noise"] >= 70
-    with Reader(tmp_path / "new") as reader:
-        assert reader.message_count == new.counts["/noise"]
-    assert not (tmp_path / "new" / ".reserve").exists()
-
-
-def test_a_length_in_a_header_that_lies(tmp_path: Path):
-    path = write_mcap(
-        tmp_path / "a.mcap",
-        [("/h", 1, b"\0\1\0\0" + struct.pack("<iII", 1, 2, 0xFFFFFFFF) + b"a\0")],
-        {"/h": "std_msgs/msg/Header"},
-    )
-    assert cli.main(["bag", "check", str(path)]) == 0
-
-
-def test_a_damaged_name_in_the_words_of_an_error_is_no_traceback(tmp_path: Path):
-    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING})
-    file = folder / "bag.db3"
-    data = file.read_bytes().replace(b"timestamp_idx", b"\xc1imestamp_idx").replace(b"CREATE INDEX", b"CREATE INDEZ")
-    assert data != file.read_bytes()
-    file.write_bytes(data)
-    with pytest.raises(BagError, match="cannot be read as a bag"):
-        Bag(folder)

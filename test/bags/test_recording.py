@@ -28,8 +28,7 @@ from magnetosuture_thread.interface import (
     NEEDLE_COMMAND,
     NEEDLE_POSE,
 )
-from magnetosuture_thread.messages.cdr import DISH_END, is_in_dish_frame, stamp_and_frame
-from test.bags.bags import STRING, make, stamped
+from test.bags.bags import make, stamped
 
 SECOND = 10**9
 POINT, QUATERNION, POSE = "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion", "geometry_msgs/msg/Pose"
@@ -202,18 +201,6 @@ def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):
     assert [r.time for r in recording.records([GROUND_TRUTH_NEEDLE], start=0.5)] == [2 * SECOND]
 
 
-@pytest.mark.parametrize("little", [True, False])
-@pytest.mark.parametrize("frame", ["dish", "/dish", "dis", "dishes", "", "DISH"])
-def test_the_dish_frame_is_told_from_the_bytes(frame: str, little: bool):
-    data = bytes(
-        typestore().serialize_cdr(pose_stamped(frame=frame), GROUND_TRUTH_NEEDLE.type_name, little_endian=little)
-    )
-    assert stamp_and_frame("/topic", data) == (SECOND, frame)
-    assert is_in_dish_frame(data) == (frame == "dish")
-    assert not is_in_dish_frame(b"\0\7" + data[2:])  # an order that nobody knows
-    assert not any(is_in_dish_frame(data[:length]) for length in range(DISH_END))
-
-
 def image(compressed: bool) -> Any:
     data = np.zeros(3, dtype=np.uint8)
     if compressed:
@@ -293,25 +280,6 @@ def test_a_frame_that_leads_nowhere_says_how_to_help(tmp_path: Path, frame: str)
     assert (place(found.pose), found.header.frame_id) == ((1.0, 2.0, 3.0), "dish")
 
 
-def test_a_topic_of_an_unfit_type_is_named_when_it_is_asked_for(tmp_path: Path):
-    text = make(STRING, "here")
-    bag = bag_of(
-        tmp_path,
-        (GROUND_TRUTH_NEEDLE.recorded, text),
-        (GROUND_TRUTH_THREAD.recorded, make("nav_msgs/msg/Path", stamped(1), [])),
-    )
-    recording = Recording(bag)
-    assert list(recording.unfit) == [GROUND_TRUTH_NEEDLE.recorded]
-    assert len(list(recording.records([GROUND_TRUTH_THREAD]))) == 1
-    for ask in (lambda: recording.records([GROUND_TRUTH_NEEDLE]), lambda: recording.require(GROUND_TRUTH_NEEDLE)):
-        with pytest.raises(
-            BagError, match=r"topic /ground_truth/needle is of type std_msgs/msg/String, expected .*PoseStamped"
-        ):
-            ask()
-    with pytest.raises(BagError, match=r"has no messages on /needle/measured_cp .*remap one by TOPIC:="):
-        recording.require(NEEDLE_POSE)
-
-
 def test_a_type_that_is_defined_in_another_way_is_converted_or_refused(tmp_path: Path):
     """Fields in another order: the bytes must not be passed on as ours."""
     parts = "================\nMSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
@@ -375,10 +343,3 @@ def test_transforms_agree_with_matrices(data: st.DataObject):
     expected = np.linalg.inv(matrices[str(after)]) @ matrices[str(before)] @ [*point, 1.0]
     assert np.allclose(rigid.apply(point), expected[:3])
     assert np.allclose(rigid.inverse().apply(rigid.apply(point)), point)
-
-
-def test_frames_in_a_circle_and_broken_transforms_lead_nowhere():
-    broken = transform("a", "b", float("nan"))
-    tree = TransformTree([("/tf_static", tf(transform("c", "d", 1.0), transform("d", "c", 1.0), broken))])
-    assert not tree.is_connected("c", "a")
-    assert not tree.is_connected("b", "a")

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import sqlite3
 import struct
-from array import array
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +14,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import StoragePlugin
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.bags.bag_folder import jazzy_qos_profiles
 from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.sanity import SanityCheck, rising
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.messages.building import MessageBuilder
 from test.bags.bags import STRING, cdr, read, texts, write_rosbag
 
@@ -38,55 +33,6 @@ def thread(index: int, points: list[tuple[float, float, float]]) -> tuple[str, i
     return "/thread/measured", at, bytes(typestore().serialize_cdr(message, PATH))
 
 
-def malformed(folder: Path, messages: list[tuple[str, int, bytes]], types: dict[str, str]) -> Path:
-    """Write a sqlite3 bag that is known to be malformed, with all rows in it."""
-    write_rosbag(folder, StoragePlugin.SQLITE3, messages, types)
-    with closing(sqlite3.connect(folder / f"{folder.name}.db3")) as database:
-        database.execute("UPDATE topics SET id = id")
-        database.execute("PRAGMA writable_schema=ON")
-        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, 'never', X'00')")
-        database.commit()
-    return folder
-
-
-def test_a_damaged_bag_without_checksums_is_refused_unless_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    line = [(0.001 * k, 0.0, 0.0) for k in range(5)]
-    good = [thread(index, line) for index in range(20)]
-    bad = list(good)
-    bad[4] = thread(4, [(1e305, 0.0, 0.0), *line])
-    bad[7] = thread(7, [(float("nan"), 0.0, 0.0), *line])
-    bad[9] = (*good[9][:2], good[9][2][:-9])
-    late = thread(3, line)[2]
-    bad[12] = (*good[12][:2], late)
-    folder = malformed(tmp_path / "bag", bad, {"/thread/measured": PATH})
-    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 1
-    error = capsys.readouterr().err
-    assert "--unverified" in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "new").exists()
-
-    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new"), "--unverified"]) == 0
-    said = capsys.readouterr().out
-    for reason in ("more than 1 m away", "not finite", "does not decode", "stamp out of order"):
-        assert reason in said
-    assert "not damaged" not in said
-    new = Bag(tmp_path / "new")
-    assert read(new) == [message for index, message in enumerate(good) if index not in (4, 7, 9, 12)]
-    # The mark stays: in every check, and in a repair of the repaired bag.
-    assert new.notes["unverified"] == new.unverified != ""
-    found = tmp_path / "found.json"
-    assert cli.main(["bag", "check", str(tmp_path / "new"), "--json", str(found)]) == 1
-    shown = capsys.readouterr().out
-    assert "unverified: " in shown
-    assert "nothing is damaged" not in shown
-    assert json.loads(found.read_text())["unverified"]
-    assert cli.main(["bag", "repair", str(tmp_path / "new"), "--output", str(tmp_path / "newer")]) == 1
-    assert cli.main(["bag", "repair", str(tmp_path / "new"), "--output", str(tmp_path / "newer"), "--unverified"]) == 0
-    assert Bag(tmp_path / "newer").unverified
-
-
 def test_a_sound_bag_without_checksums_is_copied_and_stays_unchecked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -97,27 +43,6 @@ def test_a_sound_bag_without_checksums_is_copied_and_stays_unchecked(
     assert "damage to it cannot be noticed" in new.unchecked
     assert cli.main(["bag", "check", str(tmp_path / "new")]) == 0
     assert "nothing is damaged" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("values", "kept"),
-    [
-        ([], []),
-        ([1, 2, 2, 3], [True] * 4),
-        ([1, 9, 2, 3], [True, False, True, True]),
-        ([5, 1, 2, 3], [False, True, True, True]),
-        ([1, 2, 0, 3], [True, True, False, True]),
-    ],
-)
-def test_what_is_out_of_order_is_left_out(values: list[int], kept: list[bool]):
-    assert rising(array("q", values)) == kept
-
-
-def test_every_message_of_the_examples_is_sane():
-    for name in ("post_wrap", "hernia_steering"):
-        bag = Bag(Path(__file__).parents[2] / "examples" / name)
-        check = SanityCheck(bag)
-        assert {problem for item in bag.stored() if (problem := check.problem(item))} == set()
 
 
 def foreign(path: Path, packed: bytes) -> Path:
@@ -196,21 +121,6 @@ def test_a_topic_of_which_no_message_can_be_used_is_not_marked_as_taken(
     assert np.isfinite(Bag(folder).duration)
 
 
-def test_the_mark_of_an_unverified_bag_outlives_its_notes(tmp_path: Path):
-    """In metadata.yaml and in the record of notes it may be damaged or lost; each chunk has it once more."""
-    messages = [thread(index, [(0.001 * k, 0.0, 0.0) for k in range(5)]) for index in range(20)]
-    folder = malformed(tmp_path / "bag", messages, {"/thread/measured": PATH})
-    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new"), "--unverified"]) == 0
-    (tmp_path / "new" / "metadata.yaml").unlink()
-    file = tmp_path / "new" / "new_0.mcap"
-    data = bytearray(file.read_bytes())
-    data[data.index(b"unverified") + 40] ^= 1  # in the record of notes
-    file.write_bytes(data)
-    bag = Bag(file)
-    assert "unverified" not in bag.notes
-    assert bag.unverified == "damaged, and without checksums (sqlite3): any message that is read may be wrong"
-
-
 def test_what_others_wrote_of_a_bag_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The profile and entries of metadata.yaml; the library that wrote it goes into a note."""
     folder = tmp_path / "bag"
@@ -236,23 +146,18 @@ def test_what_others_wrote_of_a_bag_is_kept(tmp_path: Path, capsys: pytest.Captu
     assert "reliable" in next(iter(new.connections())).metadata["offered_qos_profiles"]
 
 
-def test_a_table_of_another_program_is_counted_where_it_is_not_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(5), {"/text": STRING})
-    with closing(sqlite3.connect(folder / "bag.db3")) as database:
-        database.execute("CREATE TABLE lab_notes(text)")
-        database.commit()
-    assert cli.main(["bag", "repair", str(folder), "--output", str(tmp_path / "new")]) == 0
-    assert "not kept: 1 of this: table lab_notes of the database" in capsys.readouterr().out
-
-
-def test_quality_of_service_by_name_stays_as_it_was_written():
-    """Another recorder's way to write YAML is no reason to change it."""
-    by_number = "- history: 3\n  depth: 1\n  reliability: 1\n  durability: 2\n  deadline: {sec: 0, nsec: 0}\n"
-    by_number += "  lifespan: {sec: 0, nsec: 0}\n  liveliness: 1\n  liveliness_lease_duration: {sec: 0, nsec: 0}\n"
-    by_number += "  avoid_ros_namespace_conventions: false\n"
-    by_name = jazzy_qos_profiles(by_number)
-    assert by_name != by_number
-    flow = yaml.safe_dump(yaml.safe_load(by_name), default_flow_style=True)
-    assert flow != by_name
-    assert jazzy_qos_profiles(flow) == flow
-    assert jazzy_qos_profiles("no profiles: [") == "no profiles: ["
+def test_the_mark_of_an_unverified_bag_outlives_its_notes(tmp_path: Path):
+    """In metadata.yaml and in the record of notes it may be damaged or lost; each chunk has it once more."""
+    messages = [thread(index, [(0.001 * k, 0.0, 0.0) for k in range(5)]) for index in range(20)]
+    with BagWriter(tmp_path / "bag", {"unverified": "salvaged without checksums"}) as writer:
+        writer.add_topic("/thread/measured", PATH)
+        for message in messages:
+            writer.write(*message)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    file = tmp_path / "bag" / "bag_0.mcap"
+    data = bytearray(file.read_bytes())
+    data[data.index(b"unverified") + 20] ^= 1  # in the record of notes
+    file.write_bytes(data)
+    bag = Bag(file)
+    assert "unverified" not in bag.notes
+    assert bag.unverified == "salvaged without checksums"

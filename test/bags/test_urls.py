@@ -220,9 +220,3 @@ def test_a_file_by_url_is_read_as_a_local_one(tmp_path: Path, kind: str):
     assert (far.counts, far.unchecked) == (local.counts, local.unchecked)
     assert str(far.damage) == str(local.damage)
     assert ("verified as they are read" in far.facts[0]["checksums"]) == (kind == "whole")
-
-
-def test_a_database_by_url_is_refused(tmp_path: Path):
-    place = in_memory(b"SQLite format 3\0" + bytes(100), "x.db3")
-    with pytest.raises(BagError, match="copy it to this machine"):
-        Bag(place)

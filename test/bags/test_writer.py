@@ -9,13 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 from rosbags.rosbag2 import Reader
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter, RecordingEndedError
-from magnetosuture_thread.errors import BagError
 from test.bags.bags import STRING, cdr, read
 
 # Writes messages that cannot be packed until something stops it, and says how many.
@@ -125,16 +122,6 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
     assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
 
 
-def test_messages_do_not_wait_longer_than_two_seconds(tmp_path: Path):
-    bag = BagWriter(tmp_path / "slow")
-    bag.add_topic("/text", STRING)
-    for index in range(100):
-        bag.write("/text", index * 10**9, cdr(STRING, str(index)))
-    assert Bag(tmp_path / "slow").counts["/text"] >= 97
-    bag.close()
-    assert Bag(tmp_path / "slow").damage is None
-
-
 def test_every_chunk_can_be_read_on_its_own(tmp_path: Path):
     """Also without the summary and all other chunks: each tells its topics and types anew."""
     with BagWriter(tmp_path / "bag") as bag:
@@ -148,27 +135,6 @@ def test_every_chunk_can_be_read_on_its_own(tmp_path: Path):
     records = list(Bag(tmp_path / "half.mcap").records())
     assert records
     assert all(record.decode().data == str(record.time // 10**10) for record in records)
-
-
-def test_a_type_that_nobody_knows_needs_a_definition(tmp_path: Path):
-    with BagWriter(tmp_path / "bag") as bag:
-        with pytest.raises(BagError, match="the type their_msgs/msg/Thing has no definition"):
-            bag.add_topic("/thing", "their_msgs/msg/Thing")
-        definition = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "int32 number\n")
-        bag.add_topic("/thing", "their_msgs/msg/Thing", definition)
-        bag.write("/thing", 1, b"\0\1\0\0\7\0\0\0")
-    (record,) = Bag(tmp_path / "bag").records()
-    assert record.decode().number == 7
-
-
-def test_metadata_has_no_anchors(tmp_path: Path):
-    """rosbag2 would read them; people would not."""
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/text", STRING)
-        bag.write("/text", 1, cdr(STRING, ""))
-    text = (tmp_path / "bag" / "metadata.yaml").read_text()
-    assert "&" not in text
-    assert yaml.safe_load(text)["rosbag2_bagfile_information"]["files"][0]["message_count"] == 1
 
 
 def test_whatever_interrupts_a_recorder_what_it_wrote_is_whole(tmp_path: Path):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import keep_out
-from benchmarks.__main__ import BENCHMARKS, main
+from benchmarks.__main__ import main
 from benchmarks.bridge import command as bridge
 from magnetosuture_thread.errors import GraphError
 
@@ -19,27 +19,6 @@ FIGURES = {
     *("seconds", "steps", "episodes", "driven", "pressed", "stalls", "faults", "violations"),
     *("deepest", "worst", "cpu_seconds"),
 }
-
-
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("solver", ["--peers"]),
-        ("bridge", ["--trials", "--kills", "--hostile"]),
-        ("page", ["--presses"]),
-        ("keep-out", ["--seconds", "--seed"]),
-        ("attack", ["--count", "--seed"]),
-        ("vision", ["--count", "--seed", "--classes", "--save"]),
-    ],
-)
-def test_every_benchmark_has_help(name: str, options: list[str], capsys: pytest.CaptureFixture[str]):
-    assert name in BENCHMARKS
-    with pytest.raises(SystemExit) as ended:
-        main([name, "--help"])
-    assert ended.value.code == 0
-    shown = capsys.readouterr().out
-    for option in [*options, "--json FILE"]:
-        assert option in shown
 
 
 @pytest.mark.parametrize(

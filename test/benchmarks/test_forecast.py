@@ -4,19 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.forecast import closed_loop
-from benchmarks.forecast.timing import BATCH, measure_times
-
-
-def test_times_of_one_forecast_and_of_a_batch():
-    times = measure_times(repeats=1, workers=2)
-    assert times["batch_size"] == BATCH
-    assert 0.0 < times["single_ms"]["minimum"] <= times["single_ms"]["median"]
-    assert times["batch_ms"]["median"] > times["single_ms"]["minimum"] > 0.0
+from benchmarks import forecast
 
 
 def test_forecasts_of_a_loop_are_compared_with_what_then_happened(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(closed_loop, "MAX_DURATION", 3.0)
-    found = closed_loop.measure_accuracy("hernia_ring", 10, 0.5, seed=2)
+    monkeypatch.setattr(forecast, "MAX_DURATION", 3.0)
+    found = forecast.measure_accuracy("hernia_ring", 10, 0.5, seed=2)
     assert 0.0 < found["error_median_percent"] <= found["error_p95_percent"] < 0.5
     assert found["needle_error_mean_percent"] < 0.5 < found["moved_mean_percent"], "the forecast knows where it goes"

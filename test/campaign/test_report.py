@@ -10,12 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.campaign.extremes import RunInstant
-from magnetosuture_thread.campaign.limits import RunFigures
 from magnetosuture_thread.campaign.loop import LoopFrame
-from magnetosuture_thread.campaign.report.charts import draw_chart
-from magnetosuture_thread.campaign.report.page import CampaignDetails, write_campaign_page
-from magnetosuture_thread.campaign.run import RunResult
+from magnetosuture_thread.campaign.page import CampaignDetails, write_campaign_page
+from magnetosuture_thread.campaign.run import RunFigures, RunInstant, RunResult
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.setups import read_setup
@@ -61,7 +58,7 @@ def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> 
 @pytest.fixture
 def details() -> CampaignDetails:
     """Return what is run: the hernia repair."""
-    return CampaignDetails(read_procedure("hernia"), read_setup("hernia_ring"), False, False, {}, {3: "bags/seed_3"})
+    return CampaignDetails(read_procedure("hernia"), read_setup("hernia_ring"), False, {}, {3: "bags/seed_3"})
 
 
 def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:
@@ -125,24 +122,3 @@ def test_the_page_loads_and_runs_nothing(details: CampaignDetails):
     assert all(link is not None and link.startswith("#") for link in links)
     assert "default-src 'none'" in page
     assert "Simulated:" in page
-
-
-def test_seeds_without_a_result_are_named(details: CampaignDetails):
-    page = write_campaign_page(replace(details, died={5: "its process ended"}), [])
-    tags_of(page)
-    assert re.search(r"Seed 5 has no result:</b> its process ended", page)
-
-
-def test_a_chart_places_values_between_zero_and_its_limit():
-    runs = [(1, True), (2, False), (3, True)]
-    chart = draw_chart("rest", "s", runs, [0.0, 3.0, float("nan")], 3.0, is_minimum=False)
-    zero, above = (mark.y for mark in chart.marks)
-    assert [mark.success for mark in chart.marks] == [True, False]
-    assert chart.limit is not None
-    assert chart.limit[0] == above < zero
-    assert chart.limit[1] + chart.limit[2] == pytest.approx(above)  # what is above the limit is shaded
-    assert chart.ticks[0] == (zero, "0")
-    assert [text for _, text in chart.seeds] == ["1", "3"]
-    least = draw_chart("clearance", "mm", runs, [1.0, 2.0, 3.0], 1.0, is_minimum=True)
-    assert least.limit is not None
-    assert least.limit[1] == least.limit[0]  # what is below is shaded

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,14 +102,14 @@ def test_while_all_is_well_it_drives():
 
 
 def test_no_false_stops():
-    """A minute of commands and poses that come late, but in time: not one zero."""
+    """Twelve seconds of commands and poses that come late, but in time: not one zero."""
     plant = Plant().ready()
     plant.run(0.2)
     jitter = np.random.default_rng(3)
     plant.velocity = plant.tail = None
     at = {"command": plant.time + 0.04, "pose": plant.time + 0.04}
     numbers = {"command": plant.commands, "pose": plant.poses}
-    for _ in range(12_000):
+    for _ in range(2400):
         plant.time += PERIOD
         for name in ("command", "pose"):
             if plant.time >= at[name]:
@@ -135,14 +135,6 @@ def test_source_timeout_and_time_to_stop(timeout: float):
     assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
 
 
-def test_a_lost_pose_stops_while_commands_go_on():
-    plant = Plant().ready()
-    plant.run(0.5)
-    plant.tail, last = None, plant.time
-    assert plant.run(1.0)[-1].reasons == ("no needle pose for 0.2 s",)
-    assert stopped_after(plant, last) <= 0.2 - PERIOD + 1e-9
-
-
 @pytest.mark.parametrize(("lost", "timeout"), [("command", 0.3), ("pose", 0.2)])
 def test_an_input_ends_by_the_monotonic_clock_though_that_of_the_stamps_stands_still(lost: str, timeout: float):
     plant = Plant(CoilBridgeSettings(command_timeout=0.3, pose_timeout=0.2)).ready()
@@ -160,19 +152,6 @@ def test_an_input_ends_by_the_monotonic_clock_though_that_of_the_stamps_stands_s
         if not still(plant.bridge.step(stamp, arrival, plant.driver)):
             moved = k * PERIOD
     assert timeout - 3 * PERIOD < moved + PERIOD <= timeout - PERIOD + 1e-9
-
-
-@pytest.mark.parametrize("lost", ["velocity", "tail"])
-def test_source_returns_and_time_to_resume(lost: str):
-    plant = Plant().ready()
-    plant.run(0.5)
-    kept = getattr(plant, lost)
-    setattr(plant, lost, None)
-    assert still(plant.run(1.0)[-1])
-    setattr(plant, lost, kept)
-    resumed = plant.run(0.5)
-    assert not still(resumed[1])
-    assert resumed[-1].reasons == ()
 
 
 def test_cease_after_stop():
@@ -196,17 +175,6 @@ def test_inactive_and_disarmed_pass_nothing(how_far: str):
     outputs = plant.run(1.0)
     assert all(still(output) for output in outputs)
     assert outputs[-1].reasons == ("inactive" if how_far == "inactive" else "disarmed",)
-
-
-def test_what_was_commanded_before_arming_does_not_count():
-    plant = Plant()
-    plant.bridge.latch.activate()
-    plant.run(0.1)
-    plant.velocity = None
-    plant.bridge.arm(READY)
-    assert plant.run(0.02)[-1].reasons == ("no command yet",)
-    plant.velocity = (0.005, 0.0)
-    assert not still(plant.run(0.05)[-1])
 
 
 @pytest.mark.parametrize("press", ["stop", "disarm", "deactivate", "trip"])
@@ -254,26 +222,6 @@ def test_stops_are_at_once_and_starts_are_not():
     assert not any(0.0 < np.linalg.norm(output.filtered) < 0.014 for output in at_rest)
 
 
-def test_after_a_stop_the_needle_starts_from_rest():
-    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
-    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
-    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
-    plant.run(1.0)
-    plant.bridge.latch.disarm()
-    plant.run(PERIOD)
-    plant.tail = None
-    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
-    assert at_rest is not None
-    assert later is not None
-    assert later.tail.tolist() == at_rest.tail.tolist()
-    plant.bridge.arm(READY)
-    plant.command((0.015, 0.0))
-    first = plant.run(PERIOD)[0]
-    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
-    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
-
-
 def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     settings = CoilBridgeSettings(max_current_slew=100.0, command_timeout=0.1)
     plant = Plant(settings, velocity=(0.015, 0.0)).ready()
@@ -287,43 +235,6 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
-def test_a_silence_after_a_rest_is_told_as_any_other():
-    plant = Plant(CoilBridgeSettings(zero_hold=0.3), velocity=(0.0, 0.0)).ready()
-    assert all(output.publish for output in plant.run(2.0))
-    plant.velocity = None
-    told = [output for output in plant.run(2.0) if output.publish and output.reasons]
-    assert len(told) == pytest.approx(0.3 / PERIOD, abs=2)
-
-
-def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):
-    plant = Plant().ready()
-    plant.run(0.2)
-    zero = plant.bridge._coils.zero()
-    monkeypatch.setattr(plant.bridge._coils, "allocate", lambda *_: (zero, "wall"))
-    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no feasible currents",)
-    monkeypatch.undo()
-    assert all(still(output) for output in plant.run(0.08))
-    assert not still(plant.run(0.1)[-1])
-
-
-def test_a_late_step_changes_no_more_than_two_in_time():
-    plant = Plant(CoilBridgeSettings(max_acceleration=0.1), velocity=(0.015, 0.0)).ready()
-    plant.run(0.02)
-    before = plant.outputs[-1][1].filtered
-    plant.time += 0.08
-    plant.command((0.015, 0.0))
-    after = plant.bridge.step(plant.time, plant.time, READY).filtered
-    assert np.linalg.norm(after - before) <= 0.1 * 2 * PERIOD + 1e-12
-
-
-def test_currents_stay_within_their_limit_and_saturation_is_said():
-    plant = Plant(CoilBridgeSettings(max_current=1.5, max_speed=0.045), velocity=(0.4, 0.1)).ready()
-    outputs = plant.run(1.0)
-    assert max(np.abs(output.allocation.currents).max() for output in outputs) <= 1.5
-    assert outputs[-1].allocation.saturated
-    assert np.linalg.norm(outputs[-1].allocation.velocity) < np.linalg.norm(outputs[-1].filtered)
-
-
 def test_two_that_command_at_once_stop_it_until_one_is_silent():
     plant = Plant().ready()
     plant.run(0.5)
@@ -333,16 +244,7 @@ def test_two_that_command_at_once_stop_it_until_one_is_silent():
     assert plant.run(0.05)[-1].reasons == ("several publishers of needle/servo_cv at once",)
 
 
-def test_two_that_say_where_the_needle_is_stop_it():
-    plant = Plant().ready()
-    plant.run(0.5)
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        plant.bridge.extrapolator.update(-TAIL, EAST, plant.time, 7777, plant.time, plant.time)
-    plant.tail = None
-    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/measured_cp at once",)
-
-
-@pytest.mark.parametrize("towards", [(1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (-1.0, 0.0), (0.3, -0.9)])
+@pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0)])
 @pytest.mark.parametrize(
     ("obstacles", "latency", "interval"),
     [((), 0, 1), ((0.006, 0.0, 0.002), 0, 1), ((), 16, 7), ((0.006, 0.0, 0.002), 30, 6)],
@@ -416,7 +318,7 @@ def compensated_motion(
         yield tail, heading
 
 
-@pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0), (0.3, -0.9)])
+@pytest.mark.parametrize("towards", [(0.7, 0.7), (0.3, -0.9)])
 @pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
 @pytest.mark.parametrize("pull", [0.0, 1e-3])
 def test_nor_does_a_needle_whose_pull_is_compensated(
@@ -463,39 +365,14 @@ def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: p
     assert plant.bridge.latch.fault == "internal error: FloatingPointError: no such number"
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"command_timeout": 0.0},
-        {"command_timeout": 0.015},
-        {"rate": 10.0},
-        {"pose_timeout": 0.0},
-        {"max_speed": 0.0},
-        {"max_current": float("nan")},
-        {"autostart": "armed", "driver": "roboclaw"},
-        {"max_acceleration": -1.0},
-        {"rate": 0.0},
-        {"driver_timeout": 0.0},
-        {"roboclaw_answer_timeout": 0.02},
-        {"roboclaw_answer_timeout": 1.5},
-        {"keep_out": 0.0},
-        {"without_prediction": "go on"},
-    ],
-)
-def test_bad_settings_are_refused(change: dict[str, object]):
-    make: Callable[..., CoilBridgeSettings] = CoilBridgeSettings
-    with pytest.raises(Exception, match="coil_bridge\\."):
-        make(**change)
-
-
-def test_10000_hostile_inputs_and_not_one_current_outside_of_the_limits():
+def test_4000_hostile_inputs_and_not_one_current_outside_of_the_limits():
     source = np.random.default_rng(11)
     settings = CoilBridgeSettings(max_current_slew=500.0)
     plant = Plant(settings, velocity=None, tail=None).ready()
     odd = np.array([0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 0.01, -0.02, 1e-6])
     before, driven, tail = np.zeros(4), 0, np.zeros(2)
     number = {"command": 0, "pose": 0}
-    for k in range(10_000):
+    for k in range(4000):
         plant.time += float(source.choice([0.0, 1e-4, PERIOD, 0.03]))
         hostile = source.uniform() < 0.3
         stamp = plant.time + (float(source.choice([-1e9, -1.0, 0.2, 1e9])) if hostile and k % 3 == 0 else 0.0)
@@ -522,7 +399,7 @@ def test_10000_hostile_inputs_and_not_one_current_outside_of_the_limits():
             assert (currents >= np.minimum(before - change, 0.0)).all()
         before, driven = currents, driven + bool(currents.any())
         assert plant.bridge.latch.fault == ""
-    assert driven > 500  # there was something to go wrong
+    assert driven > 200  # there was something to go wrong
 
 
 def test_without_a_scene_it_does_not_arm():
@@ -638,16 +515,6 @@ def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
             plant.bridge.on_margins(plant.time, True, slowdown, "", plant.time)
 
 
-def test_friction_slows_the_needle():
-    plant = Plant(thread=False, velocity=(0.01, 0.0)).ready()
-    for _ in range(40):
-        plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
-        output = plant.run(PERIOD)[0]
-    assert output.commanded.tolist() == [0.01, 0.0]
-    assert output.filtered.tolist() == pytest.approx([0.005, 0.0])
-    assert (output.slowdown, output.active) == (0.5, ("friction",))
-
-
 @pytest.mark.parametrize(
     ("feedback", "source", "slowdown"),
     [("all", "needle", 0.5), ("all", "operator", 0.5), ("operator", "needle", 1.0), ("operator", "operator", 0.5)],
@@ -748,46 +615,12 @@ def test_one_that_the_coils_did_not_miss_drives_on(driver: DriverState, seconds:
     assert not still(frozen(plant, seconds))
 
 
-def test_a_pause_of_the_loop_while_disarmed_is_no_fault():
-    plant = Plant(driver=HARDWARE)
-    plant.bridge.latch.activate()
-    frozen(plant, 3.0)
-    plant.bridge.arm(HARDWARE)
-    assert not still(plant.run(0.2)[-1])
-
-
 def test_a_new_scene_that_takes_long_is_no_fault():
     plant = Plant(driver=HARDWARE).ready()
     plant.run(0.5)
     plant.time += 0.4
     plant.bridge.set_scene(Scene(Dish(0.036)))
     assert not still(plant.run(0.2)[-1])
-
-
-def test_a_needle_at_the_wall_without_currents_has_the_wall_as_its_reason():
-    """The share of the filtered velocity that is certified there leaves currents of some nanoamperes."""
-    heading = np.array([np.cos(6.499343824195083), np.sin(6.499343824195083)])
-    tail, velocity = np.array([-0.00676600239461346, 0.015584649870821128]), np.array([-3.3019e-10, 9.63129e-10])
-    settings = CoilBridgeSettings(command_timeout=1.0, pose_timeout=1.0)
-    bridge, now = CoilBridge(settings, ArmingLatch(), Scene(Dish(0.035))), 100.0
-    bridge.latch.activate()
-    bridge.arm(READY)
-    for number in range(1, 9):
-        bridge.on_margins(now, True, 1.0, bridge.scene_version, now)
-        bridge.extrapolator.update(tail, heading, now, number, now, now)
-        bridge.command("operator", velocity, now, number, now, now)
-        output = bridge.step(now, now, READY)
-        assert still(output)
-        assert output.reasons[0].startswith("stopped by wall"), output.reasons
-        now += PERIOD
-
-
-def test_it_does_not_arm_while_the_driver_is_not_ready():
-    plant = Plant()
-    plant.bridge.latch.activate()
-    with pytest.raises(InvalidInputError, match=r"not ready \(no answer\)"):
-        plant.bridge.arm(DriverState(False, "no answer"))
-    assert all(still(output) for output in plant.run(0.1))
 
 
 def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
@@ -806,17 +639,3 @@ def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
         tail, heading = needle.moved(tail, heading, along, left, PERIOD, found.drift)
         across.append(abs(found.drift))
     assert max(across) < 1e-3
-
-
-def test_coils_that_were_set_to_zero_for_a_new_scene_moved_no_needle_meanwhile():
-    plant = Plant(CoilBridgeSettings(motion_compensation=True)).ready()
-    plant.run(0.2)
-    plant.time += PERIOD
-    before = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    plant.bridge.rest(plant.time, plant.time)
-    plant.bridge.set_scene(Scene(Dish(0.04)))
-    plant.time += 0.06  # as long as the filter of many corners takes
-    after = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    assert before is not None
-    assert after is not None
-    np.testing.assert_allclose(after.tail, before.tail, atol=1e-12)

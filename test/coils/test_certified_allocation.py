@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.certified_allocation import MIN_SHARE, CertifiedAllocation
+from magnetosuture_thread.coils.allocation import MIN_SHARE, CertifiedAllocation
+from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
-from magnetosuture_thread.coils.pose_extrapolator import Pose
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -47,13 +47,6 @@ def test_a_needle_too_close_to_a_block_leaves_it_sideways_against_what_pulls_it(
     assert share == 1.0
 
 
-def test_a_needle_that_has_enough_clearance_is_not_taken_off_sideways():
-    safety, coils = SETTINGS.safety_filter(blocks(6e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
-    pose = Pose(-1.25e-3 * E, E)
-    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), 2e-3)
-    assert abs(found.drift) < 1e-4
-
-
 def test_it_is_taken_off_no_faster_than_it_may():
     safety, coils = SETTINGS.safety_filter(blocks(1e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
     pose = Pose(-1.25e-3 * E, E)
@@ -62,7 +55,7 @@ def test_it_is_taken_off_no_faster_than_it_may():
         assert -found.drift == pytest.approx(limit, rel=0.1, abs=5e-5)
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(10))
 def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int):
     """The needle is beside a block, with another on the other side, and pulled."""
     random = np.random.default_rng(seed)
@@ -79,16 +72,6 @@ def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int)
     assert shares[1] >= min(shares[0], MIN_SHARE) - 1e-9
 
 
-@pytest.mark.parametrize("pull", [5e-4, -5e-4])
-def test_what_pulls_a_needle_to_a_block_or_off_it_is_compensated_though_its_turn_is_limited(pull: float):
-    safety = SETTINGS.safety_filter(blocks(2.6e-4))  # 0.01 mm more than keep_out, to the left
-    coils, pose = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
-    disturbance = MotionDisturbance(0.0, pull)
-    found, _ = coils.allocate(1e-3 * LEFT, pose, safety, coils.zero(), math.inf, disturbance)
-    assert found.drift + disturbance.drift == pytest.approx(0.0, abs=2e-5)
-    assert 0.0 < (found.velocity + disturbance.velocity(E)) @ LEFT < 5e-5
-
-
 def test_command_and_compensation_give_a_needle_with_a_slack_thread_no_more_than_its_greatest_speed():
     settings = CoilBridgeSettings(motion_compensation=True, thread_drag=0.0093, max_speed=2e-3)
     safety, coils = settings.safety_filter(Scene(Dish(0.05))), CertifiedAllocation(settings.allocation(), 2e-3)
@@ -102,7 +85,7 @@ def test_command_and_compensation_give_a_needle_with_a_slack_thread_no_more_than
         assert limit == "speed"
 
 
-@pytest.mark.parametrize("seed", range(20, 60))
+@pytest.mark.parametrize("seed", range(20, 30))
 def test_where_currents_are_not_certified_with_what_is_measured_they_are_without_it(seed: int):
     random = np.random.default_rng(seed)
     left, right = random.uniform(2.4e-4, 5e-4, 2)
@@ -130,18 +113,6 @@ def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to
     found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, None)
     assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
     assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999
-
-
-def test_the_older_the_pose_the_less_of_a_pull_is_compensated_close_to_a_coil_s_axis():
-    safety, coils = SETTINGS.safety_filter(blocks()), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
-    e = np.array([math.cos(0.06), math.sin(0.06)])
-    left = []
-    for age in (0.02, 0.07, 0.12):
-        pose = Pose(np.array([0.004, 0.005]) - 1.25e-3 * e, e, age)
-        disturbance = MotionDisturbance(0.0, 2e-3)
-        found, _ = coils.allocate(1e-3 * e, pose, safety, coils.zero(), math.inf, disturbance)
-        left.append(found.drift + disturbance.drift)
-    assert 0.0 <= left[0] < left[1] < left[2] <= 2.1e-3
 
 
 @pytest.mark.parametrize("speed", [1e-3, -1e-3])

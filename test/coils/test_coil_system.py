@@ -11,8 +11,8 @@ import pytest
 from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import RecordingDriver
+from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.coils.stop_record import StopRecord
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 
@@ -67,15 +67,6 @@ def test_where_arming_cannot_be_recorded_it_does_not_arm(system, tmp_path: Path)
     assert "stop_file" in system.latch.fault
 
 
-def test_it_arms_only_on_request(system):
-    system.latch.activate()
-    for asked in (False, True):
-        if asked:
-            system.arm_when_ready()
-        system.step(500.0, 100.0)
-        assert system.latch.armed == asked
-
-
 @pytest.mark.parametrize("switch", ["disarm", "reset", "fault", "close"])
 def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, switch: str):
     system.latch.activate()
@@ -96,15 +87,6 @@ def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, swit
         system.open(settings, CoilBridge(settings, system.latch, Scene()), TimedDriver(4))
     system.step(500.0, 100.01)
     assert not system.latch.armed
-
-
-def test_what_a_running_bridge_recorded_itself_is_no_unclean_end(system, tmp_path: Path):
-    system.recall(StopRecord(tmp_path / "bridge.stop"))
-    system.latch.activate()
-    system.arm(True)
-    system.recall(StopRecord(tmp_path / "bridge.stop"))
-    assert system.latch.armed
-    assert not system.latch.fault
 
 
 def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_taken(system):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.follow_monitor import FollowMonitor, MotionStep
+from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionStep
 
 INTERVAL, SPEED = 0.05, 2e-3  # s and m/s
 EAST = np.array([SPEED * INTERVAL, 0.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.gain_estimator import MAX_CHANGE, CoilGainEstimator
+from magnetosuture_thread.coils.allocation import MAX_CHANGE, CoilGainEstimator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True)
@@ -45,12 +45,6 @@ def test_gains_are_found_but_for_a_common_factor(seed: int):
     np.testing.assert_allclose(estimator.gains / estimator.gains.mean(), gains / gains.mean(), atol=0.005)
 
 
-def test_coils_as_calibrated_keep_their_gains():
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    lie_along_field(estimator, np.ones(4), 200, 3)
-    np.testing.assert_allclose(estimator.gains, 1.0, atol=0.005)
-
-
 def test_a_needle_that_something_holds_across_the_field_says_nothing_of_the_gains():
     gains = np.array([1.04, 0.97, 1.0, 0.99])
     estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
@@ -66,46 +60,3 @@ def test_gains_are_bounded():
         lie_along_field(estimator, np.array([1.0 + size, 1.0, 1.0, 1.0]), 3, round(1000 * size))
     assert np.abs(estimator.gains - 1.0).max() <= MAX_CHANGE + 1e-12
     assert np.abs(estimator.gains - 1.0).max() > 0.5 * MAX_CHANGE
-
-
-def test_without_currents_or_before_them_nothing_is_learned():
-    currents = np.array([1.0, 0.5, 0.0, 0.0])
-    field = COILS.per_current(np.zeros(2)) @ currents
-    angle = math.atan2(field[1], field[0]) + 0.03  # so little beside the field that it is learned from
-    heading = np.array([math.cos(angle), math.sin(angle)])
-    tail = -0.5 * NEEDLE.chord * heading
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    estimator.update(tail, heading, 1.0)
-    estimator.apply(2.0, currents)
-    estimator.update(tail, heading, 1.5)
-    estimator.stop()
-    estimator.update(tail, heading, 2.5)
-    estimator.apply(3.0, np.zeros(4))
-    estimator.update(tail, heading, 3.5)
-    np.testing.assert_array_equal(estimator.gains, 1.0)
-    estimator.apply(4.0, currents)
-    estimator.update(tail, heading, 4.5)
-    assert np.abs(estimator.gains - 1.0).max() > 0.01
-    assert np.all(np.isfinite(estimator.gains))
-
-
-def test_the_currents_of_the_stamp_count_and_not_those_after_it():
-    gains, random = np.array([1.05, 0.96, 1.02, 0.97]), np.random.default_rng(8)
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    for k in range(200):
-        currents, stamp = random.uniform(-4.0, 4.0, 4), 1.0 + FRAME * k
-        field = COILS.per_current(np.zeros(2)) @ (gains * currents)
-        heading = field / np.linalg.norm(field)
-        estimator.apply(stamp - 0.01, currents)
-        estimator.apply(stamp + 0.01, random.uniform(-4.0, 4.0, 4))
-        estimator.update(-0.5 * NEEDLE.chord * heading, heading, stamp)
-    np.testing.assert_allclose(estimator.gains / estimator.gains.mean(), gains / gains.mean(), atol=0.01)
-
-
-def test_after_time_was_set_back_gains_are_found_again():
-    gains = np.array([1.04, 0.97, 1.0, 0.99])
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    for k in range(3):
-        estimator.apply(1000.0 + 0.005 * k, np.ones(4))
-    lie_along_field(estimator, gains, 200, 4)
-    np.testing.assert_allclose(estimator.gains / estimator.gains.mean(), gains / gains.mean(), atol=0.005)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.coils.measurements import read_measurements
+from magnetosuture_thread.coils.calibration_fit import read_measurements
 from magnetosuture_thread.errors import InvalidInputError
 
 HEADER = "coil,current,x,y,bx,by\n"

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.pose_extrapolator import PoseExtrapolator
+from magnetosuture_thread.coils.inputs import PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import InvalidInputError
 
@@ -20,32 +20,6 @@ def extrapolator_at_origin() -> PoseExtrapolator:
     made = PoseExtrapolator(NEEDLE, 0.2, 0.045)
     made.update(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
     return made
-
-
-def test_without_a_pose_there_is_none():
-    assert PoseExtrapolator(NEEDLE, 0.2, 0.045).pose(1.0, 50.0) is None
-
-
-def test_a_pose_ends_by_the_monotonic_clock_whatever_the_other_says():
-    assert extrapolator_at_origin().pose(1.0, 50.19) is not None
-    assert extrapolator_at_origin().pose(1.0, 50.21) is None
-
-
-def test_a_pose_is_carried_along_the_needle():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.005, 0.0]), 1.0, 48.95 + 1.0)
-    pose = extrapolator.pose(1.04, 50.04)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.0002, 0.0], atol=1e-12)
-    np.testing.assert_allclose(pose.heading, EAST)
-    assert pose.age == pytest.approx(0.04)  # since the stamp
-
-
-def test_the_age_of_a_pose_goes_by_stamp_or_arrival_whichever_is_longer_ago():
-    for now, arrival in ((1.06, 50.02), (0.98, 50.06)):  # late, or by a clock that is ahead
-        pose = extrapolator_at_origin().pose(now, arrival)
-        assert pose is not None
-        assert pose.age == pytest.approx(0.06)
 
 
 def test_a_velocity_across_turns_the_needle_about_its_middle():
@@ -69,42 +43,6 @@ def test_a_late_pose_is_carried_by_all_that_the_coils_gave_since_its_stamp():
     np.testing.assert_allclose(pose.tail, [0.02 * 0.05 + 0.01 * 0.05, 0.0], atol=1e-12)
 
 
-def test_a_motion_is_kept_as_the_needle_sees_it():
-    """A pose from within a motion is carried by what the coils give now, not by where that pointed when it began."""
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.01, 0.007]), 1.0, 50.0)
-    whole = extrapolator.pose(1.1, 50.1)
-    half = NEEDLE.moved(np.zeros(2), EAST, 0.01, 0.007, 0.05)
-    extrapolator.update(*half, 1.05, 2, 1.1, 50.1)
-    again = extrapolator.pose(1.1, 50.1)
-    assert whole is not None
-    assert again is not None
-    np.testing.assert_allclose(again.tail, whole.tail, atol=1e-12)
-    np.testing.assert_allclose(again.heading, whole.heading, atol=1e-12)
-
-
-def test_a_drift_of_the_whole_needle_turns_nothing():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.0, 0.002]), 1.0, 50.0, drift=0.002)
-    pose = extrapolator.pose(1.1, 50.1)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.0, 0.0002], atol=1e-12)
-    np.testing.assert_allclose(pose.heading, EAST, atol=1e-12)
-
-
-def test_a_needle_that_drifts_and_turns_is_extrapolated_as_in_small_steps():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.004, 0.006]), 1.0, 50.0, drift=0.002)
-    pose, (tail, heading) = extrapolator.pose(1.1, 50.1), (np.zeros(2), EAST)
-    for _ in range(4000):
-        e = NEEDLE.chord_direction(heading)
-        tail, heading = NEEDLE.moved(tail, heading, 0.004, 0.004, 0.1 / 4000)
-        tail = tail + 0.002 * 0.1 / 4000 * np.array([-e[1], e[0]])
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, tail, atol=1e-7)
-    np.testing.assert_allclose(pose.heading, heading, atol=1e-9)
-
-
 def test_where_time_is_set_back_a_pose_is_carried_from_there():
     extrapolator = PoseExtrapolator(NEEDLE, 0.3, 0.045)
     extrapolator.update(np.zeros(2), EAST, 99.9, 1, 100.0, 50.0)
@@ -116,27 +54,12 @@ def test_where_time_is_set_back_a_pose_is_carried_from_there():
     np.testing.assert_allclose(pose.tail, [0.001, 0.0], atol=1e-12)
 
 
-def test_a_stamp_from_the_future_takes_nothing_off_the_motion():
-    extrapolator = extrapolator_at_origin()
-    extrapolator.apply_velocity(np.array([0.01, 0.0]), 1.0, 50.0)
-    extrapolator.update(np.zeros(2), EAST, 1.14, 2, 1.1, 50.1)
-    pose = extrapolator.pose(1.14, 50.14)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.0004, 0.0], atol=1e-12)
-
-
 def stalled() -> PoseExtrapolator:
     """Return a watch of a needle that moves at time 1, when the coils hold for 0.1 s and stop by 0.2 s."""
     extrapolator = PoseExtrapolator(NEEDLE, 1.0, 0.045, min_hold=0.1, max_hold=0.2)
     extrapolator.update(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
     extrapolator.apply_velocity(np.array([0.01, 0.0]), 1.0, 50.0)
     return extrapolator
-
-
-def test_within_what_the_coils_hold_a_stall_costs_nothing():
-    pose = stalled().pose(1.1, 50.1)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.001, 0.0], atol=1e-12)
 
 
 def test_after_a_longer_stall_only_a_pose_from_after_the_coils_stopped_counts():
@@ -150,27 +73,6 @@ def test_after_a_longer_stall_only_a_pose_from_after_the_coils_stopped_counts():
     pose = extrapolator.pose(1.4, 50.4)
     assert pose is not None
     np.testing.assert_allclose(pose.tail, [0.0015, 0.0], atol=1e-12)  # it rests since
-
-
-def test_the_coils_hold_the_last_velocity_of_several():
-    extrapolator = stalled()
-    extrapolator.apply_velocity(np.array([0.01, 0.0]), 1.09, 50.09)
-    for stamp, number in ((1.28, 2), (1.3, 3)):
-        with nullcontext() if stamp > 1.29 else pytest.raises(InvalidInputError, match="stall of the loop"):
-            extrapolator.update(np.array([0.002, 0.0]), EAST, stamp, number, 1.35, 50.35)
-
-
-def test_a_stall_ends_where_time_is_set_back():
-    extrapolator = stalled()
-    assert extrapolator.pose(1.3, 50.3) is None
-    extrapolator.update(np.zeros(2), EAST, 0.5, 2, 0.5, 50.4)
-    assert extrapolator.pose(0.5, 50.4) is not None
-
-
-def test_a_stall_of_a_needle_at_rest_costs_nothing():
-    extrapolator = stalled()
-    extrapolator.apply_velocity(np.zeros(2), 1.05, 50.05)
-    assert extrapolator.pose(1.5, 50.5) is not None
 
 
 def doubter() -> PoseExtrapolator:
@@ -211,12 +113,6 @@ def test_a_pose_that_cannot_be_is_not_believed_and_the_needle_rests(tail: list[f
     assert extrapolator.pose(1.02, 50.02) is None
 
 
-def test_what_a_needle_can_do_is_believed():
-    extrapolator = doubter()
-    assert all(show(extrapolator, [[0.0008 * (k + 1), 0.0] for k in range(10)]))
-    assert extrapolator.pose(1.2, 50.2) is not None
-
-
 def test_a_tracker_that_says_how_uncertain_it_is_may_be_off_by_three_sigma():
     for sigma, believed in ((1e-3, True), (1e-4, False)):
         extrapolator, covariance = doubter(), np.diag([sigma**2, 0.0, 0.0])
@@ -240,37 +136,10 @@ def test_no_uncertainty_excuses_more_than_2_mm_and_an_infinite_one_says_nothing(
         doubter().update(np.array([0.0, jump]), EAST, 1.02, 2, 1.02, 50.02, np.diag(variances))
 
 
-def test_the_uncertainty_of_the_pose_before_counts_too():
-    for sigma, believed in ((1e-3, True), (1e-4, False)):
-        extrapolator = doubter()
-        extrapolator.update(np.zeros(2), EAST, 1.02, 2, 1.02, 50.02, np.diag([sigma**2, 0.0, 0.0]))
-        with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
-            extrapolator.update(np.array([0.0025, 0.0]), EAST, 1.04, 3, 1.04, 50.04)
-
-
 def test_a_needle_that_turned_too_fast_about_its_tail_is_not_believed():
     turned = np.array([np.cos(0.3), np.sin(0.3)])
     with pytest.raises(InvalidInputError, match="its tip jumped"):
         doubter().update(np.zeros(2), turned, 1.02, 2, 1.02, 50.02)
-
-
-def test_an_end_may_be_outside_of_the_dish_by_three_sigma():
-    """The tip is 0.7 mm outside of the dish, of which 0.5 mm are always forgiven."""
-    for sigma, believed in ((1e-4, True), (5e-5, False)):
-        extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045, uncertainty=0.0005)
-        extrapolator.dish_radius = 0.0175
-        tail, covariance = np.array([0.0182 - NEEDLE.chord, 0.0]), np.diag([sigma**2, 0.0, 0.0])
-        with nullcontext() if believed else pytest.raises(InvalidInputError, match=r"its tip is 0\.0182 m"):
-            extrapolator.update(tail, EAST, 1.02, 2, 1.02, 50.02, covariance)
-
-
-def test_an_uncertain_heading_moves_the_tip_by_the_chord_times_its_angle():
-    """An end may jump by 0.9 mm and by 3 sigma of its pose: of 1.5 mm here the heading has 0.6 mm to explain."""
-    sigma = 0.0006 / (3.0 * NEEDLE.chord)
-    for factor, believed in ((1.02, True), (0.98, False)):
-        extrapolator, covariance = doubter(), np.diag([0.0, 0.0, (factor * sigma) ** 2])
-        with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
-            extrapolator.update(np.array([0.0015, 0.0]), EAST, 1.02, 2, 1.02, 50.02, covariance)
 
 
 def test_poses_are_believed_again_when_five_in_a_row_agree():
@@ -325,25 +194,3 @@ def test_two_that_say_where_the_needle_is_are_one_too_many():
         extrapolator.update(np.array([0.01, 0.0]), EAST, 1.0, 7777, 1.0, 50.01)
     assert extrapolator.stale_reason(1.0, 50.02) == "several publishers of needle/measured_cp at once"
     assert extrapolator.pose(1.0, 50.02) is None
-
-
-def test_a_velocity_before_the_first_pose_moves_nothing():
-    extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045)
-    extrapolator.apply_velocity(np.array([0.01, 0.0]), 0.9, 49.9)
-    assert extrapolator.pose(0.95, 49.95) is None
-    extrapolator.update(np.zeros(2), EAST, 1.0, 1, 1.0, 50.0)
-    pose = extrapolator.pose(1.1, 50.1)
-    assert pose is not None
-    assert pose.tail.tolist() == [0.0, 0.0]
-
-
-def test_after_time_was_set_back_a_pose_is_where_it_was_measured():
-    """The velocities that were applied have stamps of the clock before; the last one goes on."""
-    extrapolator = PoseExtrapolator(NEEDLE, 0.2, 0.045)
-    extrapolator.update(np.zeros(2), EAST, 100.0, 1, 100.0, 50.0)
-    for later in (0.0, 0.05):
-        extrapolator.apply_velocity(np.array([0.01, 0.0]), 100.0 + later, 50.0 + later)
-    extrapolator.update(np.zeros(2), EAST, 90.0, 2, 90.02, 50.07)
-    pose = extrapolator.pose(90.02, 50.07)
-    assert pose is not None
-    np.testing.assert_allclose(pose.tail, [0.01 * 0.02, 0.0], atol=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,6 @@ def test_scene_too_narrow_for_the_needle_is_rejected():
         ),
         ({"approach_rate": 250.0}, r"coil_bridge\.approach_rate: got 250\.0, expected at most .* 200 1/s"),
         ({"coil_angles": (0.0, 1.0)}, "at least 3 coils"),
-        ({"coil_model": "points"}, "one of loops, dipoles"),
         ({"calibration": "nowhere.yaml"}, r"coil_bridge\.calibration, nowhere\.yaml: coil calibration: .*No such file"),
         ({"calibration": "~nobody_of_this_name/rig.yaml"}, r"coil_bridge\.calibration"),
     ],
@@ -60,34 +60,16 @@ def test_where_its_motion_is_compensated_a_needle_has_drag_beside_that_of_the_th
         CoilBridgeSettings(motion_compensation=True, needle_drag=0.02, thread_drag=0.0181)
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "command_timeout",
-        "pose_timeout",
-        "driver_timeout",
-        "roboclaw_answer_timeout",
-        "rate",
-        "max_speed",
-        "max_acceleration",
-        "max_current",
-        "max_current_slew",
-        "keep_out",
-        "approach_rate",
-        "field_per_current",
-        "coil_distance",
-        "coil_radius",
-        "coil_resistance",
-        "aligning_field",
-        "needle_length",
-        "needle_moment",
-        "needle_drag",
-        "needle_drag_across",
-        "needle_turning_drag",
-    ],
-)
-def test_sizes_are_positive(name: str):
-    for value in (0.0, -1e-3):
+SIZES = """
+command_timeout pose_timeout driver_timeout roboclaw_answer_timeout rate max_speed
+max_acceleration max_current max_current_slew keep_out approach_rate field_per_current
+coil_distance coil_radius coil_resistance aligning_field needle_length needle_moment
+needle_drag needle_drag_across needle_turning_drag
+"""
+
+
+def test_sizes_are_positive():
+    for name, value in itertools.product(SIZES.split(), (0.0, -1e-3)):
         change: dict[str, Any] = {name: value}
         with pytest.raises(ConfigurationError, match=rf"coil_bridge\.{name}: got {value}, expected .*from "):
             CoilBridgeSettings(**change)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.coils.coil_system import UNCLEAN_END, CoilSystem
-from magnetosuture_thread.coils.stop_record import RecordedState, StopRecord
+from magnetosuture_thread.coils.latch import RecordedState, StopRecord
 from magnetosuture_thread.errors import InvalidInputError
 
 
@@ -45,14 +45,6 @@ def test_it_is_on_the_disk_before_the_file_of_before_is_replaced(path, monkeypat
     monkeypatch.setattr(Path, "replace", replaced)
     StopRecord(path).write(RecordedState.STOPPED)
     assert calls == ["sync", "replace", "sync"]
-
-
-def test_a_state_that_the_file_holds_is_not_written_again(path):
-    record = StopRecord(path)
-    record.write(RecordedState.ARMED)
-    before = path.stat().st_ino
-    record.write(RecordedState.ARMED)
-    assert path.stat().st_ino == before
 
 
 @pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"stop", b"x" * 100_000])
@@ -99,13 +91,6 @@ def test_an_end_in_order_leaves_none(path):
     system.remember()
     system.remember(ends=True)
     assert not recalled(path).latch.latched_reason
-
-
-def test_a_fault_that_was_not_reset_outlives_a_crash(path):
-    system = recalled(path)
-    system.latch.trip("driver: gone")
-    system.remember()
-    assert recalled(path).latch.fault == UNCLEAN_END
 
 
 def test_what_cannot_be_written_is_not_reset(path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.watchdog import AGE_WINDOW, CommandWatchdog, PredictionMonitor, StampAges
+from magnetosuture_thread.coils.inputs import AGE_WINDOW, CommandWatchdog, StampAges
 from magnetosuture_thread.errors import InvalidInputError
 
 TIMEOUT = 0.1
@@ -17,31 +17,12 @@ def make_watchdog() -> CommandWatchdog:
     return CommandWatchdog(TIMEOUT)
 
 
-def test_no_command_is_valid_before_the_first():
-    assert make_watchdog().stale_reason(15.0, 5.0) == "no command yet"
-
-
 def test_command_is_valid_until_it_times_out():
     watchdog = make_watchdog()
     watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
     assert watchdog.velocity.tolist() == EAST.tolist()
     assert watchdog.stale_reason(10.0 + 0.0999, 0.0999) == ""
     assert watchdog.stale_reason(10.0 + 0.1001, 0.1001) == "no command for 0.1 s"
-
-
-def test_next_valid_command_ends_the_timeout():
-    watchdog = make_watchdog()
-    watchdog.update(EAST, stamp=10.0, number=1, now=10.0, arrival=0.0)
-    assert watchdog.stale_reason(10.0 + 3.0, 3.0)
-    watchdog.update(EAST, stamp=13.0, number=2, now=13.0, arrival=3.0)
-    assert watchdog.stale_reason(10.0 + 3.0, 3.0) == ""
-
-
-def test_transport_delay_counts_towards_the_timeout():
-    watchdog = make_watchdog()
-    watchdog.update(EAST, stamp=9.94, number=1, now=10.0, arrival=0.0)
-    assert watchdog.stale_reason(10.03, 0.03) == ""
-    assert watchdog.stale_reason(10.05, 0.05) == "no command for 0.1 s"
 
 
 def test_command_times_out_while_the_stamps_clock_stands_still():
@@ -58,12 +39,6 @@ def test_only_commands_after_clear_are_valid():
     assert watchdog.stale_reason(10.0 + 0.01, 0.01) == "no command yet"
     watchdog.update(EAST, stamp=10.01, number=2, now=10.01, arrival=0.01)
     assert watchdog.stale_reason(10.0 + 0.01, 0.01) == ""
-
-
-def test_command_is_stored_without_limits():
-    watchdog = make_watchdog()
-    watchdog.update(np.array([-1e308, 1e308]), stamp=1.0, number=2, now=1.0, arrival=0.0)
-    assert watchdog.velocity.tolist() == [-1e308, 1e308]
 
 
 @pytest.mark.parametrize(
@@ -97,11 +72,6 @@ def test_time_set_back_does_not_make_every_command_stale():
     assert watchdog.stale_reason(5.0, 1.0) == ""
 
 
-def test_no_command_is_valid_before_the_clock_runs():
-    with pytest.raises(InvalidInputError, match="0 is none in ROS"):
-        make_watchdog().update(EAST, stamp=0.0, number=1, now=0.0, arrival=0.0)
-
-
 def test_two_publishers_are_a_conflict_until_one_is_silent():
     watchdog = make_watchdog()
     for k in range(10):
@@ -132,12 +102,3 @@ def test_the_minimum_age_of_the_last_seconds_is_kept_for_each_topic():
     assert ages.minimum(0.5 + AGE_WINDOW)["needle/servo_cv"] == 0.020
     assert ages.minimum(2.5 + AGE_WINDOW)["needle/servo_cv"] == 0.030
     assert ages.minimum(3.5 + AGE_WINDOW) == {}
-
-
-def test_a_model_with_another_scene_is_reported_until_its_timeout():
-    monitor = PredictionMonitor(2.0)
-    monitor.update(1.0, True, 1.0, "a", 1.0)
-    assert monitor.scene_mismatch("a", 1.0) == ""
-    assert monitor.scene_mismatch("b", 1.4) == ""  # the model may take half a second
-    assert "has a, coil_bridge has b" in monitor.scene_mismatch("b", 2.9)
-    assert monitor.scene_mismatch("b", 3.1) == ""

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from playwright.sync_api import Browser, sync_playwright
 
-from benchmarks.page.measurements import BROWSERS
+from benchmarks.page import BROWSERS
 from magnetosuture_thread.console.server import ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from test.console.scene import RecordingGraph, RecordingHost

@@ -12,8 +12,7 @@ import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera, encode_jpeg
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 
 VIEW = DishView((322.0, 238.0), 8e-5)
 NODES = 40

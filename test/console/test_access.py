@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.console.access import (
-    RateCounter,
     host_refusal,
     is_loopback,
     new_token,
@@ -14,7 +13,7 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.outbox import MAX_REPLIES, MAX_UNACKNOWLEDGED, Outbox
+from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
 
@@ -142,44 +141,3 @@ def test_a_page_that_is_behind_gets_the_newest_only():
     outbox.acknowledge("state")
     assert outbox.next() == "99"
     assert outbox.next() is None
-
-
-def test_frames_do_not_wait_for_states_and_answers_come_first():
-    outbox = Outbox()
-    for number in range(MAX_UNACKNOWLEDGED + 1):
-        outbox.put("state", str(number))
-        outbox.next()
-    outbox.put("frame", b"picture")
-    outbox.reply("first")
-    outbox.reply("second")
-    assert [outbox.next() for _ in range(4)] == ["first", "second", b"picture", None]
-
-
-def test_of_too_many_replies_the_latest_are_kept():
-    outbox = Outbox()
-    for number in range(MAX_REPLIES + 10):
-        outbox.reply(str(number))
-    assert [outbox.next() for _ in range(MAX_REPLIES + 1)] == [*map(str, range(10, MAX_REPLIES + 10)), None]
-
-
-def test_got_what_was_not_sent_lets_no_more_through():
-    outbox = Outbox()
-    for _ in range(10):
-        outbox.acknowledge("state")
-    for number in range(MAX_UNACKNOWLEDGED + 2):
-        outbox.put("state", str(number))
-        outbox.next()
-    assert outbox.next() is None
-
-
-def test_the_refusal_of_a_rate_says_which_would_do():
-    with pytest.raises(ConfigurationError, match=r"console\.rate: got 10\.0, expected at least 20 Hz, 2 commands in"):
-        ConsoleSettings(rate=10.0, hold_timeout=0.1)
-    ConsoleSettings(rate=20.0, hold_timeout=0.1)
-
-
-def test_messages_are_counted_by_address_and_second():
-    rate = RateCounter()
-    assert [rate.count("10.0.0.1", now) for now in (7.0, 7.5, 7.999)] == [1, 2, 3]
-    assert rate.count("10.0.0.2", 7.999) == 1
-    assert [rate.count("10.0.0.1", now) for now in (8.0, 8.1)] == [1, 2]

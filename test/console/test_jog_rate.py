@@ -82,33 +82,3 @@ def test_a_disarmed_bridge_ends_a_jog_at_once_and_one_that_stays_disarmed_ends_n
     controller.set_armed(False)
     assert sent[-1] == (0.002, 0.0)
     assert not controller.must_release
-
-
-def test_another_page_neither_ends_a_jog_nor_takes_control_of_it(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
-    sent: list[Any] = []
-    controller = JogController(sent.append, rate=10.0, timeout=0.35)
-    controller.acquire_control(2)
-    controller.jog(2, (0.001, 0.0))
-    for other in (1, 3):
-        controller.interrupt(other)
-        controller.end_jog(other)
-        controller.set_visible(other, False)
-        assert controller.acquire_control(other) != ""
-    assert controller.acquire_control(2) == ""  # which has it already
-    assert sent == [(0.001, 0.0)]
-
-
-def test_who_takes_control_begins_with_a_needle_at_rest_and_without_the_latch_of_another(
-    monkeypatch: pytest.MonkeyPatch,
-):
-    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
-    sent: list[Any] = []
-    controller = JogController(sent.append, rate=10.0, timeout=0.35)
-    controller.acquire_control(1)
-    controller.jog(1, (0.001, 0.0))
-    controller.set_visible(1, False)
-    assert sent[-1] == (0.0, 0.0)
-    assert controller.must_release
-    assert controller.acquire_control(2) == ""
-    assert not controller.must_release

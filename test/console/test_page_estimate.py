@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from playwright.sync_api import expect
 
-from test.console.scene import estimated_state, picture, state, thread
+from test.console.scene import estimated_state, state
 from test.console.test_page import Operator, between, operator
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["operator"]  # the fixture
 
@@ -34,27 +37,6 @@ def test_estimate_prediction_and_measurement_have_their_own_colours(operator: Op
     expect(operator.page.locator("#margins")).not_to_contain_text("99 % bound")
 
 
-def test_the_band_of_the_deviation_is_shaded(operator: Operator) -> None:
-    graph = operator.served.graph
-    operator.page.emulate_media(color_scheme="light")
-    graph.shown = estimated_state()
-    line = thread()
-    along = line[39] - line[37]
-    across = (-along[1] / float((along @ along) ** 0.5), along[0] / float((along @ along) ** 0.5))
-    inside = (line[38][0] - 5.5e-4 * across[0], line[38][1] - 5.5e-4 * across[1])
-    outside = (line[38][0] - 1.2e-3 * across[0], line[38][1] - 1.2e-3 * across[1])
-    operator.until(lambda: operator.colours_at(inside, 0) != operator.colours_at(outside, 0))
-    graph.shown["estimated"]["deviation"] = [1e-6] * 40
-    operator.until(lambda: operator.colours_at(inside, 0) == operator.colours_at(outside, 0))
-
-
-def test_an_estimate_that_is_not_measured_any_more_says_so(operator: Operator) -> None:
-    operator.served.graph.shown = estimated_state(hidden=True)
-    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "prediction")
-    expect(operator.page.locator("#margins")).to_contain_text("Prediction only for 3.2 s")
-    expect(operator.page.locator("#margins")).not_to_contain_text("Measured")
-
-
 def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operator) -> None:
     graph = operator.served.graph
     operator.page.emulate_media(color_scheme="light")
@@ -68,28 +50,3 @@ def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operato
     graph.shown = estimated_state()
     expect(operator.page.locator("#dish")).to_have_attribute("data-disturbances", "0")
     operator.until(lambda: RED not in operator.colours_at(behind))
-
-
-def test_what_is_learned_of_the_thread_is_listed_with_its_interval(operator: Operator) -> None:
-    shown = estimated_state()
-    text = "1.3e-09 m^4/s, 95 % in 1.2e-09 to 1.4e-09, frozen: not excited"
-    shown["nodes"]["thread_model"]["values"] = {"learned stiffness_over_drag": text, "residual": "1.0e-09"}
-    operator.served.graph.shown = shown
-    expect(operator.page.locator("#margins")).to_contain_text(f"Stiffness over drag: {text}")
-    expect(operator.page.locator("#margins")).not_to_contain_text("1.0e-09")
-
-
-def test_an_old_estimate_is_not_drawn_as_one(operator: Operator) -> None:
-    graph = operator.served.graph
-    graph.shown = estimated_state()
-    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "measured")
-    graph.shown["estimated"]["age"] = 2.0
-    expect(operator.page.locator("#dish")).to_have_attribute("data-estimate", "none")
-    assert operator.drawn("old") == "#7d8790"
-
-
-def test_the_layout_fits_a_laptop_with_a_disturbance_and_an_image(operator: Operator) -> None:
-    operator.served.graph.picture = (1, picture())
-    operator.served.graph.shown = estimated_state(found=True, friction="sliding", count=8)
-    expect(operator.page.locator("#margins")).to_contain_text("Held at")
-    assert operator.cut_off() == []

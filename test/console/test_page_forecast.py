@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from playwright.sync_api import expect
 
 from test.console.scene import forecast_state, state
 from test.console.test_page import Operator, operator
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["operator"]  # the fixture
 
@@ -28,18 +31,6 @@ def test_the_forecast_thread_is_drawn_as_a_ghost_beside_the_thread(operator: Ope
     operator.until(all_differ)
     expect(operator.page.locator("#forecast-legend")).to_have_text("forecast for 3.0 s, fainter the later")
     expect(operator.page.locator("#forecast")).to_be_hidden()  # nothing happens
-
-
-def test_what_happens_ahead_is_said_and_disappears_with_the_forecast(operator: Operator) -> None:
-    graph, text = operator.served.graph, operator.page.locator("#forecast")
-    graph.shown = forecast_state("touches the ring in 0.8 s", "friction in 1.4 s")
-    expect(text).to_have_text("Touches the ring in 0.8 s, friction in 1.4 s")
-    expect(text).to_be_visible()
-    graph.shown = forecast_state("friction in 0.3 s")
-    expect(text).to_have_text("Friction in 0.3 s")
-    graph.shown["forecast"]["age"] = 3.0  # the model has stopped
-    expect(text).to_be_hidden()
-    expect(operator.page.locator("#dish")).to_have_attribute("data-ghosts", "0")
 
 
 def test_a_shape_with_a_hostile_name_is_shown_as_text(operator: Operator) -> None:

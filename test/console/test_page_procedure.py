@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import expect
 
-from test.console.scene import procedure_state, state
+from test.console.scene import procedure_state
 from test.console.test_page import Operator, operator
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["operator"]  # the fixture
 
@@ -16,15 +18,6 @@ def enabled(operator: Operator, *names: str) -> None:
     for name in ("plan", "run", "pause", "abort"):
         button = operator.page.locator(f"#{name}-procedure")
         (expect(button).to_be_enabled if name in names else expect(button).to_be_disabled)()
-
-
-def test_without_a_planner_there_is_no_bar(operator: Operator):
-    expect(operator.page.locator("#headline")).to_have_text("At rest: no page has control")
-    expect(operator.page.locator("#procedure")).to_be_hidden()
-    operator.served.graph.shown = procedure_state()
-    expect(operator.page.locator("#procedure")).to_be_visible()
-    operator.served.graph.shown = state()
-    expect(operator.page.locator("#procedure")).to_be_hidden()
 
 
 def test_a_procedure_is_chosen_planned_seen_run_paused_resumed_and_given_up(operator: Operator):
@@ -76,31 +69,6 @@ def test_a_procedure_is_neither_begun_disarmed_nor_resumed_where_it_goes_on_by_i
     )
 
 
-def test_a_jog_takes_over_while_a_procedure_runs(operator: Operator):
-    operator.served.graph.shown = procedure_state("running")
-    operator.take_control()
-    operator.page.keyboard.down("ArrowRight")
-    operator.last((0.003, 0.0))
-    operator.page.keyboard.up("ArrowRight")
-    operator.last((0.0, 0.0))
-
-
-def test_a_page_without_control_may_pause_and_give_up(operator: Operator):
-    graph = operator.served.graph
-    graph.shown = procedure_state("running")
-    enabled(operator, "pause", "abort")
-    operator.page.click("#pause-procedure")
-    operator.until(lambda: graph.procedures == [("pause", "hernia", False)])
-
-
-def test_a_refusal_is_shown(operator: Operator):
-    graph = operator.served.graph
-    graph.shown, graph.refusal = procedure_state(), "goals[0].wrap.around: got 'ring', expected a shape of the scene"
-    operator.take_control()
-    operator.page.click("#plan-procedure")
-    expect(operator.page.locator("#notice")).to_have_text(f"plan procedure: {graph.refusal}")
-
-
 @pytest.mark.parametrize("end", ["release", "blur", "stop"])
 def test_the_page_is_held_while_the_button_is_and_no_longer(operator: Operator, end: str):
     graph, page = operator.served.graph, operator.page
@@ -130,15 +98,3 @@ def test_the_page_is_held_while_the_button_is_and_no_longer(operator: Operator, 
     operator.until(lambda: operator.stats("states") > states + 5)
     assert len(graph.holds) == count
     page.mouse.up()
-
-
-def test_nothing_is_cut_off_beside_the_bar(operator: Operator):
-    graph = operator.served.graph
-    graph.shown = procedure_state(
-        "paused", hold_to_run=True, reason="the needle is not tracked: lost", goals=["wrap"] * 8
-    )
-    operator.take_control()
-    for width, height in ((1366, 768), (1024, 700)):
-        operator.page.set_viewport_size({"width": width, "height": height})
-        expect(operator.page.locator("#hold-procedure")).to_be_visible()
-        assert operator.cut_off() == []

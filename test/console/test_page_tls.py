@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import socket
-import ssl
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Error, Page, expect
+from playwright.sync_api import Browser, Page, expect
 
 from test.console.conftest import ServedConsole
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -43,29 +43,3 @@ def test_a_person_takes_control_and_stops_over_tls(browser: Browser, over_tls: S
         assert time.monotonic() < deadline
         time.sleep(0.01)
     page.context.close()
-
-
-def test_without_the_token_one_only_watches_over_tls_too(browser: Browser, over_tls: ServedConsole):
-    page = opened(browser, over_tls.url.split("#")[0])
-    page.wait_for_function("() => window.console_stats.states > 0")
-    expect(page.locator("#control")).to_be_disabled()
-    page.context.close()
-
-
-def test_a_browser_refuses_a_certificate_that_nobody_vouches_for(browser: Browser, over_tls: ServedConsole):
-    page = browser.new_context().new_page()
-    with pytest.raises(Error, match="ERR_CERT_AUTHORITY_INVALID"):
-        page.goto(over_tls.url)
-    page.context.close()
-
-
-@pytest.mark.parametrize("last_header", ["Connection: close", "Connection: keep-alive"])
-def test_stopping_closes_a_connection_that_the_browser_does_not_close(over_tls: ServedConsole, last_header: str):
-    port = int(over_tls.url.split(":")[2].split("/")[0])
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    with socket.create_connection(("127.0.0.1", port)) as plain, context.wrap_socket(plain) as encrypted:
-        encrypted.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{last_header}\r\n\r\n".encode())
-        assert encrypted.recv(15) == b"HTTP/1.1 200 OK"
-        over_tls.run(over_tls.server.stop())
-        over_tls.run(over_tls.all_closed())

@@ -12,8 +12,8 @@ from aiohttp import web
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from magnetosuture_thread.console.server import server_context
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.console.tls import server_context
 from magnetosuture_thread.errors import ConfigurationError
 from test.console.visitor import TOKEN, Console, run
 

@@ -16,16 +16,16 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from test.console.scene import RecordingGraph, RecordingHost
 
 TOKEN = "a-token-of-the-tests"
-WAIT_TIMEOUT = 10.0  # [s]
+WAIT_TIMEOUT = 30.0  # [s]
 REST = (0.0, 0.0)
 EAST, NORTH = (0.003, 0.0), (0.0, 0.003)  # what a page asks for that holds a direction [m/s]
 
 
-async def until(condition: Callable[[], Any]) -> Any:
+async def until(condition: Callable[[], Any], what: str = "the condition", timeout: float = WAIT_TIMEOUT) -> Any:
     """Wait until a condition holds, and return what it gave."""
-    end = time.monotonic() + WAIT_TIMEOUT
+    end = time.monotonic() + timeout
     while not (result := condition()):
-        assert time.monotonic() < end, "the condition has not come true"
+        assert time.monotonic() < end, f"waited for {what}"
         await asyncio.sleep(0.002)
     return result
 
@@ -37,31 +37,58 @@ class Page:
         self.socket = socket  # an aiohttp.ClientWebSocketResponse
         self.received: list[dict[str, Any]] = []
         self.frames: list[bytes] = []
+        self.graph: dict[str, Any] = {}
+        self.host: dict[str, Any] = {}
+        self.lease: dict[str, Any] = {}
         self.number = 0
-        self.answers = True
         self.reading = asyncio.create_task(self._read())
+        self._held: asyncio.Task[None] | None = None
 
     async def _read(self) -> None:
         async for message in self.socket:
-            what = "state"
+            what = "frame"
             if message.type is aiohttp.WSMsgType.BINARY:
                 self.frames.append(message.data)
-                what = "frame"
             else:
-                self.received.append(json.loads(message.data))
-                if self.received[-1]["type"] != "state":
+                content = json.loads(message.data)
+                self.received.append(content)
+                if (what := content["type"]) != "state":
                     continue
-            if self.answers:
-                with contextlib.suppress(ConnectionError):
-                    await self.send(type="acknowledge", kind=what)
+                self.graph, self.host, self.lease = (content[name] for name in ("graph", "host", "lease"))
+            with contextlib.suppress(ConnectionError):
+                await self.send(type="acknowledge", kind=what)
 
     async def send(self, **message: Any) -> None:
         """Send a message."""
         await self.socket.send_str(json.dumps(message))
 
+    async def ask(self, **message: Any) -> str:
+        """Send a request and return the refusal, empty if it was done."""
+        before = len(self.of("result"))
+        await self.send(**message)
+        await until(lambda: len(self.of("result")) > before, f"an answer to {message}; {self.of('error')}", 120.0)
+        return str(self.of("result")[-1]["refusal"])
+
     async def jog(self, x: float, y: float, speed: float = 0.003, sent: float | None = None) -> None:
         """Send a jog message."""
         await self.send(type="jog", direction=[x, y], speed=speed, sent=time.monotonic() if sent is None else sent)
+
+    def hold(self, x: float, y: float, speed: float = 0.003) -> None:
+        """Hold a key from now on."""
+
+        async def repeat() -> None:
+            while True:
+                await self.jog(x, y, speed)
+                await asyncio.sleep(0.02)
+
+        self._held = asyncio.create_task(repeat())
+
+    async def release(self) -> None:
+        """Release the key."""
+        if self._held is not None:
+            self._held.cancel()
+            await asyncio.gather(self._held, return_exceptions=True)
+        await self.send(type="end_jog")
 
     def tear(self) -> None:
         """End the TCP connection without a word."""
@@ -71,20 +98,22 @@ class Page:
         """Return the received messages of a type."""
         return [message for message in self.received if message["type"] == kind]
 
-    async def pictures(self, count: int) -> None:
-        """Wait until so many frames have come."""
-        await until(lambda: len(self.frames) >= count)
-
-    @property
-    def lease(self) -> dict[str, Any]:
-        """The control lease of the last state."""
-        states = self.of("state")
-        return states[-1]["lease"] if states else {}
-
     async def acquire_control(self) -> None:
         """Acquire control, and wait for the state that shows it."""
         await self.send(type="acquire_control")
         await until(lambda: self.lease.get("holder") == self.number)
+
+
+@contextlib.asynccontextmanager
+async def opened(url: str) -> AsyncIterator[Page]:
+    """Open the page at an address as the command prints it, with its token."""
+    address, token = url.split("/#token=")
+    async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}/socket") as socket:
+        page = Page(socket)
+        await page.send(type="hello", token=token)
+        yield page
+        await page.release()
+        page.reading.cancel()
 
 
 class Console:

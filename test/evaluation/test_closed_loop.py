@@ -107,31 +107,6 @@ def test_only_the_time_of_steering_counts():
     assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (4, 3, 1, 0)
 
 
-def test_a_needle_that_stays_lost_is_counted_to_the_end():
-    loop = Loop()
-    for index in range(10):
-        stamp = 10**9 + index * 10**7
-        if index == 5:
-            continue  # the rig had no time
-        loop.truth(stamp)
-        if index < 4:
-            loop.pose(stamp)
-            loop.wish(stamp, LENGTH)
-        else:
-            loop.state(stamp, 2)
-    summary = loop.collector.summary("x")
-    assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (9, 4, 5, 1)
-    assert summary.duration == pytest.approx(0.09)
-
-
-def test_the_tip_of_a_curved_needle_is_at_the_end_of_its_arc():
-    loop = Loop(curvature=200.0)
-    loop.truth(10**9)
-    loop.pose(10**9)
-    loop.wish(10**9, math.sin(1.4) / 200.0, (1.0 - math.cos(1.4)) / 200.0)
-    assert loop.collector.summary("x").path_error < 1e-9
-
-
 def test_a_run_without_a_pose_says_what_the_nodes_said():
     loop = Loop()
     loop.truth(10**9)

@@ -15,7 +15,6 @@ from magnetosuture_thread.evaluation import colours
 from magnetosuture_thread.evaluation.estimation import (
     Consistency,
     DisturbanceLog,
-    EstimationFigures,
     HiddenShares,
     compare_errors,
     hidden_part,
@@ -67,16 +66,6 @@ def test_errors_of_prediction_and_estimate_have_the_same_names():
     assert found["estimate"]["error_measured_max_percent"] == pytest.approx(0.9)
 
 
-def test_a_run_without_estimates_has_none():
-    run = RunMetrics(1.0)
-    run.add(frame(0.0, None, ground_truth=LINE))
-    found = compare_errors(run.series)
-    assert set(found["estimate"].values()) == {None}
-    assert found["prediction"]["error_ground_truth_mean_percent"] == pytest.approx(2.0)
-    assert not run.estimation.estimated
-    assert run.estimation == EstimationFigures()
-
-
 def test_the_band_is_that_of_a_mean_of_squares():
     low, high = mean_band(np.array([16, 2400]))
     for count, a, b in zip((16, 2400), low, high, strict=True):
@@ -101,11 +90,6 @@ def test_innovations_larger_than_expected_are_not():
     found = consistency_of(1.5 * random.standard_normal((500, 16)) ** 2)
     assert found.within == 0
     assert (found.means > found.high).all()
-
-
-def test_a_short_run_is_one_window_and_one_frame_too():
-    assert consistency_of(np.ones((20, 16))).windows == 1
-    assert consistency_of(np.ones((1, 16))).windows == 1
 
 
 def test_a_time_without_measurement_is_no_window():
@@ -184,19 +168,6 @@ def test_disturbances_of_one_beginning_are_one_event():
     assert second.begin_s == pytest.approx(0.85)
 
 
-def test_each_thread_has_a_colour_of_its_own_for_the_colour_blind_too():
-    """Distances in CIE Lab as red-green blind readers see them (Machado 2009) of what is drawn as a plain line."""
-    deuteranopia = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
-    protanopia = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-    for ground, names in (("light", list(colours.BY_NAME)), ("dark", ["measured", "predicted", "estimated"])):
-        linear = [linear_rgb(getattr(colours.BY_NAME[name], ground)) for name in names]
-        for seen_by in (np.eye(3), np.array(deuteranopia), np.array(protanopia)):
-            lab = [cie_lab(seen_by @ each) for each in linear]
-            for a in range(len(names)):
-                for b in range(a):
-                    assert np.linalg.norm(lab[a] - lab[b]) > 20.0, (names[a], names[b], ground)
-
-
 def test_the_colours_are_those_of_the_operator_s_page():
     page = files("magnetosuture_thread.console").joinpath("page/colours.js").read_text(encoding="utf-8")
     given = dict(re.findall(r'export const (\w+) = "(#\w{6}|rgba\([^)]*\))"', page))
@@ -204,17 +175,3 @@ def test_the_colours_are_those_of_the_operator_s_page():
     assert given["MODEL"] == colours.PREDICTED.light
     parts = [int(part) for part in re.findall(r"\d+", given["MEASURED"])[:3]]
     assert "#" + "".join(f"{part:02x}" for part in parts) == colours.MEASURED.light
-
-
-def linear_rgb(colour: str) -> np.ndarray:
-    """Return the linear components of a colour."""
-    parts = np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)]) / 255.0
-    return np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-
-
-def cie_lab(linear: np.ndarray) -> np.ndarray:
-    """Return a colour in CIE Lab."""
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    scaled = to_xyz @ np.clip(linear, 0.0, 1.0) / np.array([0.9505, 1.0, 1.089])
-    f = np.where(scaled > 0.008856, np.cbrt(scaled), 7.787 * scaled + 16.0 / 116.0)
-    return np.array([116.0 * f[1] - 16.0, 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])

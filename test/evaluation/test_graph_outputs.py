@@ -13,8 +13,7 @@ from rich.console import Console
 
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import Percentiles, error_figures, stage_latencies
-from magnetosuture_thread.evaluation.pull import pull_error_percent
+from magnetosuture_thread.evaluation.metrics import Percentiles, stage_latencies
 from magnetosuture_thread.evaluation.tables import summary_table
 
 
@@ -95,10 +94,10 @@ def test_the_pull_is_compared_with_the_ground_truth_in_percent_of_its_peak():
         if true is not None:
             wrench = Message(force=Message(x=true[0], y=true[1]))
             collector.add("/ground_truth/thread_pull", Message(header=header(k * 10**9), wrench=wrench))
-    series = collector.metrics(start=10**9).series
-    assert series.column("pull_error") == pytest.approx([5.0, 0.0, math.nan], nan_ok=True)
-    assert pull_error_percent(series) == pytest.approx(100.0 * math.sqrt(25.0 / 2.0) / 10.0)
-    assert math.isnan(pull_error_percent(GraphCollector(length=1.0).metrics().series))
+    metrics = collector.metrics(start=10**9)
+    assert metrics.series.column("pull_error") == pytest.approx([5.0, 0.0, math.nan], nan_ok=True)
+    assert metrics.pull_error_percent == pytest.approx(100.0 * math.sqrt(25.0 / 2.0) / 10.0)
+    assert math.isnan(GraphCollector(length=1.0).metrics().pull_error_percent)
 
 
 def estimate(nanoseconds: int, points: np.ndarray, degrees: int) -> Message:
@@ -150,14 +149,6 @@ def test_a_command_counts_as_driven_only_if_it_was_followed():
     assert collector.applied == {5}
 
 
-def test_the_last_word_of_every_node_is_kept():
-    collector = GraphCollector(length=1.0)
-    for text in ("starting", "lost"):
-        status = Message(name="vision_tracker: state", message=text)
-        collector.add("/diagnostics", Message(header=header(1), status=[status]))
-    assert collector.health == {"vision_tracker": "lost"}
-
-
 def test_latencies_pair_stamps():
     published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
     arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}
@@ -169,12 +160,6 @@ def test_latencies_pair_stamps():
     assert pose.maximum == pytest.approx(0.03)
     assert step.median == pytest.approx(0.01)
     assert found["command to currents"] is None
-
-
-def test_figures_of_nothing_are_none():
-    assert error_figures([]) is None
-    assert error_figures([float("nan")]) is None
-    assert Percentiles.of([]) is None
 
 
 def test_the_table_says_what_is_simulated_and_fits_a_terminal():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from magnetosuture_thread import (
     ThreadPredictor,
 )
 from magnetosuture_thread.forecast import NeedleDrag
-from magnetosuture_thread.forecast.rollout import roll_out
 from magnetosuture_thread.model.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.scene import Dish
@@ -64,7 +62,7 @@ def safety(of: Scene) -> NeedleSafetyFilter:
 @pytest.fixture(scope="module")
 def forecaster() -> ThreadForecaster:
     """Return a forecaster; kernels are compiled once for all."""
-    return ThreadForecaster(thread(), scene(), safety(scene()), law=LAW, friction_averaging=AVERAGING, workers=3)
+    return ThreadForecaster(thread(), scene(), safety(scene()), law=LAW, friction_averaging=AVERAGING)
 
 
 def by_hand(
@@ -145,8 +143,6 @@ def test_a_command_that_friction_does_not_slow_is_forecast_so(forecaster: Thread
     assert slowed.slowdown.min() < 1.0
     assert free.slowdown.tolist() == [1.0] * len(free.slowdown)
     assert np.hypot(*free.filtered[-1]) > np.hypot(*slowed.filtered[-1])
-    (batch,) = forecaster.forecasts(start, [UP], HORIZON, slowed=False)
-    assert same(batch, free)
 
 
 def test_forecast_goes_on_from_where_a_predictor_is(forecaster: ThreadForecaster):
@@ -182,24 +178,6 @@ def test_the_thread_of_a_start_is_forecast_in_place_of_the_own(forecaster: Threa
     assert same(before, one.forecast(start, UP, HORIZON)), "it is of that start alone"
 
 
-def test_the_needle_s_own_drag_does_not_depend_on_what_is_learned_of_the_thread():
-    own, drag = thread(), NeedleDrag(0.0255, 0.033, 1.6e-7)
-    held = replace(own, medium=replace(own.medium, drag_along=30.0 * own.medium.drag_along, drag_across=0.2))
-    before, learned = drag.numbers(own), drag.numbers(own, held)
-    assert (learned[:4] == before[:4]).all()
-    assert learned[4] == pytest.approx(0.2 * own.length)
-
-
-def test_what_is_compiled_to_warm_up_is_what_every_forecast_runs(forecaster: ThreadForecaster):
-    """Another type of commands would be compiled while poses come, for a minute at the first start on a machine."""
-    forecaster.warm_up()
-    start, steps = forecaster.straight(START), round(HORIZON / forecaster.step)
-    for commands in (UP, np.broadcast_to(UP, (steps, 2)), np.tile(UP, (steps, 1)).tolist()):
-        forecaster.forecast(start, np.asarray(commands), HORIZON)
-    dispatcher: Any = roll_out
-    assert len({signature[3] for signature in dispatcher.signatures}) == 1
-
-
 def same(one: Forecast, other: Forecast) -> bool:
     """Return whether two forecasts are equal to the last bit."""
     return (
@@ -211,21 +189,6 @@ def same(one: Forecast, other: Forecast) -> bool:
     )
 
 
-def test_batch_equals_single_forecasts(forecaster: ThreadForecaster):
-    start = forecaster.straight(START)
-    angles = np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False)
-    commands = 0.006 * np.column_stack([np.cos(angles), np.sin(angles)])
-    batch = forecaster.forecasts(start, commands, HORIZON)
-    assert all(
-        same(each, forecaster.forecast(start, command, HORIZON)) for each, command in zip(batch, commands, strict=True)
-    )
-    assert len({each.vertices[-1].tobytes() for each in batch}) == len(commands)
-    serial = ThreadForecaster(
-        forecaster.thread, forecaster.scene, forecaster.safety, law=LAW, friction_averaging=AVERAGING, workers=1
-    )
-    assert all(map(same, batch, serial.forecasts([start] * len(commands), commands, HORIZON)))
-
-
 def test_sequence_and_controller_equal_held_command(forecaster: ThreadForecaster):
     start, steps = forecaster.straight(START), round(HORIZON / STEP)
     held = forecaster.forecast(start, UP, HORIZON)
@@ -233,14 +196,15 @@ def test_sequence_and_controller_equal_held_command(forecaster: ThreadForecaster
     asked: list[float] = []
 
     def controller(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        np.testing.assert_array_equal(
-            np.append(tail, heading), np.append(held.tails[len(asked)], held.headings[len(asked)])
-        )
+        expected = np.append(held.tails[len(asked)], held.headings[len(asked)])
+        np.testing.assert_array_equal(np.append(tail, heading), expected)
         asked.append(time)
         return UP
 
     assert same(forecaster.forecast(start, controller, HORIZON), held)
     np.testing.assert_allclose(asked, held.times[:-1])
+    with pytest.raises(InvalidInputError, match="controller"):
+        forecaster.forecast(start, lambda time, tail, heading: np.full(2, np.nan), HORIZON)
 
 
 def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
@@ -307,15 +271,11 @@ def test_first_contact_names_shape_and_time():
     [
         ({"vertices": np.full((41, 2), np.nan)}, "nodes"),
         ({"vertices": np.zeros((40, 2))}, "nodes"),
-        ({"vertices": np.zeros((41, 3))}, "nodes"),
         ({"velocities": np.full((41, 2), np.inf)}, "velocities"),
         ({"interval": -1.0}, "interval"),
         ({"tip_velocity": np.array([np.nan, 0.0])}, "tip velocity"),
         ({"needle_force": np.zeros(3)}, "needle force"),
         ({"pose": NeedlePose(0.0, np.array([np.nan, 0.0]), EAST)}, "position"),
-        ({"pose": NeedlePose(math.nan, np.zeros(2), EAST)}, "stamp"),
-        ({"pose": NeedlePose(0.0, np.zeros(2), np.array([2.0, 0.0]))}, "heading"),
-        ({"pose": NeedlePose(0.0, np.zeros(3), np.array([1.0, 0.0, 0.0]))}, "needle pose: got tail and heading"),
         ({"pose": NeedlePose(0.0, np.array([0.006, 0.0]), EAST)}, "first node"),
         ({"pose": NeedlePose(0.0, np.array([0.005, 0.0055]), EAST), "vertices": None}, "inside of a shape"),
         ({"pose": NeedlePose(0.0, np.array([0.015, 0.0]), EAST), "vertices": None}, "inside of a shape or the wall"),
@@ -342,16 +302,6 @@ def test_commands_of_other_shape_or_not_finite_are_refused(forecaster: ThreadFor
         forecaster.forecast(forecaster.straight(START), commands, HORIZON)
 
 
-def test_batch_that_does_not_fit_is_refused(forecaster: ThreadForecaster):
-    start = forecaster.straight(START)
-    with pytest.raises(InvalidInputError, match="starts"):
-        forecaster.forecasts([start], [UP, UP], HORIZON)
-    with pytest.raises(InvalidInputError, match="commands"):
-        forecaster.forecasts(start, [], HORIZON)
-    with pytest.raises(InvalidInputError, match="controller"):
-        forecaster.forecast(start, lambda time, tail, heading: np.full(2, np.nan), HORIZON)
-
-
 def test_filter_of_another_scene_and_other_settings_are_refused():
     where = scene()
     with pytest.raises(ConfigurationError, match="scene"):
@@ -364,8 +314,3 @@ def test_filter_of_another_scene_and_other_settings_are_refused():
         ThreadForecaster(thread(), where, drag=NeedleDrag(along=0.001, across=0.03, turning=1e-7))
     with pytest.raises(ConfigurationError, match="margin_range"):
         ThreadForecaster(thread(), where, law=LAW, margin_range=1e-4)
-
-
-def test_predictor_that_has_not_started_is_refused():
-    with pytest.raises(InvalidInputError, match="start"):
-        ForecastStart.of_predictor(ThreadPredictor(thread(), scene()))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis, needle_chord, needle_points
+from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis, needle_points
 
 LENGTH = 0.007
 
@@ -23,13 +23,6 @@ def test_an_arc_has_its_length_its_tangents_and_its_curvature(curvature: float):
     turned = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     assert turned[0] == pytest.approx(0.7)
     assert (turned[-1] - turned[0]) / LENGTH == pytest.approx(curvature, abs=1e-6)
-
-
-@pytest.mark.parametrize("curvature", [0.0, 150.0, -300.0])
-def test_the_chord_leads_from_tail_to_tip(curvature: float):
-    points, _ = needle_axis(np.zeros(2), 0.4, LENGTH, curvature, np.array([1.0]))
-    chord, turn = needle_chord(LENGTH, curvature)
-    np.testing.assert_allclose(chord * turn @ [np.cos(0.4), np.sin(0.4)], points[0], atol=1e-15)
 
 
 @pytest.mark.parametrize("curvature", [0.0, 150.0, -300.0])
@@ -50,15 +43,6 @@ def test_points_of_the_body_reach_from_tail_to_tip_and_move_as_a_rigid_body(curv
     middle = 0.5 * points[-1]
     moved = (points - middle) @ rotation.T + middle - points
     np.testing.assert_allclose(moved / (0.5 * length * angle), turning, atol=1e-6)
-
-
-@pytest.mark.parametrize(("length", "pieces"), [(0.006, 10), (0.0066, 11), (0.0054, 9), (0.0054, 18), (0.007, 1)])
-def test_the_middle_is_among_the_points_also_where_the_spacing_divides_the_length(length: float, pieces: int):
-    points = needle_points(length, 200.0, length / pieces).points
-    assert len(points) == pieces + pieces % 2 + 1
-    middle, _ = needle_axis(np.zeros(2), 0.0, length, 200.0, np.array([0.5]))
-    np.testing.assert_allclose(points[len(points) // 2], middle[0], atol=1e-15)
-    assert len(needle_points(0.006, 0.0, 0.0006).points) == 11  # of a quotient that rounding makes more than 10
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

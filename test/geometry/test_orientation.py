@@ -12,7 +12,6 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import (
     heading_angle,
     heading_from_quaternion,
-    round_trip_heading,
     yaw_quaternion,
 )
 
@@ -33,12 +32,6 @@ def test_of_a_tilted_needle_the_heading_is_that_of_its_projection(size: float):
         heading = heading_from_quaternion(x, y, z, w, "field")
         assert math.hypot(*heading) == pytest.approx(1.0, abs=1e-12)
         assert heading == pytest.approx(along / np.linalg.norm(along), abs=1e-12 if size == 1.0 else 0.01)
-
-
-@pytest.mark.parametrize("angle", [0.3, -2.0, math.pi])
-def test_a_round_trip_is_that_through_a_message(angle: float):
-    heading = np.array([math.cos(angle), math.sin(angle)])
-    assert round_trip_heading(heading, "field") == pytest.approx(heading, abs=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -17,7 +16,6 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, make, read, stamped, texts, write_many_chunks, write_mcap
 
 
@@ -62,33 +60,6 @@ def test_a_damaged_bag_is_shown_all_the_same(damaged: Path, capsys: pytest.Captu
     assert "/camera/image_raw *" in shown
     assert "is damaged" in shown
     assert shown.count("damaged_0.mcap, bytes") >= 3
-
-
-def test_oddities_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "odd.mcap"
-    point, turn = (
-        make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0),
-        make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-    )
-    pose = make("geometry_msgs/msg/Pose", point, turn)
-    data = cdr("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose)
-    messages = [
-        ("/ground_truth/needle", 1, data),
-        ("/ground_truth/thread", 2, cdr(STRING, "a")),
-        ("/a", 3, cdr(STRING, "a")),
-    ]
-    types = {
-        "/ground_truth/needle": "geometry_msgs/msg/PoseStamped",
-        "/ground_truth/thread": STRING,
-        "/a": STRING,
-        "/b": HEADER,
-    }
-    write_mcap(path, [*messages, ("/b", 4, b"")], types)
-    assert cli.main(["bag", "check", str(path), "--remap", "/a:=/both"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "/ground_truth/needle has the frame world, which is not connected to dish" in shown
-    assert "/ground_truth/thread is of type std_msgs/msg/String, expected" in shown
-    assert "/b: 1 stamps cannot be read" in shown
 
 
 @pytest.mark.parametrize("text", ["camera", "/camera:="])
@@ -173,18 +144,6 @@ def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path:
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_no_bag_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    for action in (["check"], ["repair", "--output", str(tmp_path / "new")]):
-        assert cli.main(["bag", *action, str(tmp_path / "nothing")]) == 1
-        errors = capsys.readouterr().err
-        assert "does not exist" in errors
-        assert errors.count("\n") == 1
-    assert not (tmp_path / "new").exists()
-    shutil.rmtree(tmp_path)
-    with pytest.raises(BagError):
-        Bag(tmp_path)
-
-
 def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
@@ -195,28 +154,3 @@ def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for words, is_told in (([], True), (["--frame", "world"], False)):
         assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
         assert ("is not connected to dish" in capsys.readouterr().out) == is_told
-
-
-def test_the_table_is_readable_at_80_columns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("COLUMNS", "80")
-    types = {
-        "/needle/measured_cp": "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "/camera/image_raw/compressed": STRING,
-    }
-    messages = [("/camera/image_raw/compressed", 10**15 + index * 10**8, cdr(STRING, "a")) for index in range(5000)]
-    write_mcap(tmp_path / "a.mcap", messages, types)
-    assert cli.main(["bag", "check", str(tmp_path / "a.mcap")]) == 0
-    shown = capsys.readouterr().out
-    assert re.search(r"/camera/image_raw/compressed +5000 +10\.00 +0\.00 +499\.90 +0\.10 +0", shown), shown
-    assert re.search(r"topic +messages +Hz +first +last +gap +back", shown)
-    assert "/needle/measured_cp: geometry_msgs/PoseWithCovarianceStamped" in shown
-
-
-def test_a_full_disk_names_no_file_that_is_gone(tmp_path: Path):
-    output = tmp_path / "run"
-    command = [sys.executable, "-c", FULL, str(output), "result"]
-    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
-    assert said.startswith(f"{output}: cannot be written: the disk takes no larger file after")
-    assert "can be read" not in said

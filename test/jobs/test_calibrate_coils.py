@@ -10,16 +10,16 @@ import pytest
 from magnetosuture_thread import cli
 from magnetosuture_thread.cli.commands.calibrate import calibrate_coils
 from magnetosuture_thread.coils.calibration import read_calibration
-from magnetosuture_thread.coils.field import coils_around, make_coils
+from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import BagError, InvalidInputError
 
 ANGLES = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)
 
 
-def probe(folder: Path, reach: float = 0.015, model: str = "loops", background: float = 3e-5) -> Path:
+def probe(folder: Path, reach: float = 0.015, background: float = 3e-5) -> Path:
     """Write what a probe reads of four coils, and without current."""
-    coils, random = make_coils(model, coils_around(ANGLES, 0.052, 0.024, 1.1e-3)), np.random.default_rng(0)
+    coils, random = LoopCoils(coils_around(ANGLES, 0.052, 0.024, 1.1e-3)), np.random.default_rng(0)
     lines = ["coil,current,x,y,bx,by"]
     for coil, current in ((0, 0.0), (0, 2.0), (1, 2.0), (2, -2.0), (3, 2.0)):
         for x, y in reach * random.uniform(-0.7, 0.7, (20, 2)):
@@ -30,22 +30,21 @@ def probe(folder: Path, reach: float = 0.015, model: str = "loops", background: 
     return path
 
 
-@pytest.mark.parametrize("model", ["loops", "dipoles"])
 def test_a_calibration_is_written_that_the_bridge_takes(
-    tmp_path: Path, model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("COLUMNS", "120")
     output = tmp_path / "rig_7.yaml"
-    measurements = probe(tmp_path, model=model)
-    assert cli.main(["calibrate-coils", str(measurements), "--output", str(output), "--model", model]) == 0
+    measurements = probe(tmp_path)
+    assert cli.main(["calibrate-coils", str(measurements), "--output", str(output)]) == 0
     shown = capsys.readouterr().out
-    assert f"coils as {model}" in shown
+    assert "coils as loops" in shown
     assert "coil_3" in shown
     assert "100 readings, residual" in shown
     assert "is in line" in shown
     assert str(output) in shown
     written = read_calibration(output)
-    assert (written.name, written.model) == ("rig_7", model)
+    assert written.name == "rig_7"
     assert "100 readings in probe.csv" in written.notes
     assert len(written.date) == 10
     settings = CoilBridgeSettings(calibration=str(output))
@@ -54,8 +53,8 @@ def test_a_calibration_is_written_that_the_bridge_takes(
         assert coil.distance == pytest.approx(0.052, rel=0.1)
         assert coil.field_per_current == pytest.approx(1.1e-3, rel=0.02)
     point = np.array([0.008, -0.006])
-    truth = make_coils(model, coils_around(ANGLES, 0.052, 0.024, 1.1e-3)).per_current(point)
-    np.testing.assert_allclose(written.field().per_current(point), truth, atol=2e-5)
+    truth = LoopCoils(coils_around(ANGLES, 0.052, 0.024, 1.1e-3)).per_current(point)
+    np.testing.assert_allclose(LoopCoils(written.coils).per_current(point), truth, atol=2e-5)
 
 
 def test_what_is_poorly_determined_is_marked(

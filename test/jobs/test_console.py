@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import signal
@@ -12,11 +11,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import numpy as np
 import pytest
 import rclpy
@@ -26,12 +24,13 @@ from rclpy.context import Context
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.inbox import Inbox
+from magnetosuture_thread.nodes.console.graph import Inbox
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
+from test.console.visitor import Page, opened, until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "post_wrap"
 OTHER = "petri_35mm_polyamide_post"
-WAIT = 60.0  # s
+WAIT = 120.0  # s
 
 
 class Console:
@@ -57,7 +56,7 @@ class Console:
     def end(self) -> int:
         """Press Ctrl-C, and return its exit code."""
         self.process.send_signal(signal.SIGINT)
-        code = self.process.wait(30.0)
+        code = self.process.wait(60.0)
         self._reading.join(10.0)
         return code
 
@@ -86,93 +85,6 @@ def running(*arguments: str, **environment: str) -> Iterator[Console]:
                 console.end()
 
 
-class Page:
-    """What a page in a browser does, without one."""
-
-    def __init__(self, socket: aiohttp.ClientWebSocketResponse[bool]) -> None:
-        self._socket = socket
-        self._held: asyncio.Task[None] | None = None
-        self._answers: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
-        self.frames = 0
-        self.errors: list[str] = []
-        self.busy: set[str] = set()
-        self.graph: dict[str, Any] = {}
-        self.host: dict[str, Any] = {}
-
-    async def send(self, message_type: str, **fields: Any) -> None:
-        """Send a message."""
-        await self._socket.send_str(json.dumps({"type": message_type, **fields}))
-
-    async def ask(self, message_type: str, **fields: Any) -> str:
-        """Ask for something and return the refusal, empty if it was done."""
-        await self.send(message_type, **fields)
-        try:
-            answer = await asyncio.wait_for(self._answers.get(), WAIT)
-        except asyncio.TimeoutError:
-            raise AssertionError(f"no answer to {message_type} {fields}; {self.errors[-5:]}") from None
-        return str(answer["refusal"])
-
-    def hold(self, direction: tuple[float, float], speed: float) -> None:
-        """Hold a key from now on."""
-
-        async def again_and_again() -> None:
-            while True:
-                await self.send("jog", direction=list(direction), speed=speed, sent=time.monotonic())
-                await asyncio.sleep(0.02)
-
-        self._held = asyncio.create_task(again_and_again())
-
-    async def let_go(self) -> None:
-        """Let the key go."""
-        if self._held is not None:
-            self._held.cancel()
-            await asyncio.gather(self._held, return_exceptions=True)
-        await self.send("end_jog")
-
-    async def until(self, condition: Callable[[], Any], what: str) -> None:
-        """Wait until the page is told something."""
-        deadline = time.monotonic() + WAIT
-        while not (self.graph and condition()):
-            assert time.monotonic() < deadline, (
-                f"waited for {what}; {self.errors[-5:]}, {self.host}, {self.graph.get('bridge')}"
-            )
-            await asyncio.sleep(0.02)
-
-    async def listen(self) -> None:
-        """Hear what the page is told."""
-        async for message in self._socket:
-            if message.type is aiohttp.WSMsgType.BINARY:
-                self.frames += 1
-                await self.send("acknowledge", kind="frame")
-                continue
-            told = json.loads(message.data)
-            if told["type"] == "state":
-                self.graph, self.host = told["graph"], told["host"]
-                self.busy.add(self.host["busy"])
-                await self.send("acknowledge", kind="state")
-            elif told["type"] == "result":
-                self._answers.put_nowait(told)
-            elif told["type"] == "error":
-                self.errors.append(told["text"])
-        self.errors.append(f"the connection ended with {self._socket.close_code}")
-
-
-@asynccontextmanager
-async def opened(url: str) -> Any:
-    """Open the page at an address as the command prints it."""
-    address, token = url.split("/#token=")
-    async with aiohttp.ClientSession() as session, session.ws_connect(f"{address}/socket") as socket:
-        page = Page(socket)
-        await page.send("hello", token=token)
-        listening = asyncio.create_task(page.listen())
-        try:
-            yield page
-        finally:
-            await page.let_go()
-            listening.cancel()
-            await asyncio.gather(listening, return_exceptions=True)
-
-
 @contextmanager
 def wire(domain: int) -> Iterator[Inbox]:
     """Give what goes to the simulated coils."""
@@ -191,76 +103,58 @@ def tail(page: Page) -> np.ndarray:
     return np.array(page.graph["needle"]["tail"])
 
 
-async def steer_and_stop(page: Page, currents: Inbox, recordings: Path) -> None:
-    """Arm, steer, record, stop in an emergency, and choose another scenario."""
-    await page.until(lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
-    assert page.host["mode"] == "simulated"
-    assert page.host["simulated"]
-    assert OTHER in page.host["setups"]
-    assert not page.graph["bridge"]["armed"]
-    assert await page.ask("acquire_control") == ""
-    assert await page.ask("record", recording=True) == ""
-    await page.until(lambda: page.host["recording"], "the recording")
-    assert await page.ask("bridge_action", action="arm") == ""
-    before = tail(page)
-    page.hold((1.0, 0.0), 0.005)
-    await page.until(lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
-    assert abs(tail(page)[1] - before[1]) < 1e-3
-    await page.until(lambda: any(page.graph["bridge"]["current"]), "currents")
-    assert page.graph["filter"]["commanded"] == [0.005, 0.0]
-    assert await page.ask("pause", paused=True) == ""
-    await page.until(lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
-    await page.until(lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
-    await page.let_go()
-    assert await page.ask("pause", paused=False) == ""
-    await page.until(lambda: page.graph["needle"]["age"] < 0.5, "poses again")
-    await page.let_go()  # what was held before counts no more
-    page.hold((1.0, 0.0), 0.003)
-    await page.until(lambda: any(page.graph["bridge"]["current"]), "currents again")
-    assert await page.ask("bridge_action", action="stop") == ""
-    await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
-    await page.let_go()
-    list(currents.take())
-    heard: list[CoilCurrents] = []
-
-    def enough() -> bool:
-        heard.extend(one for one, _ in currents.read())
-        return len(heard) > 10
-
-    await page.until(enough, "currents on the wire")
-    assert not any(any(one.current) for one in heard)
-    assert await page.ask("record", recording=False) == ""
-    check(next(recordings.iterdir()))
-    assert "expected one of" in await page.ask("select_setup", setup="../../etc/passwd.yaml")
-    await record_a_second(page)
-    assert await page.ask("select_setup", setup=OTHER) == ""
-    await page.until(lambda: page.host["setup"] == OTHER, "the other scenario to begin")
-    assert not page.host["recording"]
-    await page.until(lambda: not page.host["busy"] and page.graph["predicted"], "the other scenario")
-    assert f"starting {OTHER}" in page.busy
-    assert len(page.graph["scene"]["shapes"]) == 1
-    assert not page.graph["bridge"]["emergency_stopped"]
-    await record_a_second(page)
+async def wait(page: Page, condition: Callable[[], Any], what: str) -> None:
+    """Wait until the page shows something of a whole graph."""
+    await until(lambda: page.graph and condition(), f"{what}; {page.of('error')[-3:]}", WAIT)
 
 
 async def record_a_second(page: Page) -> None:
     """Begin a recording, and let it run for a second of the graph's time."""
-    assert await page.ask("record", recording=True) == ""
+    assert await page.ask(type="record", recording=True) == ""
     began = page.graph["time"]
-    await page.until(lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
+    await wait(page, lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
 
 
-def check(path: Path) -> Bag:
-    """Check that a recording is whole and holds what was steered."""
-    bag = Bag(path)
-    assert bag.damage is None
-    assert "control was with a script when the recording began" in bag.notes["simulated"]
-    assert "thread_model" in bag.notes["scenario"]
-    for name in ("/operator/servo_cv", "/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
-        assert bag.counts[name] > 0, name
-    wishes = [record.decode().twist.linear.x for record in bag.records({"/operator/servo_cv"})]
-    assert 0.005 in wishes
-    return bag
+async def steer_and_stop(page: Page, currents: Inbox) -> None:
+    """Arm, steer, record, pause, stop in an emergency, and choose another setup."""
+    await wait(page, lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
+    assert (page.host["mode"], page.host["simulated"]) == ("simulated", True)
+    assert not page.graph["bridge"]["armed"]
+    assert await page.ask(type="acquire_control") == ""
+    await record_a_second(page)
+    assert await page.ask(type="bridge_action", action="arm") == ""
+    before = tail(page)
+    page.hold(1.0, 0.0, 0.005)
+    await wait(page, lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
+    assert abs(tail(page)[1] - before[1]) < 1e-3
+    assert page.graph["filter"]["commanded"] == [0.005, 0.0]
+    assert await page.ask(type="pause", paused=True) == ""
+    await wait(page, lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
+    await wait(page, lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
+    assert await page.ask(type="pause", paused=False) == ""
+    await wait(page, lambda: page.graph["needle"]["age"] < 0.5, "poses again")
+    await page.release()  # what was held before counts no more
+    page.hold(1.0, 0.0)
+    await wait(page, lambda: any(page.graph["bridge"]["current"]), "currents again")
+    assert await page.ask(type="bridge_action", action="stop") == ""
+    await wait(page, lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+    list(currents.take())
+    heard: list[CoilCurrents] = []
+
+    def enough() -> bool:
+        heard.extend(message for message, _ in currents.read())
+        return len(heard) > 10
+
+    await wait(page, enough, "currents on the wire")
+    assert not any(any(message.current) for message in heard)
+    await page.release()
+    assert "expected one of" in await page.ask(type="select_setup", setup="../../etc/passwd.yaml")
+    assert await page.ask(type="select_setup", setup=OTHER) == ""
+    await wait(page, lambda: page.host["setup"] == OTHER and not page.host["recording"], "the other setup to begin")
+    await wait(page, lambda: not page.host["busy"] and page.graph["predicted"], "the other setup")
+    assert len(page.graph["scene"]["shapes"]) == 1
+    assert not page.graph["bridge"]["emergency_stopped"]
+    await record_a_second(page)
 
 
 @pytest.mark.whole_graph
@@ -269,7 +163,7 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
 
     async def use(url: str, currents: Inbox) -> None:
         async with opened(url) as page:
-            await steer_and_stop(page, currents, recordings)
+            await steer_and_stop(page, currents)
 
     with running("petri_35mm_polyamide", "--record", str(recordings)) as console:
         domain = int(console.find(r"ROS domain (\d+)"))
@@ -280,32 +174,32 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
             asyncio.run(use(url, currents))
         assert console.end() == 0
     assert console.lines[-1] == "ended"
-    bags = sorted(recordings.iterdir())
-    assert len(bags) == 3
-    assert all(Bag(path).damage is None for path in bags)
-    assert Bag(bags[-1]).notes["setup"] == OTHER
+    first, second = map(Bag, sorted(recordings.iterdir()))  # ended by the choice of a setup, and by Ctrl-C
+    assert first.damage is second.damage is None
+    assert second.notes["setup"] == OTHER
+    assert "control was with a script when the recording began" in first.notes["simulated"]
+    assert "thread_model" in first.notes["scenario"]
+    for name in ("/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
+        assert first.counts[name] > 0, name
+    assert 0.005 in [record.decode().twist.linear.x for record in first.records({"/operator/servo_cv"})]
 
 
 @pytest.mark.whole_graph
 def test_a_person_watches_a_bag():
     async def use(url: str) -> None:
         async with opened(url) as page:
-            await page.until(lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "a prediction")
-            assert page.host["mode"] == "replay"
-            assert page.host["can_pause"]
-            assert not page.host["can_record"]
-            assert await page.ask("acquire_control") == ""
-            assert "nothing can be jogged" in await page.ask("bridge_action", action="arm")
+            await wait(page, lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "a prediction")
+            assert (page.host["mode"], page.host["can_pause"], page.host["can_record"]) == ("replay", True, False)
+            assert await page.ask(type="acquire_control") == ""
+            assert "nothing can be jogged" in await page.ask(type="bridge_action", action="arm")
             assert "nothing can be jogged" in page.graph["filter"]["reason"]
-            before = page.graph["time"]
-            await page.until(lambda: page.graph["time"] > before, "time to go on")
-            assert await page.ask("pause", paused=True) == ""
-            await page.until(lambda: page.graph["predicted"]["age"] > 0.5, "time to stand still")
+            assert await page.ask(type="pause", paused=True) == ""
+            await wait(page, lambda: page.graph["predicted"]["age"] > 0.5, "time to stand still")
             still = page.graph["time"]
-            await page.until(lambda: page.graph["predicted"]["age"] > 1.0, "time to stand still for longer")
+            await wait(page, lambda: page.graph["predicted"]["age"] > 1.0, "time to stand still for longer")
             assert page.graph["time"] == still
-            assert await page.ask("pause", paused=False) == ""
-            await page.until(lambda: page.graph["time"] > still, "time to go on again")
+            assert await page.ask(type="pause", paused=False) == ""
+            await wait(page, lambda: page.graph["time"] > still, "time to go on again")
 
     with running("--replay", str(EXAMPLE)) as console:
         asyncio.run(use(console.find(r"open (http://\S+)$")))
@@ -316,17 +210,15 @@ def test_a_person_watches_a_bag():
 def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
     async def use(url: str) -> None:
         async with opened(url) as page:
-            await page.until(lambda: page.graph["bridge"] is not None, "the bridge")
-            assert page.host["mode"] == "graph"
-            assert not page.host["simulated"]
-            assert not page.host["can_pause"]
-            assert await page.ask("acquire_control") == ""
-            assert "not started from the page" in await page.ask("select_setup", setup=OTHER)
-            assert await page.ask("record", recording=True) == ""
-            assert await page.ask("bridge_action", action="arm") == ""
-            await page.until(lambda: page.graph["bridge"]["armed"], "the bridge to be armed")
-            assert await page.ask("bridge_action", action="stop") == ""
-            await page.until(lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+            await wait(page, lambda: page.graph["bridge"] is not None, "the bridge")
+            assert (page.host["mode"], page.host["simulated"], page.host["can_pause"]) == ("graph", False, False)
+            assert await page.ask(type="acquire_control") == ""
+            assert "not started from the page" in await page.ask(type="select_setup", setup=OTHER)
+            assert await page.ask(type="record", recording=True) == ""
+            assert await page.ask(type="bridge_action", action="arm") == ""
+            await wait(page, lambda: page.graph["bridge"]["armed"], "the bridge to be armed")
+            assert await page.ask(type="bridge_action", action="stop") == ""
+            await wait(page, lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
 
     with reserved_domain() as domain:
         environment = graph_environment(domain)
@@ -360,7 +252,7 @@ def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixt
 def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
     for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
         monkeypatch.delitem(sys.modules, name)
-    jobs = {f"magnetosuture_thread.jobs.{name}" for name in ("console", "console_hosts", "replay", "simulate")}
+    jobs = {f"magnetosuture_thread.jobs.{name}" for name in ("console", "graph", "replay", "simulate")}
     for name in [name for name in sys.modules if name in jobs or name.split(".")[0] == "rclpy"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "rclpy", None)

@@ -13,13 +13,13 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from examples.console_picture import AROUND, PATH, SCREEN, SPEED, WAIT, Pilot, nearby
-from magnetosuture_thread.nodes.console.inbox import Inbox
+from magnetosuture_thread.nodes.console.graph import Inbox
 from test.console.conftest import browser
 from test.jobs.test_console import running, wire
 
 __all__ = ["browser"]
 
-pytestmark = pytest.mark.whole_graph
+pytestmark = [pytest.mark.whole_graph, pytest.mark.slow]
 
 DRIFT = 1.8e-4  # m/s; at rest the needle may still be pulled by its thread: 0.1 mm in eleven frames at 20 Hz
 

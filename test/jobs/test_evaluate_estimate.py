@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.bags.message_types import MESSAGES
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.evaluation.estimation import compare_errors
@@ -22,6 +22,7 @@ from magnetosuture_thread.jobs import replay_inputs
 from magnetosuture_thread.jobs.evaluate import evaluate_bags
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.messages.packing import packed_observation, packed_path
 from magnetosuture_thread.messages.reading import path_points, stamp_of
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -53,7 +54,9 @@ def with_paths(bag: Path, folder: Path, change: Callable[[int, np.ndarray], np.n
         if old.topic != MEASURED_THREAD.recorded:
             return message
         points = change(numbers.setdefault(stamp_of(old), len(numbers)), path_points(message, old.topic))
-        return None if points is None else MESSAGES.path_message(stamp_of(old), points)
+        if points is None:
+            return None
+        return typestore().deserialize_cdr(packed_path(stamp_of(old), points), MEASURED_THREAD.type_name)
 
     return changed(bag, folder, measured)
 
@@ -172,12 +175,8 @@ def test_pieces_are_used_where_a_bag_has_them(tmp_path: Path, pushed_bag: Path):
             first = number < 20
             pieces = (piece(points, 0, 64),) if first else (piece(points, 0, 20), piece(points, 45, 64))
             observation = ThreadObservation(pieces, complete=first)
-            writer.write_message(
-                THREAD_OBSERVATION.recorded, record.time, MESSAGES.observation_message(stamp, observation)
-            )
-            writer.write_message(
-                MEASURED_THREAD.recorded, record.time, MESSAGES.path_message(stamp, points + np.array([0.0, 2e-3]))
-            )
+            writer.write(THREAD_OBSERVATION.recorded, record.time, packed_observation(stamp, observation))
+            writer.write(MEASURED_THREAD.recorded, record.time, packed_path(stamp, points + np.array([0.0, 2e-3])))
     row, _ = evaluated(tmp_path / "pieces", tmp_path / "out")
     assert (
         row["estimate"]["error_ground_truth_mean_percent"] < 0.5 * row["prediction"]["error_ground_truth_mean_percent"]

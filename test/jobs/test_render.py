@@ -12,7 +12,6 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.setups import read_setup
@@ -42,58 +41,10 @@ def test_the_bag_holds_frames_commands_and_truth_and_says_that_it_is_simulated(s
     assert info.k[0] * 0.005 / 0.3 == pytest.approx(0.005 / (0.035 / (0.9115 * 480)))
 
 
-def test_every_command_is_the_trajectorys_velocity(short_bag: Path):
-    commands = [render_bag.decode() for render_bag in Bag(short_bag).records({"/needle/servo_cv"})]
-    assert [command.twist.linear.x for command in commands] == pytest.approx([0.003] * 30, rel=1e-6)
-
-
-def test_what_exists_is_not_touched(tmp_path: Path, straight_pull: ReferenceTrajectory):
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "mine").write_text("precious")
-    with pytest.raises(BagError, match="exists already"):
-        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.2)
-    assert (tmp_path / "bag" / "mine").read_text() == "precious"
-
-
 def test_a_setup_that_differs_by_rounding_alone_is_taken(tmp_path: Path, straight_pull: ReferenceTrajectory):
     disc = Disc((0.0077, 0.0039000000000000003), 0.0015)  # as a reference trajectory has it
     other = replace(straight_pull, metadata={"boundary": "pinned", "material": {"L_m": 0.019}}, discs=(disc,))
     assert render_bag(other, read_setup("petri_35mm_polyamide_post"), tmp_path / "bag", duration=0.1) == 3
-
-
-@pytest.mark.parametrize("where", [".", "/", "..", ""])
-def test_folders_that_cannot_be_made_are_refused(straight_pull: ReferenceTrajectory, where: str):
-    with pytest.raises(BagError, match="exists already"):
-        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), Path(where), duration=0.2)
-
-
-def test_two_runs_to_one_output_do_not_harm_each_other(tmp_path: Path):
-    with whole_folder(tmp_path / "out") as first:
-        (first / "mine").write_text("first")
-        with whole_folder(tmp_path / "other" / "out") as second, whole_folder(tmp_path / "out2") as third:
-            assert len({first, second, third}) == 3
-        assert (first / "mine").read_text() == "first"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "out", "out2"]
-    assert (tmp_path / "out" / "mine").read_text() == "first"
-
-
-def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):
-    def later() -> None:
-        with whole_folder(tmp_path / "out") as second, whole_folder(tmp_path / "out") as first:
-            (first / "mine").write_text("first")
-            (second / "mine").write_text("second")
-
-    with pytest.raises(BagError, match="cannot be written"):
-        later()
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert (tmp_path / "out" / "mine").read_text() == "first"
-
-
-def test_frames_are_not_lost_by_rounding(tmp_path: Path, straight_pull: ReferenceTrajectory):
-    setup = read_setup("petri_35mm_polyamide")
-    assert render_bag(straight_pull, setup, tmp_path / "three", start=0.9, duration=0.1) == 3
-    with pytest.raises(BagError, match="hold no frame"):
-        render_bag(straight_pull, setup, tmp_path / "none", duration=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -120,16 +71,6 @@ def test_times_that_are_not_there_are_refused_and_nothing_is_left(tmp_path: Path
         with pytest.raises(BagError, match="has the times 0 to 1 s"):
             render_bag(reference, read_setup("petri_35mm_polyamide"), tmp_path / "bag", start=start, duration=duration)
     assert not (tmp_path / "bag").exists()
-
-
-def test_an_interrupted_recording_leaves_nothing(tmp_path: Path, straight_pull: ReferenceTrajectory):
-
-    def stop(share: float) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "bag", duration=0.5, progress=stop)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: ReferenceTrajectory):

@@ -24,14 +24,13 @@ from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
-from magnetosuture_thread.bags.message_types import make, typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError, ConfigurationError, GraphError
+from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.interface import (
     ESTIMATED_THREAD,
-    IMAGE,
     MARGINS,
     MEASURED_THREAD,
     NEEDLE_POSE,
@@ -43,7 +42,6 @@ from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay import replay_live
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.images import decode_image
 
 pytestmark = pytest.mark.whole_graph
 
@@ -144,21 +142,6 @@ def content(output: Path) -> dict[tuple[Channel, int], bytes]:
     return found
 
 
-def test_a_window_of_a_bag_of_poses_is_played_without_a_tracker(pose_bag: Path, tmp_path: Path):
-    """And agrees with offline: the thread starts as it is first seen in the window."""
-    summary = replay_live(pose_bag, tmp_path / "out", start=0.5, duration=1.0)
-    assert (summary.source, summary.frames, summary.tracked, summary.predicted) == ("poses", 31, 31, 31)
-    assert summary.error_truth is not None
-    assert summary.error_truth["maximum"] < 1.0
-    assert summary.commands == 31
-    assert summary.dropped == {"poses without an answer": 0, "outputs lost by the recording": 0}
-    assert summary.latency["pose to prediction"] is not None
-    assert not (tmp_path / "out" / "logs" / "vision_tracker.log").exists()
-    offline = replay_offline(pose_bag, tmp_path / "offline", start=0.5, duration=1.0)
-    assert offline.error_truth == pytest.approx(summary.error_truth, rel=1e-9)
-    agree(tmp_path / "out", tmp_path / "offline", predictions=31)
-
-
 @contextmanager
 def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
     """Give a process that is ended by Ctrl-C if the test fails: one that goes on disturbs all others."""
@@ -176,14 +159,7 @@ def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]
         finally:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
-                process.communicate(timeout=30)
-
-
-def test_an_interruption_waits_until_a_message_is_played(pose_bag: Path, tmp_path: Path, interrupting):
-    with pytest.raises(KeyboardInterrupt):
-        replay_live(pose_bag, tmp_path / "out", progress=interrupting)
-    assert len(interrupting.went_on) == 1
-    assert not (tmp_path / "out").exists()
+                process.communicate(timeout=90)
 
 
 def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
@@ -208,13 +184,16 @@ def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag:
             watch.spin_until(lambda: len(watch.predicted) > again + 10)
             assert sorted(watch.predicted[again:]) == watch.predicted[again:]
         process.send_signal(signal.SIGINT)
-        shown, errors = process.communicate(timeout=30)
+        shown, errors = process.communicate(timeout=90)
     assert errors == ""
     assert process.returncode == 0
     assert "results: out" in shown
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     assert Bag(tmp_path / "out" / "bag").counts["/thread/predicted"] == 60
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["predicted"] == 60
+    assert not (tmp_path / "out" / "logs" / "vision_tracker.log").exists()  # poses need no tracker
+    replay_offline(pose_bag, tmp_path / "offline")
+    agree(tmp_path / "out", tmp_path / "offline", predictions=60)
 
 
 class Watch:
@@ -262,7 +241,7 @@ class Watch:
 
     def spin_until(self, condition: Callable[[], bool]) -> None:
         """Listen until a condition holds."""
-        end = time.monotonic() + 30.0
+        end = time.monotonic() + 90.0
         while not condition():
             assert time.monotonic() < end
             self._executor.spin_once(timeout_sec=0.02)
@@ -317,14 +296,6 @@ def test_bad_bags_are_refused_before_anything_is_written(short_bag: Path, tmp_pa
     assert set(tmp_path.iterdir()) == before
 
 
-def test_an_output_that_exists_is_not_touched(short_bag: Path, tmp_path: Path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine").write_text("precious")
-    with pytest.raises(BagError, match="exists already"):
-        replay_live(short_bag, tmp_path / "out")
-    assert (tmp_path / "out" / "mine").read_text() == "precious"
-
-
 def test_a_bad_setup_is_refused_before_anything_starts(short_bag: Path, tmp_path: Path):
     path = tmp_path / "bad.yaml"
     path.write_text("/**/thread_model: {ros__parameters: {segments: 1}}\n")
@@ -333,46 +304,7 @@ def test_a_bad_setup_is_refused_before_anything_starts(short_bag: Path, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_a_bag_of_raw_frames_alone_is_played(short_bag: Path, tmp_path: Path):
-    """The bag says which kind its images are, not the setup; one that names no setup gets the default."""
-    with BagWriter(tmp_path / "raw") as writer:
-        writer.add_topic(IMAGE.recorded, IMAGE.type_name)
-        for each in Bag(short_bag).records({FRAMES}):
-            message = each.decode()
-            pixels = decode_image(message.data)
-            image = make(
-                IMAGE.type_name,
-                header=message.header,
-                height=pixels.shape[0],
-                width=pixels.shape[1],
-                encoding="bgr8",
-                is_bigendian=0,
-                step=3 * pixels.shape[1],
-                data=pixels.ravel(),
-            )
-            writer.write_message(IMAGE.recorded, each.time, image)
-    count_diagnostics: list[str] = []
-    summary = replay_live(tmp_path / "raw", tmp_path / "out", log=count_diagnostics.append)
-    assert (summary.frames, summary.tracked, summary.commands, summary.driven) == (30, 28, 0, 0)
-    assert summary.error_truth is None
-    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in count_diagnostics)
-    assert summary.simulated == ""
-
-
-def test_a_bag_in_which_nothing_is_seen_fails_and_leaves_nothing(short_bag: Path, tmp_path: Path):
-    """The needle that is expected is far longer than the one in the frames."""
-    path = tmp_path / "other.yaml"
-    path.write_text("/**: {ros__parameters: {scene: dish_35mm, needle_length: 0.02}}\n")
-    with pytest.raises(
-        GraphError,
-        match=r"none of 30 frames gave a prediction, 0 had a needle; .*vision_tracker: .*searching: no needle",
-    ):
-        replay_live(short_bag, tmp_path / "out", setup_name=str(path), rate=4.0)
-    assert [p.name for p in tmp_path.iterdir()] == ["other.yaml"]
-
-
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_replay_ends_its_nodes_and_leaves_nothing(tmp_path: Path, end: signal.Signals):
+def test_a_replay_that_is_terminated_ends_its_nodes_and_leaves_nothing(tmp_path: Path):
     example = Path(__file__).parents[2] / "examples" / "post_wrap"
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(example), "--output", "out"]
     with started(command, tmp_path) as process:
@@ -382,8 +314,8 @@ def test_an_interrupted_replay_ends_its_nodes_and_leaves_nothing(tmp_path: Path,
                 break
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert len(children) == 2  # tracker and model are in one
-        process.send_signal(end)
-        _, errors = process.communicate(timeout=30)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=90)
     assert process.returncode == 1
     assert "interrupted" in errors
     assert "Traceback" not in errors

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from magnetosuture_thread.bags.message_types import MESSAGES
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.interface import SCENE
+from magnetosuture_thread.interface import COMPRESSED_IMAGE, IMAGE, SCENE
 from magnetosuture_thread.jobs.replay import GraphInput
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, open_bag
-from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.messages.scene import packed_scene, parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from magnetosuture_thread.vision.images import decode_image
 
 POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
 OLD = "vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\nthread_model: {ros__parameters: {length: 0.019}}\n"
@@ -36,7 +38,7 @@ def copied(short_bag: Path, tmp_path: Path):
             for time, topic, data in records:
                 while waiting and waiting[0][0] <= time:
                     at, scene = waiting.pop(0)
-                    message = MESSAGES.scene_message(at, scene)
+                    message: Any = typestore().deserialize_cdr(packed_scene(at, scene), SCENE.type_name)
                     message.version = version or message.version
                     writer.write_message(SCENE.recorded, at, message)
                 writer.write(topic, time, data)
@@ -111,3 +113,21 @@ def test_a_scene_that_changes_on_the_way_is_played_when_it_does(copied):
         told = [record for record in GraphInput(found).records() if record.topic == SCENE.recorded]
         assert [parse_scene_message(record.decode()) for record in told] == [Scene(), POST]
         assert told[1].time == pytest.approx(found.begin + 4e8, abs=1e8)
+
+
+def test_raw_frames_are_played_as_such_whatever_the_setup_says(short_bag: Path, tmp_path: Path):
+    """A bag that names no setup gets the default."""
+    with BagWriter(tmp_path / "raw") as writer:
+        writer.add_topic(IMAGE.recorded, IMAGE.type_name)
+        for record in Bag(short_bag).records({COMPRESSED_IMAGE.recorded}):
+            message = record.decode()
+            pixels = decode_image(message.data)
+            size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": 3 * pixels.shape[1]}
+            image = {"header": message.header, "encoding": "bgr8", "is_bigendian": 0, "data": pixels.ravel(), **size}
+            writer.write_message(IMAGE.recorded, record.time, make(IMAGE.type_name, **image))
+    logged: list[str] = []
+    with open_bag(tmp_path / "raw", logged.append) as found:
+        arguments = GraphInput(found).arguments(tmp_path / "qos.yaml")
+        assert "vision_tracker:image_transport:=raw" in arguments
+        assert GraphInput(found).channels == [SCENE, IMAGE]
+    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in logged)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,14 +18,8 @@ from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.cli.commands.calibrate import calibrate_camera
-from magnetosuture_thread.cli.commands.evaluate import track_table
-from magnetosuture_thread.errors import BagError, InvalidInputError
-from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.jobs import track as frames
-from magnetosuture_thread.jobs.render import render_bag
-from magnetosuture_thread.jobs.track import FrameSource, settings_with, track
+from magnetosuture_thread.jobs.track import track
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.bags.bags import copy_with_notes
@@ -43,14 +36,6 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> str:
     text = capsys.readouterr().err
     assert text.count("\n") == 1
     return text
-
-
-def rate_of(video: Path) -> float:
-    """Return a video's frames a second."""
-    capture = cv2.VideoCapture(str(video))
-    rate = capture.get(cv2.CAP_PROP_FPS)
-    capture.release()
-    return float(rate)
 
 
 def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -80,12 +65,6 @@ def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytes
     assert "2 tracked, 2 lost" in capsys.readouterr().out
 
 
-def test_single_files_are_taken_in_their_order():
-    seen = track([SAMPLES / "frame_03.png", SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
-    assert [frame.name for frame in seen] == ["frame_03.png", "frame_00.png"]
-    assert all(frame.track.state is State.TRACKED for frame in seen)
-
-
 def test_files_of_one_name_are_told_apart_and_each_has_its_overlay(tmp_path: Path):
     image = cv2.imread(str(SAMPLES / "frame_00.png"))
     assert image is not None
@@ -110,21 +89,9 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     assert row["stamp_s"] == pytest.approx(1.0 + 5 / 30.0, abs=1e-6)
     np.testing.assert_allclose(row["tail_m"], [0.003 + 0.003 * 5 / 30.0, 0.002], atol=8e-5)
     assert video.stat().st_size > 1000
-    assert rate_of(video) == pytest.approx(30.0, abs=0.01)
-
-
-def test_an_overlay_video_has_the_rate_of_the_bag(tmp_path: Path, straight_pull: ReferenceTrajectory):
-    render_bag(straight_pull, read_setup("petri_35mm_polyamide"), tmp_path / "slow", duration=0.8, rate=7.0)
-    track([tmp_path / "slow"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "seen.mp4")
-    assert rate_of(tmp_path / "seen.mp4") == pytest.approx(7.0, abs=0.01)
-    track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene(), overlay=tmp_path / "pictures.mp4")
-    assert rate_of(tmp_path / "pictures.mp4") == pytest.approx(30.0)
-
-
-def test_a_bag_whose_stamps_stand_still_has_the_rate_of_pictures(short_bag: Path, monkeypatch: pytest.MonkeyPatch):
-    source = FrameSource([short_bag])
-    monkeypatch.setattr(frames, "_stamp", lambda message: 5.0)
-    assert source.rate() == 30.0
+    capture = cv2.VideoCapture(str(video))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0, abs=0.01)
+    capture.release()
 
 
 def test_of_broken_frames_in_a_bag_the_json_says_null(
@@ -144,25 +111,6 @@ def test_of_broken_frames_in_a_bag_the_json_says_null(
     assert "30 frames" in capsys.readouterr().out
 
 
-def test_what_is_no_number_is_null_and_the_table_leaves_it_empty():
-    (frame,) = track([SAMPLES / "frame_00.png"], VisionTrackerSettings(), Scene())
-    nothing = np.full(2, np.nan)
-    broken = replace(
-        frame.track,
-        tail=nothing,
-        tip=nothing,
-        heading=nothing,
-        curvature=np.nan,
-        confidence=np.inf,
-        centreline=np.vstack([frame.track.centreline, nothing]),
-    )
-    row = replace(frame, track=broken).to_json()
-    json.dumps(row, allow_nan=False)
-    for key in ("tail_m", "tip_m", "heading_rad", "curvature_per_m", "thread_m", "confidence"):
-        assert row[key] is None
-    assert track_table([row]).row_count == 1
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [("nowhere", "does not exist"), ("empty", "holds no pictures"), ("file.mcap", "is empty, expected an mcap file")],
@@ -174,25 +122,6 @@ def test_paths_without_frames_are_refused_in_one_line(
     (tmp_path / "file.mcap").write_bytes(b"")
     assert cli.main(["track", str(tmp_path / name)]) == 1
     assert words in error_of(capsys)
-
-
-def test_a_bag_among_pictures_is_refused(short_bag: Path):
-    with pytest.raises(BagError, match="expected it alone"):
-        track([SAMPLES / "frame_00.png", short_bag], VisionTrackerSettings(), Scene())
-
-
-def test_what_of_the_view_is_given_is_taken():
-    settings = settings_with(VisionTrackerSettings(), 9e-5, (320.0, 240.0))
-    assert (settings.metres_per_pixel, settings.dish_centre_px) == (9e-5, (320.0, 240.0))
-    assert settings_with(settings, None, None) == settings
-
-
-@pytest.mark.parametrize("wrong", [["--centre", "1"], ["--metres-per-pixel", "0"], ["--json", "/no/such/x.json"]])
-def test_wrong_use_is_2(wrong: list[str], capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["track", str(SAMPLES), *wrong])
-    assert ended.value.code == 2
-    assert capsys.readouterr().err
 
 
 def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -231,18 +160,6 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
     assert "camera_info.width" in error_of(capsys)
 
 
-def test_frames_that_show_no_dish_or_no_markers_calibrate_nothing(tmp_path: Path):
-    cv2.imwrite(str(tmp_path / "plain.png"), np.full((480, 640, 3), 90, np.uint8))
-    with pytest.raises(InvalidInputError, match="with a dish"):
-        calibrate_camera([tmp_path / "plain.png"], 0.035, tmp_path / "camera.yaml")
-    with pytest.raises(InvalidInputError, match="no marker 0, 1, 2, 3"):
-        calibrate_camera([tmp_path / "plain.png"], 0.035, tmp_path / "camera.yaml", (0.05, 0.005))
-    (tmp_path / "broken.png").write_bytes(b"")
-    with pytest.raises(BagError, match="no frame that can be read"):
-        calibrate_camera([tmp_path / "broken.png"], 0.035, tmp_path / "camera.yaml")
-    assert not (tmp_path / "camera.yaml").exists()
-
-
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_said(
     plugin: StoragePlugin, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -265,23 +182,6 @@ def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_sai
     output = str(tmp_path / "camera.yaml")
     assert cli.main(["calibrate-camera", *given, "--dish-diameter", "0.035", "--output", output]) == 0
     assert "has no checksums" in " ".join(capsys.readouterr().out.split())
-
-
-def test_a_damaged_bag_is_said(tmp_path: Path):
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage")
-        for index in range(3):
-            bag.write("/camera/image_raw/compressed", index * 10**10, b"")
-    file = tmp_path / "bag" / "bag_0.mcap"
-    file.write_bytes(file.read_bytes()[:-40])
-    said: list[str] = []
-    track([file], VisionTrackerSettings(), Scene(), log=said.append)
-    assert any("is damaged" in line for line in said)
-
-
-def test_pictures_have_no_topic_to_remap():
-    with pytest.raises(BagError, match="is no bag"):
-        FrameSource([SAMPLES / "frame_00.png"], remap={"/a": "/b"})
 
 
 def test_an_orientation_is_ignored_and_said(tmp_path: Path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -16,9 +15,10 @@ from magnetosuture_msgs.srv import EditShape
 
 from magnetosuture_thread.interface import ADD_SHAPE, ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
-from test.jobs.test_console import Page, opened, tail
+from test.console.visitor import Page, opened
+from test.jobs.test_console import tail, wait
 from test.nodes.conftest import Graph
 
 pytestmark = pytest.mark.whole_graph
@@ -49,7 +49,6 @@ class Rigs:
     environment: dict[str, str]
     graph: Graph
     currents: dict[str, list[Any]]
-    scenes: dict[str, list[Any]]
 
     def currents_flow(self, space: str) -> bool:
         """Return whether any current has gone to the coils of a rig since what came before was dropped."""
@@ -76,119 +75,79 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
         graph = Graph(domain)
         stack.callback(graph.close)
         currents = {space: graph.listen_later(within(space, topics.RIG_CURRENTS)) for space in (LEFT, RIGHT)}
-        scenes = {space: graph.listen_later(within(space, topics.SCENE)) for space in (LEFT, RIGHT)}
         logs = {space: folder / space / "console.log" for space in (LEFT, RIGHT)}
         address = re.compile(r"the operator's page: (\S+)")
         graph.wait(lambda: all(address.search(log.read_text()) for log in logs.values()), "both pages", 240.0)
         urls = {space: address.findall(log.read_text())[0] for space, log in logs.items()}
-        yield Rigs(urls, environment, graph, currents, scenes)
+        yield Rigs(urls, environment, graph, currents)
 
 
 async def ready(page: Page) -> None:
-    """Wait until a page's rig runs and its needle is tracked."""
-    await page.until(
-        lambda: page.graph["predicted"] and page.graph["needle"] and page.graph["bridge"]["driver_ready"], "the rig"
-    )
+    """Wait until a page's rig runs, its needle is tracked, and only its own nodes are shown."""
+    await wait(page, lambda: page.graph["predicted"] and page.graph["needle"], "the rig")
+    await wait(page, lambda: page.graph["bridge"]["driver_ready"], "the bridge")
+    own = {*ALL_NODES, "console"} - {PLANNER, "path_follower"}
+    await wait(page, lambda: set(page.graph["nodes"]) == own, "the nodes of its rig")
+    assert await page.ask(type="acquire_control") == ""
 
 
 async def jog(page: Page) -> None:
-    """Take control, arm, and move the needle to the right by a millimetre; the key stays down."""
-    assert await page.ask("acquire_control") == ""
-    assert await page.ask("bridge_action", action="arm") == ""
+    """Arm, and move the needle to the right by a millimetre; the key stays down."""
+    assert await page.ask(type="bridge_action", action="arm") == ""
     before = tail(page)
-    page.hold((1.0, 0.0), 0.003)
-    await page.until(lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
+    page.hold(1.0, 0.0)
+    await wait(page, lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
 
 
-def test_arming_and_commands_of_one_page_reach_its_own_rig_alone(rigs: Rigs):
-    async def use() -> None:
-        async with opened(rigs.urls[LEFT]) as left, opened(rigs.urls[RIGHT]) as right:
-            await ready(left)
-            await ready(right)
-            for received in rigs.currents.values():
-                received.clear()
-            still = tail(right)
-            await jog(left)
-            assert rigs.currents_flow(LEFT)
-            assert not right.graph["bridge"]["armed"]
-            assert not rigs.currents_flow(RIGHT)
-            assert len(rigs.currents[RIGHT]) > 10
-            assert np.linalg.norm(tail(right) - still) < 5e-4  # it may still be drawn by its thread
-            await left.let_go()
-
-    asyncio.run(use())
-
-
-def test_a_page_shows_its_own_rig_alone(rigs: Rigs):
-    async def use(space: str) -> None:
-        async with opened(rigs.urls[space]) as page:
-            await ready(page)
-            own = {*ALL_NODES, "console"} - {PLANNER, "path_follower"}
-            await page.until(lambda: set(page.graph["nodes"]) == own, "the nodes of its rig")
-            assert page.host["simulated"]
-            assert page.host["mode"] == "graph"
-
-    for space in (LEFT, RIGHT):
-        asyncio.run(use(space))
-
-
-def test_an_emergency_stop_and_a_reset_reach_one_bridge_alone(rigs: Rigs):
-    async def use() -> None:
-        async with opened(rigs.urls[LEFT]) as left, opened(rigs.urls[RIGHT]) as right:
-            await ready(left)
-            assert await left.ask("acquire_control") == ""
-            assert await left.ask("bridge_action", action="arm") == ""
-            await asyncio.to_thread(rigs.stop, RIGHT)
-            await right.until(lambda: right.graph["bridge"]["emergency_stopped"], "the emergency stop")
-            await left.until(lambda: left.graph["bridge"]["armed"], "the other rig to be armed still")
-            assert not left.graph["bridge"]["emergency_stopped"]
-            assert await left.ask("bridge_action", action="stop") == ""
-            await left.until(lambda: left.graph["bridge"]["emergency_stopped"], "its own emergency stop")
-            assert await right.ask("acquire_control") == ""
-            assert await right.ask("bridge_action", action="reset") == ""
-            await right.until(lambda: not right.graph["bridge"]["emergency_stopped"], "the reset")
-            assert left.graph["bridge"]["emergency_stopped"]
-            assert await left.ask("bridge_action", action="reset") == ""
-
-    asyncio.run(use())
-
-
-def test_commands_on_a_remapped_topic_reach_the_rig_that_has_the_remap(rigs: Rigs):
+def test_commands_of_one_page_reach_its_own_rig_alone_also_on_a_remapped_topic(rigs: Rigs):
     """The rig on the right takes its operator's commands from another topic, as its page publishes them there."""
     commands = rigs.graph.listen(within(RIGHT, topics.OPERATOR_COMMAND, OTHER_NAME))
-    unused = rigs.graph.listen_later(within(RIGHT, topics.OPERATOR_COMMAND))
 
     async def use() -> None:
-        async with opened(rigs.urls[RIGHT]) as right:
+        async with opened(rigs.urls[LEFT]) as left, opened(rigs.urls[RIGHT]) as right:
+            await ready(left)
             await ready(right)
-            for received in rigs.currents.values():
-                received.clear()
-            await jog(right)
-            assert rigs.currents_flow(RIGHT)
-            await right.let_go()
+            for page, other, space, other_space in ((left, right, LEFT, RIGHT), (right, left, RIGHT, LEFT)):
+                for received in rigs.currents.values():
+                    received.clear()
+                still = tail(other)
+                await jog(page)
+                assert rigs.currents_flow(space)
+                assert not other.graph["bridge"]["armed"]
+                assert not rigs.currents_flow(other_space)
+                assert np.linalg.norm(tail(other) - still) < 5e-4  # it may still be drawn by its thread
+                await page.release()
+                assert await page.ask(type="bridge_action", action="disarm") == ""
+                await wait(page, lambda page=page: not page.graph["bridge"]["armed"], "the bridge to be disarmed")
 
     asyncio.run(use())
     assert any(message.twist.linear.x == 0.003 for message in commands)
-    assert unused == []
-    assert not rigs.graph.matched(within(RIGHT, topics.OPERATOR_COMMAND))
-    assert not rigs.currents_flow(LEFT)
 
 
-def test_a_shape_that_is_added_to_one_scene_is_not_in_the_other(rigs: Rigs):
+def test_an_emergency_stop_a_reset_and_a_new_shape_reach_one_rig_alone(rigs: Rigs):
     graph = rigs.graph
     client = graph.probe.create_client(EditShape, f"/{RIGHT}/{ADD_SHAPE}")
     graph.wait(client.service_is_ready, "the scene server")
-    graph.wait(lambda: all(rigs.scenes.values()), "both scenes")
 
     async def use() -> None:
         async with opened(rigs.urls[LEFT]) as left, opened(rigs.urls[RIGHT]) as right:
             await ready(left)
+            await ready(right)
+            assert await left.ask(type="bridge_action", action="arm") == ""
+            await asyncio.to_thread(rigs.stop, RIGHT)
+            await wait(right, lambda: right.graph["bridge"]["emergency_stopped"], "the emergency stop")
+            await wait(left, lambda: left.graph["bridge"]["armed"], "the other rig to be armed still")
+            assert not left.graph["bridge"]["emergency_stopped"]
+            assert await left.ask(type="bridge_action", action="stop") == ""
+            await wait(left, lambda: left.graph["bridge"]["emergency_stopped"], "its own emergency stop")
+            assert await right.ask(type="bridge_action", action="reset") == ""
+            await wait(right, lambda: not right.graph["bridge"]["emergency_stopped"], "the reset")
+            assert left.graph["bridge"]["emergency_stopped"]
             answer = client.call_async(EditShape.Request(name="hook", shape=DISC))
-            await right.until(lambda: answer.done() and right.graph["scene"]["shapes"], "the shape")
+            await wait(right, lambda: answer.done() and right.graph["scene"]["shapes"], "the shape")
             assert answer.result().success
-            since = time.monotonic()
-            await left.until(lambda: time.monotonic() - since > 1.0, "a second")
+            since = left.graph["time"]
+            await wait(left, lambda: left.graph["time"] > since + 1.0, "a second")
             assert left.graph["scene"]["shapes"] == []
 
     asyncio.run(use())
-    assert [len(rigs.scenes[space]) for space in (LEFT, RIGHT)] == [1, 2]

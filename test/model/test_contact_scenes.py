@@ -102,30 +102,3 @@ def test_a_shape_that_appears_around_a_moving_node_pushes_it_out_or_no_margin_is
     assert proven[-1]
     assert max(depths) < DEPTH
     assert all(proven[:59])
-
-
-def test_more_shapes_at_once_than_rows_of_contacts_at_first():
-    """Small discs with friction on both sides of a straight thread, many more than rows of contacts at first."""
-    discs = [Disc((-1e-3 - 4.5e-4 * k, side * 4.4e-4), 4e-4) for k in range(36) for side in (-1.0, 1.0)]
-    predictor = ThreadPredictor.create(
-        "polyamide_7_0", length=0.019, segments=25, scene=scene_of(*discs, friction=0.2), margin_range=2e-3
-    )
-    tail = np.zeros(2)
-    predictor.start(NeedlePose(0.0, tail, EAST))
-    for k in range(1, 61):
-        prediction = predictor.step(NeedlePose(k / RATE, np.array([2e-3 * k / RATE, 0.0]), EAST))
-        assert prediction.converged
-        assert prediction.residual < 1e-6
-        assert prediction.margins["obstacle"].value.min() > -DEPTH
-
-
-def test_a_thread_that_starts_inside_of_a_shape_comes_out_or_says_that_it_did_not():
-    predictor = ThreadPredictor.create(
-        "polyamide_7_0", length=0.019, segments=25, scene=scene_of(Disc((-8e-3, 5e-4), 2e-3), friction=0.1)
-    )
-    predictor.start(NeedlePose(0.0, np.zeros(2), EAST), strict=False)
-    for k in range(1, 61):
-        prediction = predictor.step(NeedlePose(k / RATE, np.array([2e-3 * k / RATE, 0.0]), EAST))
-        if prediction.converged:
-            assert prediction.margins["obstacle"].value.min() > -DEPTH
-    assert prediction.converged

@@ -5,19 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.model.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.model.margins import (
-    UNKNOWN,
     Friction,
     FrictionLaw,
     FrictionState,
     Margins,
     NodeMotion,
-    friction_colour,
 )
 
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=2e-4)
@@ -62,23 +59,6 @@ def test_the_bound_counts_where_it_is_to_and_where_there_is_one():
     assert replace(by_bound, by_bound=False).classify(bounded, np.ones(8)).nodes == ()
 
 
-def test_the_threshold_is_of_the_clearance():
-    """At 0.96 mm from the discs; the threshold is not within."""
-    avoided = barriers(*GATE)["obstacle"]
-    near = float(avoided.clearance[avoided.node == 3].max())
-    assert near == pytest.approx(np.hypot(0.5e-3, 1.9e-3) - 1e-3)
-    for threshold, count in ((0.999 * near, 0), (1.001 * near, 2)):
-        assert len(FrictionLaw(threshold, 0.9, 0.0).classify(barriers(*GATE), np.ones(8)).nodes) == count
-
-
-def test_a_node_at_the_threshold_itself_is_free():
-    """Two rows of one node with the same clearance, as no roundings can be told apart in a scene."""
-    node, near = np.array([[3], [3]]), np.full(2, 5e-4)
-    margins = Margins.of([BarrierRows("obstacle", node, np.array([0, 1]), near, np.zeros((2, 1, 2)), near)], 0.0)
-    assert FrictionLaw(5e-4, 0.9, 0.0).classify(margins, np.ones(8)).state is FrictionState.FREE
-    assert FrictionLaw(np.nextafter(5e-4, 1.0), 0.9, 0.0).classify(margins, np.ones(8)).nodes == (3,)
-
-
 def test_the_needle_itself_is_no_friction_of_the_thread():
     at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
     assert LAW.classify(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
@@ -105,47 +85,8 @@ def test_speeds_are_averaged():
     np.testing.assert_allclose(back.update(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
 
 
-def test_without_an_interval_it_begins_anew():
-    motion = NodeMotion(0.0)
-    motion.update(np.zeros((3, 2)), 0.1)
-    assert motion.update(np.full((3, 2), 1e-3), 0.1).min() > 0.0
-    np.testing.assert_array_equal(motion.update(np.full((3, 2), 9e-3), 0.0), np.zeros(3))
-
-
 def test_trembling_is_no_motion():
     """A pose that is off by 0.02 mm, back and forth at 30 Hz, which is 1.2 mm/s from each to the next."""
     motion, thread = NodeMotion(0.2), np.zeros((3, 2))
     speeds = [motion.update(thread + np.array([(-1.0) ** k * 2e-5, 0.0]), 1.0 / 30.0).max() for k in range(60)]
     assert max(speeds) < 2e-4
-
-
-def test_without_averaging_or_with_other_nodes_it_begins_anew():
-    motion = NodeMotion(0.0)
-    motion.update(np.zeros((3, 2)), 0.0)
-    np.testing.assert_allclose(motion.update(np.full((3, 2), 3e-4), 0.1), np.full(3, np.hypot(3e-3, 3e-3)))
-    np.testing.assert_array_equal(motion.update(np.ones((5, 2)), 0.1), np.zeros(5))
-
-
-def test_colours_tell_the_state():
-    def of(state: FrictionState, count: int = 0) -> tuple[float, float, float]:
-        return friction_colour(Friction(state, tuple(range(count)), 1.0))
-
-    free, blue = of(FrictionState.FREE), of(FrictionState.STUCK, 3)
-    assert free[1] == max(free)
-    assert blue[2] == max(blue)
-    shades = [of(FrictionState.SLIDING, count) for count in (1, 5, 10, 20, 40)]
-    assert all(red > green > blue for red, green, blue in shades)
-    assert [green for _, green, _ in shades] == sorted((green for _, green, _ in shades), reverse=True)
-    assert len(set(shades)) == 4  # no deeper beyond twenty
-    assert len(set(friction_colour(UNKNOWN))) == 1
-
-
-def test_friction_that_is_unknown_does_not_slow_the_needle():
-    assert barriers(*GATE).friction == Friction(FrictionState.UNKNOWN, (), 1.0)
-
-
-@pytest.mark.parametrize("beta", [0.5, 0.9, 1.0])
-def test_each_node_counts_as_one_factor(beta: float):
-    slowed = FrictionLaw(2e-3, beta, 0.0).classify(barriers(*GATE), np.ones(8))
-    assert len(slowed.nodes) > 2
-    assert slowed.slowdown == pytest.approx(beta ** len(slowed.nodes))

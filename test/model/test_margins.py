@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -22,8 +20,6 @@ def rows(barrier: str, nodes: list[int], obstacle: list[int], clearance: list[fl
 
 CONNECTIVITY = rows("connectivity", [1, 2, 3], [NO_OBSTACLE] * 3, [1e-9, -1e-9, 0.0])
 OBSTACLE = rows("obstacle", [3, 7, 7, 5], [0, 0, 1, 2], [4e-5, 2e-3, 5e-5, -1e-6])
-WALL = rows("wall", [6, 7], [NO_OBSTACLE] * 2, [3e-3, 2e-5])
-NONE = rows("obstacle", [], [], [])
 
 
 def test_barriers_are_found_by_their_names_in_their_order():
@@ -52,35 +48,3 @@ def test_the_minimum_of_each_barrier_is_named():
 @pytest.mark.parametrize(("tolerance", "touching"), [(5e-5, (3, 5, 7)), (1e-5, (5,)), (0.0, (5,)), (1.0, (3, 5, 7))])
 def test_nodes_within_the_tolerance_touch(tolerance: float, touching: tuple[int, ...]):
     assert Margins.of([CONNECTIVITY, OBSTACLE], tolerance).in_contact == touching
-
-
-def test_who_touches_the_wall_touches():
-    found = Margins.of([CONNECTIVITY, OBSTACLE, WALL], 4.5e-5)
-    assert found.in_contact == (3, 5, 7)
-    assert [(least.barrier, int(least.node[0]), int(least.obstacle[0])) for least in found.minima] == [
-        ("connectivity", 2, -1),
-        ("obstacle", 5, 2),
-        ("wall", 7, -1),
-    ]
-    assert Margins.of([CONNECTIVITY, WALL], 1e-5).in_contact == ()
-
-
-def test_a_barrier_without_rows_has_no_bound():
-    found = Margins.of([CONNECTIVITY, NONE], 5e-5)
-    assert [least.barrier for least in found.minima] == ["connectivity"]
-    assert found.in_contact == ()
-    assert len(found["obstacle"]) == 0
-    assert found["obstacle"].minimum == found["obstacle"].minimum_clearance == math.inf
-
-
-@pytest.mark.parametrize("barriers", [[], [NONE]])
-def test_there_may_be_no_row_at_all(barriers: list[BarrierRows]):
-    found = Margins.of(barriers, 5e-5)
-    assert (found.minima, found.in_contact) == ((), ())
-
-
-@pytest.mark.parametrize("barrier", [NONE, CONNECTIVITY, OBSTACLE])
-def test_the_tables_have_the_types_of_the_message(barrier: BarrierRows):
-    (found,) = Margins.of([barrier], 5e-5).barriers
-    tables = (found.node, found.obstacle, found.value, found.clearance)
-    assert [table.dtype for table in tables] == [np.uint32, np.int32, np.float64, np.float64]

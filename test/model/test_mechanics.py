@@ -87,30 +87,6 @@ def test_a_thread_in_its_rest_shape_has_no_bending_force():
     assert np.abs(wrong_way).max() > 1.9 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
 
 
-def test_in_space_the_rest_shape_may_lie_any_way():
-    bent = np.column_stack([arc(12, 0.1), np.zeros(13)])
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    rest, nothing = np.full(11, 0.1), np.zeros(3)
-    flat, turned = gradient_of(bent, nothing, False, rest), gradient_of(bent @ turn.T, nothing, False, rest)
-    np.testing.assert_allclose(flat @ turn.T, turned, atol=1e-13)
-    np.testing.assert_array_equal(gradient_of(bent, nothing, False, -rest), flat)  # there is no left
-    np.testing.assert_allclose(flat[:, :2], gradient_of(bent[:, :2].copy(), np.zeros(2), False, rest), atol=1e-13)
-
-
-@pytest.mark.parametrize("turn", [0.05, 0.2, 0.4])
-def test_a_chord_is_shorter_than_its_arc(turn: float):
-    chords = np.empty(30)
-    mechanics.chord_lengths(arc(30, turn), np.zeros(2), False, chords)
-    assert chords[10] == pytest.approx(2.0 * np.sin(0.5 * turn) / turn, abs=turn**4 / 20.0)
-
-
-def test_a_kink_between_straight_segments_shortens_none():
-    corner = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [2.0, 1.0], [2.0, 2.0]])
-    chords = np.empty(4)
-    mechanics.chord_lengths(corner, np.zeros(2), False, chords)
-    np.testing.assert_array_equal(chords, 1.0)
-
-
 def metric_of(positions: np.ndarray, along: float = 0.5, inertia: float = 0.0) -> np.ndarray:
     """Return the compiled metric."""
     nodes, dimension = positions.shape
@@ -125,18 +101,6 @@ def test_drag_is_half_along_the_thread_and_less_than_half_at_its_end():
     np.testing.assert_allclose(metric[3], 13.0 / 12.0 * np.diag([0.5, 1.0]))
     np.testing.assert_allclose(metric[4], 5.0 / 12.0 * np.diag([0.5, 1.0]))
     np.testing.assert_allclose(metric.sum(axis=0), 4.0 * np.diag([0.5, 1.0]))
-
-
-def test_drag_turns_with_the_thread():
-    positions = np.random.default_rng(2).normal(size=(5, 2))
-    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    np.testing.assert_allclose(metric_of(positions @ turn.T), turn @ metric_of(positions) @ turn.T, atol=1e-14)
-
-
-def test_a_folded_thread_has_a_drag():
-    """Its node has no tangent."""
-    metric = metric_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]))
-    np.testing.assert_allclose(metric[1], np.eye(2))
 
 
 @pytest.mark.parametrize("clamped", [False, True])
@@ -163,33 +127,3 @@ def test_tension_is_the_slope_of_its_energy(clamped: bool):
         hessian += np.diag(couplings[apart - 1, :-apart], apart) + np.diag(couplings[apart - 1, :-apart], -apart)
     assert np.linalg.eigvalsh(hessian).min() > -1e-12
     np.testing.assert_allclose(hessian.sum(axis=1)[2:], 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("clamped", [False, True])
-def test_the_force_of_tension_is_that_where_the_velocities_lead(clamped: bool):
-    """Implicit in u: q(x + dt u) = q(x) + P u, for turns that are resolved."""
-    random, heading, tension, interval = np.random.default_rng(5), np.array([-1.0, 0.0]), np.linspace(1.0, 2.0, 6), 0.3
-    positions = np.arange(7.0)[:, None] * np.array([1.0, 0.0]) + 0.01 * random.normal(size=(7, 2))
-    velocities, programs = 1e-3 * random.normal(size=(7, 2)), []
-    for at in (positions, positions + interval * velocities):
-        program = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
-        mechanics.tension_stiffness(at, heading, clamped, tension, -1.0, interval, program)
-        programs.append(program)
-    blocks, couplings, linear = programs[0]
-    expected = linear + np.einsum("iab,ib->ia", blocks, velocities)
-    for apart in range(1, 4):
-        coupled = couplings[apart - 1, :-apart, None]
-        expected[:-apart] += coupled * velocities[apart:]
-        expected[apart:] += coupled * velocities[:-apart]
-    np.testing.assert_allclose(programs[1][2], expected, rtol=1e-3, atol=1e-7)
-
-
-def test_a_push_counts_no_more_than_its_bound():
-    positions = np.cumsum([[1.0, 0.1 * (-1.0) ** k] for k in range(7)], axis=0)
-    found = []
-    for tension in (-100.0, -12.0 * 0.3):  # of two segments over 24
-        program = np.zeros((7, 2, 2)), np.zeros((3, 7)), np.zeros((7, 2))
-        mechanics.tension_stiffness(positions, np.zeros(2), False, np.full(6, tension), -0.3, 0.5, program)
-        found.append(np.concatenate([part.ravel() for part in program]))
-    np.testing.assert_allclose(found[0], found[1])
-    assert found[0].any()

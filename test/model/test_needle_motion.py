@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import cmath
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from magnetosuture_thread import NeedlePose, ThreadPredictor
+from magnetosuture_thread import NeedlePose
 from magnetosuture_thread.model.needle_motion import (
-    ACCELERATION,
     MAX_INTERVAL,
-    MAX_SPEED,
-    MAX_TURNING,
-    TURNING,
     NeedleMotionFilter,
-    filter_pose,
 )
-from magnetosuture_thread.model.prediction import NeedleMotion
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
@@ -88,20 +81,6 @@ def test_poses_whose_deviation_is_not_known_are_as_they_were():
     assert motion.update(pose) is pose
 
 
-def test_after_a_change_of_mind_nothing_of_the_velocity_is_known():
-    """Whatever was known of it, and however well: the covariance is that of a needle that was only just there."""
-    state, measured_at = np.array([0.0, 0.0, 0.3, 4e-3, 0.0, 0.5]), np.array([0.0, 3e-4, 0.3])
-    sizes, found = np.array([1e-5, 1e-5, 5e-3, 1e-4, 1e-4, 1e-2]), []
-    root = sizes[:, None] * np.random.default_rng(10).normal(size=(6, 6))
-    unknown = np.diag([0.0, 0.0, 0.0, MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2])
-    unknown[:3, :3] = (root @ root.T)[:3, :3]
-    for covariance in (root @ root.T, unknown):
-        moved = state.copy()
-        filter_pose(moved, covariance, measured_at, 1.0 / RATE, PLACE**2, ANGLE**2)
-        found.append(np.concatenate([moved, covariance.ravel()]))
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-9, atol=1e-18)
-
-
 def test_after_a_gap_or_out_of_order_a_pose_stays_as_it_was():
     random, motion = np.random.default_rng(5), NeedleMotionFilter()
     for k in range(20):
@@ -112,79 +91,6 @@ def test_after_a_gap_or_out_of_order_a_pose_stays_as_it_was():
     assert after.motion is not None
     far = measured(on_circle(20 / RATE + 1.01 * MAX_INTERVAL), random)
     assert motion.update(far) is far
-
-
-def test_a_heading_that_passes_pi_is_no_turn():
-    random, motion, turnings = np.random.default_rng(6), NeedleMotionFilter(), []
-    for k in range(round(2.0 * math.pi * RADIUS / SPEED * RATE)):
-        pose = motion.update(measured(on_circle(k / RATE), random))
-        turnings.append(pose.motion.turning if pose.motion is not None else 0.0)
-    assert np.abs(turnings[60:]).max() < 1.5
-
-
-def after_arc(state: np.ndarray, interval: float) -> np.ndarray:
-    """Return a state after a motion that is constant as the needle has it: an arc of a circle, exactly."""
-    x, y, angle, along, across, turning = state.tolist()
-    half = 0.5 * turning * interval
-    way = complex(along, across) * interval * math.sin(half) / half * cmath.exp(1j * (angle + half))
-    return np.array([x + way.real, y + way.imag, angle + 2.0 * half, along, across, turning])
-
-
-def slope_of_arc(state: np.ndarray, interval: float) -> np.ndarray:
-    """Return the derivative of the state after an arc by the state, by differences."""
-    steps = np.diag([1e-9, 1e-9, 1e-5, 1e-7, 1e-7, 1e-4])
-    columns = [(after_arc(state + step, interval) - after_arc(state - step, interval)) / step.max() for step in steps]
-    return 0.5 * np.column_stack(columns)
-
-
-def test_pose_and_covariance_are_predicted_along_an_arc():
-    """A pose that says nothing leaves the prediction: F P F' + Q, with F by differences of the exact arc."""
-    state, interval = np.array([1e-3, -2e-3, 1.3, 0.03, -0.02, 0.5]), 0.02
-    sizes = np.array([1e-5, 1e-5, 5e-2, 1e-3, 1e-3, 5.0])
-    root = sizes[:, None] * np.random.default_rng(8).normal(size=(6, 6))
-    slope, white = slope_of_arc(state, interval), np.diag([0.0, 0.0, 0.0, ACCELERATION**2, ACCELERATION**2, TURNING**2])
-    expected = slope @ root @ root.T @ slope.T
-    for time in (np.arange(20) + 0.5) / 20 * interval:  # noise that has entered this long ago
-        expected += interval / 20 * slope_of_arc(state, float(time)) @ white @ slope_of_arc(state, float(time)).T
-    predicted, covariance = state.copy(), root @ root.T
-    filter_pose(predicted, covariance, np.zeros(3), interval, 1e9, 1e9)
-    np.testing.assert_allclose(predicted, after_arc(state, interval), rtol=1e-3)
-    own = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(covariance / np.outer(own, own), expected / np.outer(own, own), atol=5e-3)
-    covariance[:] = 0.0
-    filter_pose(state, covariance, np.zeros(3), interval, 1e9, 1e9)
-    np.testing.assert_allclose(covariance[3:, 3:], interval * white[3:, 3:], atol=1e-15)
-    assert covariance[2, 5] == pytest.approx(0.5 * interval**2 * TURNING**2)
-
-
-def test_the_velocity_is_that_in_the_dish_whichever_way_the_needle_heads():
-    motion, velocity, heading = NeedleMotionFilter(), np.array([2e-3, -1e-3]), np.array([math.cos(2.1), math.sin(2.1)])
-    for k in range(60):
-        pose = motion.update(NeedlePose(k / RATE, velocity * k / RATE, heading, (1e-6, 1e-3)))
-    assert pose.motion is not None
-    assert pose.motion.velocity == pytest.approx(velocity, rel=1e-3)
-    assert pose.motion.turning == pytest.approx(0.0, abs=1e-6)
-
-
-def test_forces_are_those_of_the_given_motion():
-    """A thread dragged along itself at one speed by the poses and at another by the motion."""
-    predictor = ThreadPredictor.create("silk_6_0", length=0.019, segments=25)
-    predictor.start(eastward(0.0, 0.0))
-    plain = ThreadPredictor.create("silk_6_0", length=0.019, segments=25)
-    plain.start(eastward(0.0, 0.0))
-    motion, kept = NeedleMotion(np.array([3e-3, 0.0]), 0.0), []
-    for k in range(1, 30):
-        pose = eastward(k / RATE, 2e-3 * k / RATE)
-        prediction, other = predictor.step(replace(pose, motion=motion)), plain.step(pose)
-        np.testing.assert_array_equal(prediction.positions, other.positions)
-        kept.append(prediction)
-    drag = predictor.thread.medium.drag_along * predictor.thread.length
-    for prediction in (kept[-1], kept[5]):  # later steps change nothing about an earlier one
-        assert prediction.forces is not None
-        # The rest is the compliance of the segments, which a higher tension strains by micrometres.
-        assert prediction.forces.needle_force == pytest.approx([-3e-3 * drag, 0.0], rel=0.01, abs=1e-12)
-    onward = replace(pose, stamp=1.0)
-    np.testing.assert_array_equal(predictor.step(onward).positions, plain.step(onward).positions)
 
 
 def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -13,7 +9,6 @@ from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
@@ -108,49 +103,6 @@ def test_a_start_needs_a_centreline():
     assert not predictor.started
 
 
-def test_a_centreline_with_repeated_points_is_taken():
-    seen = np.array([[0.0, 0.0], [0.0, 0.0], [-0.01, 0.0], [-0.015, 0.0], [-0.015, 0.0]])
-    prediction = new().start(pose(0.0), seen, strict=False)
-    np.testing.assert_allclose(prediction.positions[:, 0], -THREAD.segment_length * np.arange(26), atol=1e-12)
-
-
-def test_a_needle_that_leaps_onto_a_node_is_followed():
-    """Its first segment has no length then, and so no direction."""
-    predictor = started()
-    unit = THREAD.segment_length
-    for k in range(1, 30):
-        prediction = predictor.step(pose(k / 30.0, -unit))
-    assert np.all(np.isfinite(prediction.positions))
-    assert np.abs(prediction.strain).max() < 1e-2
-
-
-def test_a_thread_a_millimetre_from_a_shape_is_in_contact_with_nothing():
-    predictor = started((Disc((-0.01, 0.002), 0.001),))
-    prediction = predictor.step(pose(1.0 / 30.0, 1e-4))
-    assert prediction.margins["obstacle"].clearance.min() == pytest.approx(1e-3 - 0.5 * THREAD.diameter, abs=5e-5)
-    assert isinstance(predictor.formulation, RodFormulation)
-    assert not predictor.formulation.nodes_in_contact.any()
-    assert prediction.margins.in_contact == ()
-
-
-def test_the_status_is_that_of_the_first_step_that_was_not_solved_at_once(monkeypatch: pytest.MonkeyPatch):
-    predictor, statuses = started(), iter(("solved", "solved, after banded: stalled", "solved"))
-    follow = predictor._follow
-
-    def relabelled(*given: Any) -> Iterator[Any]:
-        return (replace(done, status=next(statuses)) for done in follow(*given))
-
-    monkeypatch.setattr(predictor, "_follow", relabelled)
-    prediction = predictor.step(pose(0.06, 1e-4))
-    assert (prediction.substeps, prediction.status) == (3, "solved, after banded: stalled")
-
-
-def test_a_reset_forgets():
-    predictor = started()
-    predictor.reset()
-    assert not predictor.started
-
-
 def test_warming_up_leaves_no_trace():
     warm, cold = new(), new()
     warm.warm_up()
@@ -159,27 +111,6 @@ def test_warming_up_leaves_no_trace():
         predictor.start(pose(5.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
     first, second = warm.step(pose(5.1, 1e-4)), cold.step(pose(5.1, 1e-4))
     np.testing.assert_allclose(first.positions, second.positions, atol=1e-9)
-
-
-def test_held_nodes_stay():
-    predictor = started(fixed_nodes=(10,))
-    where = -THREAD.segment_length * 10
-    for k in range(1, 40):
-        prediction = predictor.step(pose(k / 30.0, -5e-5 * k, 2e-5 * k))
-    np.testing.assert_allclose(prediction.positions[10], [where, 0.0], atol=1e-12)
-    assert prediction.strain.max() < 5e-3
-
-
-def test_both_ends_can_be_led():
-    predictor = started()
-    end = np.array([-0.019, 0.0])
-    for k in range(1, 40):
-        end = end + np.array([1e-4, 5e-5])
-        prediction = predictor.step(pose(k / 30.0), {25: end})
-        np.testing.assert_allclose(prediction.positions[25], end, atol=1e-12)
-    assert np.abs(prediction.strain).max() < 5e-3
-    free = predictor.step(pose(2.0))  # let go
-    assert free.positions.shape == (26, 2)
 
 
 @pytest.mark.parametrize(
@@ -199,12 +130,6 @@ def test_driven_nodes_that_cannot_be_are_refused(prescribed: dict[int, np.ndarra
         new(fixed_nodes=(26,))
 
 
-def test_nodes_to_start_at_must_be_those_of_the_thread():
-    for nodes in (np.zeros((25, 2)), np.full((26, 2), np.nan), np.zeros((26, 3))):
-        with pytest.raises(InvalidInputError, match="thread's nodes"):
-            new().start_at(pose(0.0), nodes)
-
-
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
 @pytest.mark.parametrize("segments", [3.0, 10.0, 24.0])
 def test_a_needle_that_jumps_by_many_segments_is_followed(segments: float, formulation: str):
@@ -218,22 +143,6 @@ def test_a_needle_that_jumps_by_many_segments_is_followed(segments: float, formu
         prediction = predictor.step(pose(k / 60.0, -jump, 0.2 * jump))
     assert prediction.strain.max() < 5e-3
     assert prediction.residual < 1e-6
-
-
-@pytest.mark.parametrize("after", [1e-6, 1e-5, 1e-4])
-def test_samples_that_come_twice_with_a_little_noise_do_no_harm(after: float):
-    """Between two stamps so close, the noise of a pose is a speed of metres a second."""
-    twice, once = started(), started()
-    random = np.random.default_rng(1)
-    for k in range(1, 300):
-        angle = 0.02 * k
-        where = 0.004 * np.array([np.cos(angle) - 1.0, np.sin(angle)])
-        expected = once.step(pose(k / 60.0, *where))
-        found = twice.step(pose(k / 60.0, *where))
-        if k % 30 == 0:
-            noisy = where + 1e-4 * random.normal(size=2)
-            assert twice.step(pose(k / 60.0 + after, *noisy)).residual < 1e-6
-    assert np.linalg.norm(found.positions - expected.positions, axis=1).mean() < 2e-3 * THREAD.length
 
 
 @example(  # a disc that a segment's chord lies in, and not its arc

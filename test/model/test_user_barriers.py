@@ -15,12 +15,10 @@ import pytest
 from magnetosuture_thread import (
     Barrier,
     ConfigurationError,
-    Disc,
     Gradient,
     InvalidInputError,
     NeedlePose,
     Prediction,
-    Scene,
     ThreadPredictor,
     check_gradient,
 )
@@ -30,7 +28,6 @@ from test.examples import FOLDER, load_example
 TipKeepIn = load_example("barriers/tip_keep_in").TipKeepIn
 CurvatureBound = load_example("barriers/curvature_bound").CurvatureBound
 MovingDisc = load_example("barriers/moving_disc").MovingDisc
-EAST = np.array([1.0, 0.0])
 HOLDS = 1.1e-7  # m; what a barrier may be short of
 
 
@@ -131,33 +128,6 @@ def test_a_gradient_that_is_wrong_is_named(barrier: Barrier, change: Callable[[G
         check_gradient(skewed(barrier, change), positions)
 
 
-def test_several_barriers_hold_together_beside_the_wall_and_a_post():
-    scene = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.004, -0.004), 0.002)})
-    barriers = [TipKeepIn(), MovingDisc()]
-    held = predicted(*barriers, scene=scene)
-    assert all(prediction.converged for prediction in held)
-    for barrier in barriers:
-        assert least(barrier, held) > -HOLDS
-    assert min(prediction.margins["obstacle"].minimum for prediction in held) > -HOLDS
-    assert list(held[-1].margins) == ["connectivity", "compression", "obstacle", "wall", "tip_keep_in", "moving_disc"]
-
-
-def test_the_banded_and_a_general_solver_find_the_same_thread():
-    barrier, way = WAYS[0]
-    banded, general = (predicted(barrier, way=way, solver=solver)[-1].positions for solver in ("banded", "osqp"))
-    np.testing.assert_allclose(banded, general, atol=1e-8)
-
-
-def test_a_solver_of_qpsolvers_is_found_by_its_name():
-    pytest.importorskip("qpsolvers")
-    pytest.importorskip("clarabel")
-    barrier, way = WAYS[3]
-    found = predicted(barrier, way=way, solver="clarabel")
-    assert {prediction.solver for prediction in found} == {"clarabel"}
-    assert least(barrier, found) > -HOLDS
-    np.testing.assert_allclose(found[-1].positions, predicted(barrier, way=way)[-1].positions, atol=1e-6)
-
-
 def test_a_gain_slows_how_fast_the_margin_falls():
     """h(next) >= (1 - gain dt) h(last), as far as the rows are linear, which these are."""
 
@@ -248,28 +218,6 @@ def test_barriers_must_be_told_apart():
             ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=barriers)  # type: ignore[arg-type]
 
 
-def test_a_failed_row_leaves_the_thread_where_it_was():
-    class Fragile(MovingDisc):  # type: ignore[misc, valid-type]
-        broken = False
-
-        def value(self, positions: np.ndarray) -> np.ndarray:
-            return np.full(3, math.nan) if self.broken else np.asarray(super().value(positions))
-
-    barrier = Fragile()
-    one, other = (
-        ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=[each])
-        for each in (barrier, MovingDisc())
-    )
-    for predictor in (one, other):
-        predictor.start(around(0))
-        predictor.step(around(1))
-    barrier.broken = True
-    with pytest.raises(InvalidInputError, match="moving_disc"):
-        one.step(around(2))
-    barrier.broken = False
-    np.testing.assert_array_equal(one.step(around(3)).positions, other.step(around(3)).positions)
-
-
 @pytest.fixture
 def my_barriers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Make a module of a user's importable, and return its name."""
@@ -296,11 +244,3 @@ def test_barriers_are_loaded_by_the_name_of_their_class(my_barriers: str):
             load_barriers([name])
     with pytest.raises(ConfigurationError, match="a name that no other barrier has"):
         load_barriers([f"{my_barriers}:TipKeepIn"] * 2)
-
-
-def test_what_a_module_says_as_it_fails_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "loud_barriers.py").write_text("raise RuntimeError('x' * 1_000_000)\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(ConfigurationError, match="RuntimeError: xxx") as refused:
-        load_barriers(["loud_barriers:KeepIn"])
-    assert len(str(refused.value)) < 1000

@@ -16,9 +16,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.interface import ARM
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
-from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.scene import read_scene
+from test.nodes import wire
 
 EAST = np.array([1.0, 0.0])
 TAIL = np.array([-0.0035, 0.0])
@@ -38,19 +38,19 @@ def armed(graph, **parameters: Any) -> Any:
 def predict(graph, slowdown: float = 1.0, version: str | None = None) -> None:
     """Publish the thread's margins, of the bridge's scene unless another version is named."""
     version = read_scene(SCENE).version if version is None else version
-    margins = SafetyMargins(header=MESSAGES.header(graph.now()), valid=True, slowdown=slowdown, scene_version=version)
+    margins = SafetyMargins(header=wire.header(graph.now()), valid=True, slowdown=slowdown, scene_version=version)
     graph.publish(topics.MARGINS, margins)
 
 
 def command(graph, x: float = 0.01, y: float = 0.0) -> TwistStamped:
     """Return a velocity command made now."""
-    return MESSAGES.twist_message(graph.now(), np.array([x, y]))
+    return wire.twist_message(graph.now(), np.array([x, y]))
 
 
 def drive(graph, x: float = 0.005, y: float = 0.0) -> TwistStamped:
     """Say where needle and thread are, then command a velocity; return that command."""
     predict(graph)
-    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
     asked = command(graph, x, y)
     graph.publish(topics.NEEDLE_COMMAND, asked)
     return asked

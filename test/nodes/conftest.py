@@ -1,4 +1,4 @@
-"""A graph for one test: its own context and domain, an executor in a thread, waits on conditions."""
+"""A graph for one test: its own nodes in its module's context, an executor in a thread, waits on conditions."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from magnetosuture_thread.nodes.topics import Topic
 
 
 class Graph:
-    """Nodes of one test and a probe that speaks and listens to them."""
+    """Nodes of one test and a probe that speaks and listens to them.
 
-    def __init__(self, domain: int) -> None:
-        self.domain = domain
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=self.domain, args=[])
+    Args:
+        context: of all nodes, which the tests of a module share: in one context, nodes find each other at once.
+        domain: of the context.
+    """
+
+    def __init__(self, context: Context, domain: int) -> None:
+        self.context, self.domain = context, domain
         self.executor = SingleThreadedExecutor(context=self.context)
         self.nodes: list[Node] = []
         self.probe = rclpy.create_node("probe", context=self.context)
@@ -104,7 +107,6 @@ class Graph:
         self._thread.join(10.0)
         # Not before: an executor that is shut down amid a spin comes upon guards that are gone.
         self.executor.shutdown()
-        self.context.try_shutdown()
         for node in self.nodes:
             node.destroy_node()
         if self._failure is not None:
@@ -120,11 +122,20 @@ class Graph:
             self._failure = error
 
 
-@pytest.fixture
-def graph() -> Iterator[Graph]:
-    """A graph, closed at the end of the test."""
+@pytest.fixture(scope="module")
+def shared_context() -> Iterator[tuple[Context, int]]:
+    """The context of a module's tests, on a ROS domain of its own."""
     with reserved_domain() as domain:
-        made = Graph(domain)
-        yield made
-        made.close()
+        context = Context()
+        rclpy.init(context=context, domain_id=domain, args=[])
+        yield context, domain
+        context.try_shutdown()
         assert is_empty(domain), "a node is still in the graph; who gets this domain next would meet it"
+
+
+@pytest.fixture
+def graph(shared_context: tuple[Context, int]) -> Iterator[Graph]:
+    """A graph of one test; its nodes are destroyed at the end."""
+    made = Graph(*shared_context)
+    yield made
+    made.close()

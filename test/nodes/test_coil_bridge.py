@@ -14,8 +14,8 @@ from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.scene import Dish, Scene, read_scene
+from test.nodes import wire
 from test.nodes.bridge import (
     EAST,
     LONG,
@@ -58,38 +58,6 @@ def test_a_command_reaches_the_driver_and_the_topics(graph):
     assert (state.driver, state.driver_ready) == ("recording", True)
 
 
-@pytest.mark.parametrize("tail", [(1e200, 0.0), (0.05, 0.025), (-1e-320, 1e308)])
-def test_a_pose_that_cannot_be_does_not_end_the_bridge(graph, tail):
-    node = armed(graph, **LONG)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-
-    def refused() -> bool:  # on a busy machine a command is too old once the next diagnostics come
-        graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), np.array(tail), EAST))
-        graph.publish(topics.NEEDLE_COMMAND, command(graph))
-        return any("the dish's centre" in str(d.status[0].values) for d in diagnostics)
-
-    graph.wait(refused, "a refusal")
-    assert not driven(node)
-    # Several in a row are a fault of the armed bridge.
-    graph.wait(lambda: refused() and "needle does not follow" in node.system.latch.fault, "the fault")
-
-
-def test_between_commands_the_currents_follow_the_needle(graph):
-    """The bridge lays the field along the needle as it turns, at its own rate."""
-    node = armed(graph, **LONG)
-    drive(graph, 0.0, 0.003)
-    graph.wait(lambda: sum(a.any() for a in applied(node)) > 20, "currents without another command")
-    assert len({tuple(a) for a in applied(node) if a.any()}) > 10
-
-
-def test_without_a_pose_there_is_no_current(graph):
-    node = armed(graph, **LONG)
-    states = graph.listen(topics.BRIDGE_STATE)
-    graph.publish(topics.NEEDLE_COMMAND, command(graph))
-    graph.wait(lambda: reasons(states) == "no needle pose yet", "the reason")
-    assert not driven(node)
-
-
 def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
     node = armed(graph, pose_timeout=0.05, command_timeout=1.0)
     currents = graph.listen(topics.CURRENTS)
@@ -109,7 +77,7 @@ def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
 def test_a_bad_pose_is_not_used(graph, spoil):
     node = armed(graph, **LONG)
     states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
-    pose = MESSAGES.pose_message(graph.now(), np.zeros(2), EAST)
+    pose = wire.pose_message(graph.now(), np.zeros(2), EAST)
     spoil(pose)
     graph.publish(topics.NEEDLE_POSE, pose)
     graph.wait(lambda: any("needle/measured_cp" in str(d.status[0].values) for d in diagnostics), "a refusal")
@@ -148,7 +116,7 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     """With /clock standing still the coils must stop all the same; before it runs nothing is good."""
     node = armed(graph, use_sim_time=True)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(Time(), np.array([0.01, 0.0])))
+    graph.publish(topics.NEEDLE_COMMAND, wire.twist_message(Time(), np.array([0.01, 0.0])))
     graph.wait(lambda: any("0 is none in ROS" in str(d.status[0].values) for d in diagnostics), "a refusal")
     now = Time(sec=50)
     clock = graph.probe.create_publisher(Clock, "/clock", topics.CLOCK.qos)
@@ -159,8 +127,8 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
         return bool(node.get_clock().now().nanoseconds == 50 * 10**9)
 
     graph.wait(running, "the time")
-    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(now, TAIL, EAST))
-    graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(now, np.array([0.01, 0.0])))
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(now, TAIL, EAST))
+    graph.publish(topics.NEEDLE_COMMAND, wire.twist_message(now, np.array([0.01, 0.0])))
     graph.wait(lambda: driven(node), "a current")
     graph.wait(lambda: not applied(node)[-1].any(), "zero current")
 
@@ -180,7 +148,7 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
 def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
     node = armed(graph, pose_timeout=1.0)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
     bad = command(graph)
     spoil(bad)
     graph.publish(topics.NEEDLE_COMMAND, bad)
@@ -193,14 +161,14 @@ def test_a_bad_command_never_reaches_the_driver(graph, spoil, words):
 def test_the_offset_of_another_hosts_clock_is_measured_and_its_commands_refused(graph, offset_ms):
     node = armed(graph, pose_timeout=1.0)
     diagnostics = graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(graph.now(), TAIL, EAST))
+    graph.publish(topics.NEEDLE_POSE, wire.pose_message(graph.now(), TAIL, EAST))
 
     def age_of(topic: str) -> float:
         values = {each.key: each.value for each in diagnostics[-1].status[0].values} if diagnostics else {}
         return float(values.get(f"minimum age of {topic} [ms]", "inf"))
 
     def minimum_age() -> float:
-        graph.publish(topics.NEEDLE_COMMAND, MESSAGES.twist_message(shifted(graph.now(), offset_ms), EAST))
+        graph.publish(topics.NEEDLE_COMMAND, wire.twist_message(shifted(graph.now(), offset_ms), EAST))
         return age_of("needle/servo_cv")
 
     # The age has the transport in it, which on a busy machine takes its time.
@@ -215,22 +183,12 @@ def shifted(stamp: Time, milliseconds: int) -> Time:
     return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
-def test_currents_stay_within_their_limit_and_saturation_is_said(graph):
-    node = armed(graph, max_current=0.5, max_speed=0.04, **LONG)
-    states = graph.listen(topics.BRIDGE_STATE)
-    drive(graph, x=9.0)
-    graph.wait(lambda: any(m.saturated for m in states), "saturation")
-    assert max(np.abs(a).max() for a in applied(node)) <= 0.5
-    saturated = next(m for m in states if m.saturated)
-    assert 0.0 < saturated.applied.x < saturated.filtered.x
-
-
 @pytest.mark.parametrize("damaged", [True, False], ids=["damaged", "no room"])
 def test_a_scene_that_is_refused_stops_the_needle_until_a_good_one_comes(graph, damaged: bool):
     """The setup's scene goes on to be in force, but nobody knows whether it still is what stands in the dish."""
     node, states = armed(graph, **LONG), graph.listen(topics.BRIDGE_STATE)
     drive_until(graph, lambda: driven(node), "the needle to be driven")
-    refused = MESSAGES.scene_message(graph.now(), Scene() if damaged else Scene(Dish(0.006)))
+    refused = wire.scene_message(graph.now(), Scene() if damaged else Scene(Dish(0.006)))
     refused.wall_friction = 0.1 if damaged else 0.0
     graph.publish(topics.SCENE, refused)
     words = "scene.version: got" if damaged else "room for the needle"
@@ -239,7 +197,7 @@ def test_a_scene_that_is_refused_stops_the_needle_until_a_good_one_comes(graph, 
     drive(graph)
     graph.wait(lambda: len(applied(node)) > stopped + 10, "steps")
     assert not any(currents.any() for currents in applied(node)[stopped:])
-    graph.publish(topics.SCENE, MESSAGES.scene_message(graph.now(), read_scene(SCENE)))
+    graph.publish(topics.SCENE, wire.scene_message(graph.now(), read_scene(SCENE)))
     drive_until(graph, lambda: applied(node)[-1].any(), "the needle to be driven again")
 
 
@@ -257,25 +215,3 @@ def test_two_publishers_at_once_stop_the_needle(graph):
     assert not applied(node)[-1].any()
     assert min(a[0] for a in applied(node)) > -1.0  # the other was not followed for a moment
     graph.wait(lambda: "several publishers" not in reasons(states), "one of them to be silent")
-
-
-def test_the_coils_are_left_at_zero(graph):
-    node = armed(graph, **LONG)
-    drive(graph)
-    graph.wait(lambda: driven(node), "a current")
-    assert applied(node)[-1].any()
-    graph.remove(node)
-    assert not applied(node)[-1].any()
-
-
-def test_a_message_that_breaks_arithmetic_does_not_end_the_node(graph, monkeypatch):
-    node = armed(graph, **LONG)
-    states = graph.listen(topics.BRIDGE_STATE)
-
-    def broken(*_: Any) -> None:
-        raise OverflowError("a check that was forgotten")
-
-    monkeypatch.setattr(node.system.bridge, "command", broken)
-    monkeypatch.setattr(node.system.bridge.extrapolator, "update", broken)
-    drive(graph)
-    graph.wait(lambda: bool(states) and states[-1].refused == 2, "both refused")

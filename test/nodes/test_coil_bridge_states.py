@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import gc
-from typing import Any
-
-import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from test.nodes.bridge import (
     LONG,
     READY,
@@ -27,26 +22,8 @@ from test.nodes.bridge import (
     driven,
     press,
     reasons,
-    set_parameter,
     stage,
 )
-
-
-def test_a_bridge_that_is_destroyed_leaves_the_graph_at_once(graph):
-    gc.disable()
-    try:
-        node = graph.add(CoilBridgeNode)
-        graph.wait(lambda: "coil_bridge" in graph.probe.get_node_names(), "the bridge")
-        graph.remove(node)
-        graph.wait(lambda: graph.probe.get_node_names() == ["probe"], "the bridge to leave")
-    finally:
-        gc.enable()
-
-
-def test_its_state_is_logged_before_its_loop_runs(graph, capfd):
-    """The first line takes long, and no command shall wait for it."""
-    graph.nodes.append(CoilBridgeNode(context=graph.context))
-    assert "unconfigured; driver" in capfd.readouterr().err
 
 
 def test_it_starts_active_but_disarmed_and_arming_lets_commands_pass(graph):
@@ -191,50 +168,3 @@ def test_an_error_in_a_transition_leaves_the_coils_at_zero_and_the_driver_closed
     assert not applied(node)[-1].any()
     assert "nobody foresaw this" in str(node.problem)
     assert stage(graph) in ("unconfigured", "finalized")
-
-
-def test_what_was_taken_is_given_back_where_configuring_fails(graph, monkeypatch):
-    node = graph.add(CoilBridgeNode, autostart="unconfigured")
-
-    def broken(*_: Any, **__: Any) -> None:
-        raise RuntimeError("no timer")
-
-    monkeypatch.setattr(node, "create_timer", broken)
-    assert not change(graph, Transition.TRANSITION_CONFIGURE)
-    assert node.system.bridge is None
-    assert not node.system.driver.state().ready
-    monkeypatch.undo()
-    assert change(graph, Transition.TRANSITION_CONFIGURE)
-
-
-def test_bad_parameters_refuse_to_configure_until_they_are_mended(graph):
-    graph.add(CoilBridgeNode, autostart="unconfigured", command_timeout=0.0)
-    assert not change(graph, Transition.TRANSITION_CONFIGURE)
-    assert stage(graph) == "unconfigured"
-    assert set_parameter(graph, "command_timeout", 0.2).successful
-    assert change(graph, Transition.TRANSITION_CONFIGURE)
-    refused = set_parameter(graph, "max_current", 50.0)
-    assert not refused.successful
-    assert "expected its value in force, until the node is cleaned up" in refused.reason
-    assert change(graph, Transition.TRANSITION_CLEANUP)
-    assert set_parameter(graph, "max_current", 5.0).successful
-    assert change(graph, Transition.TRANSITION_CONFIGURE)
-
-
-@pytest.mark.parametrize(
-    "bad", [{"command_timeout": 0.0}, {"autostart": "armed", "driver": "roboclaw"}, {"autostart": "everything"}]
-)
-def test_with_bad_parameters_it_does_not_start(graph, bad):
-    with pytest.raises(ConfigurationError, match="coil_bridge\\."):
-        graph.add(CoilBridgeNode, **bad)
-
-
-def test_without_a_rig_the_simulated_driver_is_not_armed(graph):
-    graph.add(CoilBridgeNode, driver="simulated", **LONG, **READY)
-    refusal = arm(graph)
-    assert not refusal.success
-    assert "no rig_simulator subscribed" in refusal.message
-    wires = graph.listen(topics.RIG_CURRENTS)
-    graph.wait(lambda: arm(graph).success, "the rig to be found")
-    drive(graph)
-    graph.wait(lambda: any(np.any(m.current) for m in wires), "currents on the wires")

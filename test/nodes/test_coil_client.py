@@ -6,8 +6,8 @@ import pytest
 
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.cli.commands.run_graph import COIL_ACTIONS
-from magnetosuture_thread.nodes.coil_bridge import client
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes import clients as client
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 
 
 def press(capsys, action: str, *options: str) -> tuple[int, str]:

@@ -40,18 +40,6 @@ def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):
     assert said[-1].status[0].level == DiagnosticStatus.WARN
 
 
-def test_a_change_that_comes_too_soon_is_said_a_moment_later_and_not_lost(graph, monkeypatch):
-    monkeypatch.setattr(diagnostics, "PERIOD", 1e6)  # the state of each second would say it too
-    said = graph.listen_later(topics.DIAGNOSTICS)
-    health = Health(graph.probe)
-    graph.wait(lambda: graph.matched(topics.DIAGNOSTICS), "the match")
-    for text in ("first", "second", "third"):
-        health.warn(text)
-    graph.wait(lambda: any(d.status[0].message == "third" for d in said), "the last change")
-    assert "second" not in [d.status[0].message for d in said]
-    graph.wait(health._late.is_canceled, "the end of the late reports")
-
-
 def test_that_a_node_stands_by_is_reported_at_once_as_a_warning_whatever_else_there_is(graph, monkeypatch):
     monkeypatch.setattr(diagnostics, "PERIOD", 1e6)  # the state of each second would say it too
     said = graph.listen_later(topics.DIAGNOSTICS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
@@ -20,12 +19,12 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.coils.coil_system import UNCLEAN_END
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import EMERGENCY_STOP, RESET
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.processes import graph_environment
-from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
 from test.nodes.bridge import (
     LONG,
@@ -39,7 +38,6 @@ from test.nodes.bridge import (
     driven,
     press,
     reasons,
-    set_parameter,
     stage,
 )
 
@@ -157,23 +155,6 @@ def test_every_transition_out_of_work_says_so_with_zeros(graph, transitions: lis
     graph.wait(lambda: says(heard, ending), "zeros and the reason")
 
 
-def test_a_finalized_bridge_is_reported_as_such(graph):
-    graph.add(CoilBridgeNode, **READY)
-    states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
-    assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    assert stage(graph) == "finalized"
-    graph.wait(lambda: reasons(states) == "finalized", "the state")
-    graph.wait(lambda: bool(diagnostics) and diagnostics[-1].status[0].message == "finalized", "the diagnostics")
-
-
-def test_all_can_be_set_before_a_bridge_is_first_configured(graph):
-    node = graph.add(CoilBridgeNode, autostart="unconfigured")
-    assert set_parameter(graph, "max_current", 3.0).successful
-    assert not set_parameter(graph, "max_current", 3000.0).successful
-    assert change(graph, Transition.TRANSITION_CONFIGURE)
-    assert node.settings.max_current == 3.0
-
-
 def test_an_emergency_stop_outlives_the_bridge(graph):
     """A node that is destroyed without a transition leaves what a crash leaves."""
     node = armed(graph, **LONG)
@@ -195,18 +176,6 @@ def test_an_emergency_stop_outlives_the_bridge(graph):
     assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
     graph.remove(node)
     assert armed(graph, **LONG).system.latch.armed
-
-
-def test_an_emergency_stop_outlives_an_end_in_order_too(graph):
-    node = graph.add(CoilBridgeNode, autostart="unconfigured", **READY)
-    assert press(graph, EMERGENCY_STOP).success
-    assert change(graph, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
-    graph.remove(node)
-    node = graph.add(CoilBridgeNode, autostart="unconfigured", **READY)
-    assert node.system.latch.emergency
-    assert press(graph, RESET).success
-    graph.remove(node)
-    assert not graph.add(CoilBridgeNode, **READY).system.latch.latched_reason
 
 
 def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph):
@@ -320,16 +289,3 @@ def test_a_full_disk_holds_up_no_stop(graph, monkeypatch: pytest.MonkeyPatch):
     assert answer.success
     assert "No space left" in answer.message
     assert seen[0] is False  # the coils were at zero before the disk was asked
-
-
-@pytest.mark.parametrize("name", ["calibration", "scene", "stop_file"])
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_no_file_of_a_parameter_holds_up_the_bridge(graph, tmp_path: Path, name: str, kind: str):
-    path = tmp_path / "pipe.yaml"
-    os.mkfifo(path)
-    given = {**READY, name: "/dev/zero" if kind == "device" else str(path)}
-    node = graph.add(CoilBridgeNode, autostart="unconfigured", **given)
-    assert not change(graph, Transition.TRANSITION_CONFIGURE)
-    assert isinstance(node.problem, MagnetosutureError)
-    assert Path(str(given[name])).name in str(node.problem)  # of a long path the middle is left out
-    assert press(graph, EMERGENCY_STOP).success

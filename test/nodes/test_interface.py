@@ -12,10 +12,10 @@ import pytest
 from rclpy.node import Node
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
+from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
-from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode

@@ -60,20 +60,6 @@ def test_what_is_raised_already_stays(heeded):
     assert {number: signal.getsignal(number) for number in heeded} == heeded
 
 
-def test_a_signal_is_raised_once(heeded):
-    interruption = Interruption()
-    with pytest.raises(KeyboardInterrupt), interruption:
-        os.kill(os.getpid(), signal.SIGINT)
-    with interruption:
-        interruption.check()
-
-
-def test_what_is_ignored_stays_ignored(heeded):
-    done: list[str] = []
-    kept(signal.SIGHUP, done, asks=True)
-    assert done == ["went on", "went on again"]
-
-
 def test_in_another_thread_signals_stay_as_they_are(heeded):
     found: list[object] = []
 

@@ -1,9 +1,10 @@
-"""Conversions."""
+"""Messages: packed as rclpy and rosbags have them, read back as they were, refused where they are not valid."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,73 +13,323 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import CoilBridgeState, ThreadMaterial, TrackerState
-from rclpy.serialization import deserialize_message, serialize_message
+from magnetosuture_msgs.msg import CoilBridgeState, PredictedThread, SafetyMargins, ThreadMaterial, TrackerState
+from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker
 
-from magnetosuture_thread.bags.message_types import MESSAGES as BAG_MESSAGES
+from magnetosuture_thread import interface
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages import building, reading
-from magnetosuture_thread.messages.building import MessageBuilder
+from magnetosuture_thread.messages import markers, packing, reading
+from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.model.forces import ThreadForces
+from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
+from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.model.settings import parse_material
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES, serialised_velocity
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.nodes.topics import topic_of
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.look import State, no_pose
+from test.model.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
+from test.nodes import wire
+from test.scene.scenes import every_shape
 
 STAMP = Time(sec=3, nanosec=500_000_000)
 TAIL, HEADING = np.array([1e-3, -2e-3]), np.array([-0.6, 0.8])
+POINTS = np.random.default_rng(0).normal(size=(5, 2))
+VIEW = DishView((320.0, 240.0), 1e-4)
+
+
+def observation(*counts: int, outlines: int = 2) -> ThreadObservation:
+    """Return an observation of pieces with so many points."""
+    random = np.random.default_rng(sum(counts))
+    pieces = tuple(
+        ThreadPiece(
+            random.normal(size=(count, 2)),
+            random.uniform(1e-6, 1e-4, count),
+            PieceEnd.COVERED,
+            PieceEnd.UNKNOWN,
+            (0.001, 0.002) if number % 2 else (math.nan, math.nan),
+            direction_known=bool(number % 2),
+            confidence=0.5,
+        )
+        for number, count in enumerate(counts)
+    )
+    return ThreadObservation(pieces, hidden=tuple(random.normal(size=(3 + k, 2)) for k in range(outlines)))
+
+
+def prediction(touching: tuple[int, ...] | None = None, positions: np.ndarray = POINTS) -> Prediction:
+    """Return a prediction whose thread is pushed at some nodes; without forces if None."""
+    count, forces = len(positions), None
+    if touching is not None:
+        contact, use = np.zeros((count, 2)), np.linspace(0.0, 1.0, count)
+        contact[list(touching)] = 1e-6
+        forces = ThreadForces(np.arange(count - 1.0), contact, np.array([1e-6, -2e-6]), 3e-9, 1e-7 * use, use)
+    return Prediction(
+        0.0,
+        formulation="rod",
+        scene_version="a1",
+        solver="banded",
+        status="solved",
+        positions=positions,
+        strain=np.arange(count - 1.0),
+        interval=0.015,
+        substeps=2,
+        residual=1e-9,
+        converged=True,
+        compute_margins=lambda: Margins(()),
+        compute_forces=lambda: forces,
+    )
+
+
+def an_estimate(disturbances: int = 0) -> ThreadEstimate:
+    """Return an estimate of a thread, measured in this frame, with so many forces that the model does not know."""
+    way = poses(3)
+    truth = true_shapes(thread_of(segments=6), way)
+    estimator = estimator_of(thread_of(segments=6), discs=(Disc((-0.005, 0.0015), 1e-3),))
+    estimator.start(way[0])
+    estimate = estimator.correct(whole(truth[0], 1))
+    found = [
+        Disturbance(1e-3 * k, 2e-3, np.array([k, -0.5]), np.array([0.6, 0.8]), 2e-4, 5.0, 11.5 + k)
+        for k in range(disturbances)
+    ]
+    return replace(estimate, disturbances=tuple(found), problems=("a", "of two words")[:disturbances])
+
+
+def rows(barrier: str, *entries: tuple[int, float]) -> BarrierMargins:
+    """Return margins of a barrier at nodes."""
+    nodes, clearances = np.array([n for n, _ in entries], int), np.array([h for _, h in entries])
+    return BarrierMargins(barrier, nodes.astype(np.uint32), -np.ones(len(entries), np.int32), clearances, clearances)
+
+
+MARGINS = Margins(
+    (rows("connectivity", (1, 0.0)), rows("obstacle", (1, 2e-3), (3, -1e-6)), rows("wall"), rows("own", (2, 1.2e-3))),
+    friction=Friction(FrictionState.SLIDING, (2, 3), 0.729),
+)
+PACKED = {
+    "pose": (interface.NEEDLE_POSE, packing.packed_pose(7, TAIL, HEADING, np.eye(3))),
+    "pose before 1970": (interface.NEEDLE_POSE, packing.packed_pose(-7, TAIL, HEADING)),
+    "setpoint": (interface.TIP_SETPOINT, packing.packed_pose_stamped(7, TAIL, 0.3)),
+    "twist": (interface.NEEDLE_COMMAND, packing.packed_twist(7, TAIL)),
+    "wrench": (interface.GROUND_TRUTH_PULL, packing.packed_wrench(7, TAIL, 1e-9)),
+    "path": (interface.MEASURED_THREAD, packing.packed_path(7, POINTS)),
+    "empty path": (interface.MEASURED_THREAD, packing.packed_path(7, POINTS[:0])),
+    "jpeg": (interface.COMPRESSED_IMAGE, packing.packed_compressed_image(7, np.arange(9, dtype=np.uint8))),
+    "image": (interface.IMAGE, packing.packed_image(7, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))),
+    "camera": (interface.CAMERA_INFO, packing.packed_camera_info(7, (640, 480), VIEW, 0.3)),
+    "tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "glare", VIEW))),
+    "blind tracker": (interface.TRACKER_STATE, packing.packed_tracker_state(7, no_pose(State.LOST, "", None))),
+    "observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, observation(3, 64))),
+    "empty observation": (interface.THREAD_OBSERVATION, packing.packed_observation(7, ThreadObservation())),
+    "prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction((0, 3)), "silk")),
+    "free prediction": (interface.PREDICTED_THREAD, packing.packed_prediction(7, prediction(), "")),
+    "estimate": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate())),
+    "disturbed": (interface.ESTIMATED_THREAD, packing.packed_estimate(7, an_estimate(2))),
+    "margins": (interface.MARGINS, packing.packed_margins(7, MARGINS)),
+    "no margins": (interface.MARGINS, packing.packed_margins(7, None, "for a reason", "0123456789abcdef")),
+    "scene": (interface.SCENE, packed_scene(7, every_shape())),
+    "scene markers": (interface.SCENE_MARKERS, markers.packed_scene_markers(7, every_shape())),
+    "thread markers": (
+        interface.THREAD_MARKERS,
+        markers.packed_thread_markers(7, prediction(), MARGINS, 1e-4, an_estimate(2)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PACKED)
+def test_what_is_packed_is_what_rosbags_and_rclpy_make_of_the_same_message(name: str):
+    channel, data = PACKED[name]
+    store = typestore()
+    theirs = store.serialize_cdr(store.deserialize_cdr(data, channel.type_name), channel.type_name)
+    assert bytes(theirs) == data
+    message = topic_of(channel).decode(data)
+    assert str(topic_of(channel).decode(serialize_message(message))) == str(message)  # NaN is not equal to itself
+
+
+def test_a_prediction_says_what_it_is_of():
+    message = topics.PREDICTED_THREAD.decode(packing.packed_prediction(7, prediction((0, 3)), "silk", step_time=1e-4))
+    assert (message.formulation, message.scene_version, message.material) == ("rod", "a1", "silk")
+    assert [(point.x, point.y) for point in message.positions] == list(map(tuple, POINTS.tolist()))
+    assert (list(message.contact_nodes), [force.y for force in message.contact_forces]) == ([0, 3], [1e-6, 1e-6])
+    assert (message.needle_force.x, message.needle_force.y, message.needle_moment) == (1e-6, -2e-6, 3e-9)
+    free, stuck, sliding = (
+        PredictedThread.FRICTION_FREE,
+        PredictedThread.FRICTION_STUCK,
+        PredictedThread.FRICTION_SLIDING,
+    )
+    assert list(message.friction_states) == [free, stuck, stuck, stuck, sliding]
+    assert (message.interval, message.substeps, message.residual, message.step_time) == (0.015, 2, 1e-9, 1e-4)
+
+
+def test_an_estimate_says_what_disturbs_the_thread():
+    estimate = an_estimate(2)
+    message = topics.ESTIMATED_THREAD.decode(packing.packed_estimate(7, estimate))
+    assert message.covariance.tolist() == estimate.covariance.ravel().tolist()
+    assert [(each.position.x, each.force, each.since.sec) for each in message.disturbances] == [
+        (0.0, 2e-4, 11),
+        (1.0, 2e-4, 12),
+    ]
+    assert (list(message.problems), message.prediction_only, message.converged) == (["a", "of two words"], False, True)
 
 
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
-def test_a_pose_goes_there_and_back(angle: float, x: float, y: float):
-    heading = np.array([math.cos(angle), math.sin(angle)])
-    found = reading.needle_pose(MESSAGES.pose_message(STAMP, np.array([x, y]), heading))
+def test_a_pose_goes_there_and_back_also_without_a_message(angle: float, x: float, y: float):
+    tail, heading, covariance = (
+        np.array([x, y]),
+        np.array([math.cos(angle), math.sin(angle)]),
+        np.diag([2e-10, 3e-10, 1e-5]),
+    )
+    found = reading.needle_pose(wire.pose_message(STAMP, tail, heading, covariance))
     assert found.stamp == 3.5
-    np.testing.assert_allclose(found.tail, [x, y])
+    np.testing.assert_array_equal(found.tail, tail)
     np.testing.assert_allclose(found.heading, heading, atol=1e-12)
+    handed = reading.tracked_pose(STAMP, tail, heading, covariance)
+    assert (handed.stamp, handed.deviation) == (found.stamp, found.deviation)
+    assert handed.heading.tobytes() == found.heading.tobytes()
 
 
-def test_a_pose_whose_heading_is_unknown_by_its_covariance_is_refused():
-    message = MESSAGES.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
-    message.pose.covariance[-1] = 0.9**2
-    assert reading.needle_pose(message).stamp == 3.5
+def _set_covariance(message: Any) -> None:
     message.pose.covariance[-1] = math.pi**2
-    with pytest.raises(InvalidInputError, match="the heading is unknown"):
-        reading.needle_pose(message)
 
 
-def test_a_needle_that_stands_upright_has_no_heading():
-    message = MESSAGES.pose_message(STAMP, np.zeros(2), np.array([1.0, 0.0]))
+def _stand_upright(message: Any) -> None:
     message.pose.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))
-    with pytest.raises(InvalidInputError, match="an x axis in the dish plane"):
+
+
+def _orientation(axis: str, value: float) -> Callable[[Any], None]:
+    return lambda message: setattr(message.pose.pose.orientation, axis, value)
+
+
+def _stamp(message: Any) -> None:
+    message.header.stamp = Time(sec=2**31 - 1, nanosec=2**32 - 1)
+
+
+@pytest.mark.parametrize(
+    ("harm", "problem"),
+    [
+        (_set_covariance, "the heading is unknown"),
+        (_stand_upright, "an x axis in the dish plane"),
+        (_stamp, r"header\.stamp\.nanosec"),
+        *(
+            (_orientation(axis, value), "a unit quaternion")
+            for axis in "xw"
+            for value in (0.5, 1e308, math.inf, math.nan)
+        ),
+    ],
+)
+def test_a_pose_that_is_none_is_refused(harm: Callable[[Any], None], problem: str):
+    message = wire.pose_message(STAMP, np.zeros(2), np.array([0.6, 0.8]))
+    harm(message)
+    with pytest.raises(InvalidInputError, match=problem):
         reading.needle_pose(message)
 
 
-@pytest.mark.parametrize("value", [0.5, 1e200, 1e308, -1e308, float("inf"), float("nan")])
-@pytest.mark.parametrize("axis", ["x", "y", "z", "w"])
-def test_an_orientation_that_is_none_is_refused_whatever_it_holds(value: float, axis: str):
-    message = MESSAGES.pose_message(STAMP, np.zeros(2), np.array([0.6, 0.8]))
-    setattr(message.pose.pose.orientation, axis, value)
-    with pytest.raises(InvalidInputError, match="a unit quaternion"):
-        reading.needle_pose(message)
+def test_paths_and_velocities_go_there_and_back():
+    np.testing.assert_array_equal(reading.path_points(wire.path_message(STAMP, POINTS)), POINTS)
+    assert reading.path_points(wire.path_message(STAMP, np.empty((0, 2)))).shape == (0, 2)
+    twist = wire.twist_message(STAMP, np.array([1.0, -2.0]))
+    np.testing.assert_array_equal(reading.plane_velocity(twist, "needle/servo_cv"), [1.0, -2.0])
 
 
-@pytest.mark.parametrize("nanosec", [10**9, 2**32 - 1])
-def test_a_stamp_of_more_than_a_second_of_nanoseconds_is_none(nanosec: int):
-    message = MESSAGES.pose_message(Time(sec=2**31 - 1, nanosec=nanosec), np.zeros(2), np.array([1.0, 0.0]))
-    with pytest.raises(InvalidInputError, match=r"header\.stamp\.nanosec"):
-        reading.needle_pose(message)
+def test_an_observation_goes_there_and_back():
+    sent = observation(5, 2, 7)
+    found = reading.thread_observation(wire.observation_message(STAMP, sent))
+    for one, other in zip(found.pieces, sent.pieces, strict=True):
+        for name in ("points", "deviation", "arc_length"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        for name in ("first_end", "last_end", "direction_known", "confidence"):
+            assert getattr(one, name) == getattr(other, name)
+    for outline, shape in zip(found.hidden, sent.hidden, strict=True):
+        np.testing.assert_array_equal(outline, shape)
 
 
-@given(sec=st.integers(-(2**31), 2**31 - 1), nanosec=st.integers(0, 10**9 - 1))
-def test_a_stamp_goes_there_and_back(sec: int, nanosec: int):
-    stamp = Time(sec=sec, nanosec=nanosec)
-    assert MESSAGES.time(reading.nanoseconds(stamp)) == stamp
+def _broken(message: Any, name: str) -> None:
+    """Make a message one that is refused."""
+    piece = message.pieces[0]
+    if name == "few points":
+        piece.points = piece.points[:1]
+    elif name == "other deviations":
+        piece.deviation = piece.deviation[:-1]
+    elif name == "a point that is none":
+        piece.points[1].x = math.nan
+    elif name == "an end that is none":
+        piece.last_end = 9
+    elif name == "half an interval":
+        piece.arc_length_min, piece.arc_length_max = 0.003, math.nan
+    elif name == "no confidence":
+        piece.confidence = math.nan
+    elif name == "complete in two pieces":
+        message.complete = True
+    elif name == "too many pieces":
+        message.pieces = [piece] * (reading.MAX_PIECES + 1)
+    elif name == "an outline that is none":
+        message.hidden[0].corners = message.hidden[0].corners[:2]
+    else:
+        message.header.frame_id = "camera"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("few points", "other deviations", "a point that is none", "an end that is none", "half an interval"),
+        *("no confidence", "complete in two pieces", "too many pieces", "an outline that is none", "another frame"),
+    ],
+)
+def test_an_observation_that_is_not_valid_is_refused(name: str):
+    message = wire.observation_message(STAMP, observation(4, 5))
+    _broken(message, name)
+    with pytest.raises(InvalidInputError, match="thread/observation"):
+        reading.thread_observation(message)
+
+
+def test_margins_of_an_estimate_have_bounds_and_go_there_and_back():
+    margins = an_estimate().margins
+    for of_estimate in (True, False):
+        message = topics.MARGINS.decode(packing.packed_margins(7, margins, of_estimate=of_estimate))
+        assert message.source == (SafetyMargins.OF_ESTIMATE if of_estimate else SafetyMargins.OF_PREDICTION)
+        read = reading.margins_of(message)
+        for name in margins:
+            np.testing.assert_array_equal(read[name].bound, margins[name].bound)
+            np.testing.assert_array_equal(read[name].clearance, margins[name].clearance)
+        assert (read["obstacle"].bound <= read["obstacle"].clearance).all()
+        least = {each.barrier: each.clearance_bound for each in message.minimum}
+        assert least["obstacle"] == margins["obstacle"].bound.min()
+        assert least["connectivity"] == -math.inf
+    none = topics.MARGINS.decode(packing.packed_margins(7, None, "no pose"))
+    assert (none.valid, none.source, none.reason) == (False, SafetyMargins.OF_NOTHING, "no pose")
+
+
+def test_markers_show_the_estimate_beside_the_prediction():
+    estimate = an_estimate(2)
+    predicted = replace(estimate.prediction, positions=estimate.positions + 1e-3)
+    data = markers.packed_thread_markers(7, predicted, estimate.margins, 1e-4, estimate)
+    shown = topics.THREAD_MARKERS.decode(data).markers
+    lines = {each.ns: each for each in shown if each.id == 0}
+    for name, nodes in (("thread", estimate.positions), ("predicted", predicted.positions)):
+        np.testing.assert_array_equal([[point.x, point.y] for point in lines[name].points], nodes)
+    assert len(lines["deviation"].points) == 6 * 6
+    forces = [each for each in shown if each.ns == "disturbances"]
+    assert [each.type for each in forces] == [Marker.ARROW, Marker.TEXT_VIEW_FACING] * 2
+    assert (forces[0].points[1].x, forces[0].points[1].y) == (0.0, -0.5)
+    alone = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, None, None, 1e-4, estimate))
+    assert {each.ns for each in alone.markers} == {"thread", "deviation", "disturbances"}
+
+
+def test_the_minimum_of_every_barrier_is_written_beside_its_node():
+    """Also of a barrier that a user added; not of those that hold the segments together, nor of one without rows."""
+    data = markers.packed_thread_markers(7, prediction(), MARGINS, 1e-4)
+    texts = [each for each in topics.THREAD_MARKERS.decode(data).markers if each.ns == "margins"]
+    assert [each.text for each in texts] == ["obstacle -0.00 mm", "own 1.20 mm"]
+    assert texts[0].color.r > texts[1].color.r  # red where it is touched
+    for each, node in zip(texts, (3, 2), strict=True):
+        assert each.pose.position.x == POINTS[node, 0]
+        assert each.lifetime.nanosec > 0  # it goes when the barrier has no row any more
+    hidden = topics.THREAD_MARKERS.decode(markers.packed_thread_markers(7, prediction(), None, 1e-4))
+    assert {each.ns for each in hidden.markers} == {"thread"}
 
 
 def test_a_material_becomes_parameters():
@@ -86,91 +337,25 @@ def test_a_material_becomes_parameters():
     assert parse_material(ThreadMaterial()) == {}
     message = ThreadMaterial(name="silk_6_0", viscosity=0.9, attachment_offset=[1e-3, 0.0], rest_curvature=[0.0])
     values = parse_material(message)
-    assert values == {
-        "material": "silk_6_0",
-        "diameter": 0.0,
-        "elastic_modulus": 0.0,
-        "paper_stiffness_weight": 0.0,
-        "viscosity": 0.9,
-        "rest_curvature": 0.0,
-        "attachment_offset": [1e-3, 0.0],
-    }
+    assert (values["material"], values["viscosity"], values["attachment_offset"]) == ("silk_6_0", 0.9, [1e-3, 0.0])
     assert {type(value) for value in values.values()} == {str, float, list}
 
 
-def test_a_path_shares_nothing_with_the_one_made_before():
-    points = np.random.default_rng(1).normal(size=(9, 2))
-    first = MESSAGES.path_message(STAMP, points)
-    shorter = MESSAGES.path_message(Time(sec=9), points[:3] + 1.0)
-    np.testing.assert_array_equal(reading.path_points(shorter), points[:3] + 1.0)
-    assert shorter.header.stamp.sec == shorter.poses[2].header.stamp.sec == 9
-    np.testing.assert_array_equal(reading.path_points(first), points)
-
-
 def test_the_numbers_of_states_and_markers_are_those_of_the_messages():
-    for name, number in building.STATES.items():
+    for name, number in packing.STATES.items():
         assert getattr(TrackerState, f"STATE_{name}") == number
-    assert CoilBridgeState.STATE_UNCONFIGURED == building.UNCONFIGURED
-    for name, number in building.CONDITIONS.items():
+    assert CoilBridgeState.STATE_UNCONFIGURED == packing.UNCONFIGURED
+    for name, number in packing.CONDITIONS.items():
         assert getattr(CoilBridgeState, f"STATE_{name}") == number
-    assert set(building.STATES) == {state.name for state in State}
-    assert set(building.CONDITIONS) == {condition.name for condition in ArmingState}
-    kinds = (Marker.LINE_STRIP, Marker.TRIANGLE_LIST, Marker.CYLINDER, Marker.TEXT_VIEW_FACING)
-    assert kinds == (building.LINE_STRIP, building.TRIANGLE_LIST, building.CYLINDER, building.TEXT)
-    assert (Marker.ADD, Marker.DELETEALL) == (building.ADD, building.DELETE_ALL)
-
-
-DISH = Scene(Dish(0.035, 0.01), (SceneShape("post", "tissue", Disc((0.0, 0.009), 0.002)),))
-VIEW = DishView((320.0, 240.0), 1e-4)
-
-
-@pytest.mark.parametrize(
-    ("type_name", "build"),
-    [
-        ("geometry_msgs/msg/PoseWithCovarianceStamped", lambda m: m.pose_message(7, TAIL, HEADING, np.eye(3))),
-        ("geometry_msgs/msg/PoseStamped", lambda m: m.placed(7, TAIL, 0.3)),
-        ("geometry_msgs/msg/TwistStamped", lambda m: m.twist_message(7, TAIL)),
-        ("nav_msgs/msg/Path", lambda m: m.path_message(7, np.stack([TAIL, HEADING]))),
-        ("sensor_msgs/msg/CompressedImage", lambda m: m.compressed_image(7, np.arange(9, dtype=np.uint8))),
-        ("sensor_msgs/msg/Image", lambda m: m.image(7, np.arange(24, dtype=np.uint8).reshape(2, 4, 3))),
-        ("sensor_msgs/msg/CameraInfo", lambda m: m.camera_info(7, (640, 480), VIEW, 0.3)),
-        ("magnetosuture_msgs/msg/TrackerState", lambda m: m.tracker_state(7, no_pose(State.LOST, "glare", VIEW))),
-        ("magnetosuture_msgs/msg/Scene", lambda m: m.scene_message(7, DISH)),
-        ("visualization_msgs/msg/MarkerArray", lambda m: m.scene_markers(7, DISH)),
-    ],
-)
-def test_rclpy_and_rosbags_get_the_same_message(type_name: str, build: Callable[[MessageBuilder], Any]):
-    store = typestore()
-    theirs = store.serialize_cdr(build(BAG_MESSAGES), type_name)
-    kind = type(build(MESSAGES))
-    assert deserialize_message(bytes(theirs), kind) == deserialize_message(serialize_message(build(MESSAGES)), kind)
-
-
-def test_paths_and_velocities_go_there_and_back():
-    points = np.random.default_rng(0).normal(size=(5, 2))
-    np.testing.assert_array_equal(reading.path_points(MESSAGES.path_message(STAMP, points)), points)
-    assert reading.path_points(MESSAGES.path_message(STAMP, np.empty((0, 2)))).shape == (0, 2)
-    twist = MESSAGES.twist_message(STAMP, np.array([1.0, -2.0]))
-    np.testing.assert_array_equal(reading.plane_velocity(twist, "needle/servo_cv"), [1.0, -2.0])
-    np.testing.assert_array_equal(serialised_velocity(serialize_message(twist)), [1.0, -2.0])
-
-
-@pytest.mark.parametrize("topic", [*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS], ids=lambda topic: topic.name)
-def test_every_topic_has_a_type_that_bags_know(topic: topics.Topic):
-    assert topic.channel.type_name in typestore().fielddefs
+    assert set(packing.STATES) == {state.name for state in State}
+    assert set(packing.CONDITIONS) == {condition.name for condition in ArmingState}
+    kinds = (Marker.ARROW, Marker.CYLINDER, Marker.LINE_STRIP, Marker.SPHERE_LIST, Marker.TEXT_VIEW_FACING)
+    assert kinds == (markers.ARROW, markers.CYLINDER, markers.LINE_STRIP, markers.SPHERE_LIST, markers.TEXT)
+    assert (Marker.TRIANGLE_LIST, Marker.DELETEALL) == (markers.TRIANGLE_LIST, markers.DELETE_ALL)
 
 
 def test_the_bags_and_the_graph_have_the_same_own_messages():
     """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
-    for topic in (
-        topics.PREDICTED_THREAD,
-        topics.MARGINS,
-        topics.CURRENTS,
-        topics.BRIDGE_STATE,
-        topics.FILTER_STATE,
-        topics.TRACKER_STATE,
-        topics.THREAD_OBSERVATION,
-        *topics.SETTINGS,
-    ):
+    for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())

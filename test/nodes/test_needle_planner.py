@@ -34,11 +34,11 @@ from magnetosuture_thread.interface import (
     PLAN_PROCEDURE,
     RESUME_PROCEDURE,
 )
-from magnetosuture_thread.nodes import procedure_inputs, topics
-from magnetosuture_thread.nodes.messages import MESSAGES
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from magnetosuture_thread.scene import Scene, SceneShape, read_scene
+from test.nodes import wire
 from test.nodes.bridge import applied, armed, reasons
 from test.nodes.scenes import scene_told
 
@@ -90,7 +90,7 @@ class Bench:
         )
         self.graph.publish(topics.MARGINS, self.margins)
         runs, count = self.is_in(ProcedureState.STATE_RUNNING), len(self.commands)
-        self.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp, self.tail, self.heading))
+        self.graph.publish(topics.NEEDLE_POSE, wire.pose_message(stamp, self.tail, self.heading))
         # A needle that went on meanwhile would be controlled late; a pose that got lost has no answer.
         deadline = time.monotonic() + ANSWER_TIMEOUT
         while runs and len(self.commands) == count and self.is_in(ProcedureState.STATE_RUNNING):
@@ -227,14 +227,6 @@ def test_a_second_procedure_is_refused_while_one_is_executed(graph, make_bench):
     assert bench.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
-def test_a_goal_that_is_sent_twice_is_executed_once(graph, make_bench):
-    bench = make_bench()
-    first = bench.run()
-    again = bench.send(FAR, first.goal_id)
-    assert not again.accepted
-    assert bench.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
-
-
 def test_a_cancel_brings_the_needle_to_rest_and_another_while_cancelling_does_no_harm(graph, make_bench):
     bench = make_bench()
     goal = bench.run()
@@ -252,7 +244,7 @@ def test_a_cancel_brings_the_needle_to_rest_and_another_while_cancelling_does_no
 def test_any_command_of_the_operator_pauses_until_it_is_resumed(graph, make_bench):
     bench = make_bench()
     goal = bench.run()
-    graph.publish(topics.OPERATOR_COMMAND, MESSAGES.twist_message(graph.now(), np.zeros(2)))
+    graph.publish(topics.OPERATOR_COMMAND, wire.twist_message(graph.now(), np.zeros(2)))
     bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "an operator commands"), "the pause")
     assert not bench.state().resumes
     assert bench.rests()
@@ -342,13 +334,6 @@ def test_late_poses_are_as_none(graph, make_bench):
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "the needle to be known again")
 
 
-def test_a_needle_that_is_taken_out_of_the_dish_pauses(graph, make_bench):
-    bench = make_bench()
-    bench.run()
-    bench.tail = np.array([0.03, 0.0])
-    bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "outside of the dish"), "the pause")
-
-
 def test_a_bridge_that_is_disarmed_pauses_until_it_is_resumed(graph, make_bench):
     bench = make_bench()
     bench.run()
@@ -367,13 +352,13 @@ def test_a_page_has_to_be_held_where_that_is_asked_for(graph, make_bench):
     hold = graph.probe.create_publisher(topics.PROCEDURE_HOLD.message, topics.PROCEDURE_HOLD.name, 1)
     goal = bench.send(f"{{limits: {{speed: 0.0005}}, {FAR}}}", hold_to_run=True)
     bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "nobody holds the page"), "the pause")
-    old = MESSAGES.header(graph.now())
+    old = wire.header(graph.now())
     old.stamp.sec -= 10
     hold.publish(old)
     assert bench.rests()
 
     def held() -> None:
-        hold.publish(MESSAGES.header(graph.now()))
+        hold.publish(wire.header(graph.now()))
 
     def runs() -> bool:
         held()
@@ -389,17 +374,6 @@ def test_a_page_has_to_be_held_where_that_is_asked_for(graph, make_bench):
 
     bench.until(ends, "the end")
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
-
-
-def test_a_scene_without_a_shape_that_is_needed_ends_the_procedure(graph, make_bench):
-    bench = make_bench(Scene(Dish(0.035), (POST,)), thread_length=0.05)
-    goal = bench.run(AROUND)
-    bench.scene = Scene(Dish(0.035))
-    graph.publish(topics.SCENE, scene_told(bench.scene))
-    status, result = bench.result(goal)
-    assert status == GoalStatus.STATUS_ABORTED
-    assert "goals[0].wrap.around: got 'post'" in result.reason
-    assert bench.rests()
 
 
 def test_a_second_node_that_commands_pauses_and_nothing_is_begun(graph, make_bench):
@@ -432,31 +406,3 @@ def test_a_planner_that_is_killed_leaves_the_needle_at_rest(graph, make_bench):
     graph.remove(bench.node)  # without its `finish`, as a crash ends it
     graph.wait(lambda: "no command for" in reasons(states), "the bridge to miss its commands")
     assert not applied(bridge)[-1].any()
-
-
-def test_without_a_scene_or_a_needle_nothing_is_begun(graph):
-    node = graph.add(NeedlePlannerNode)
-    graph.listen(topics.NEEDLE_COMMAND)
-    client = ActionClient(graph.probe, ExecuteProcedure, EXECUTE_PROCEDURE)
-    graph.wait(client.server_is_ready, "the action")
-    reasons = []
-    for _ in range(2):
-        future = client.send_goal_async(ExecuteProcedure.Goal(procedure=NEAR))
-        graph.wait(future.done, "the answer")
-        result = future.result().get_result_async()
-        graph.wait(result.done, "the result")
-        reasons.append(result.result().result.reason)
-        graph.publish(topics.SCENE, scene_told(OPEN))
-        graph.wait(lambda: node._scene.version == OPEN.version, "the scene")
-    with graph.between_callbacks():
-        client.destroy()
-    assert "a scene first" in reasons[0]
-    assert "a needle that is tracked" in reasons[1]
-
-
-@pytest.mark.parametrize("positions", [[], [Point()], [Point(), Point(x=math.nan)]])
-def test_positions_that_are_no_thread_are_none(positions: list[Point]):
-    assert procedure_inputs._vertices(PredictedThread(positions=positions)) is None
-    found = procedure_inputs._vertices(PredictedThread(positions=[Point(), Point(x=-0.01)]))
-    assert found is not None
-    assert found.tolist() == [[0.0, 0.0], [-0.01, 0.0]]

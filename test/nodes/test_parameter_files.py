@@ -17,7 +17,6 @@ from rclpy.parameter import parameter_value_to_python
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.nodes import parameter_files
-from magnetosuture_thread.nodes.coil_bridge.node import CoilBridgeNode
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.resources import find_setup_file
@@ -108,17 +107,6 @@ def test_what_comes_later_counts(followed, texts: list[str], arguments: tuple[st
     assert followed(texts, arguments)[1] == speed
 
 
-def test_the_nodes_own_arguments_come_before_those_of_the_process(followed, tmp_path: Path):
-    own = ("-p", "speed:=0.002", "-r", "__node:=mine")
-    assert followed([COMMON + OWN], LEFT, own, "/lab2") == ("/lab2/mine", 0.002, 0.006)
-    file = tmp_path / "own.yaml"
-    file.write_text("/lab2/mine: {ros__parameters: {speed: 0.001}}")
-    own = ("--params-file", str(file), "-r", "__node:=mine")
-    assert followed([COMMON + OWN], (), own, "/lab2")[1] == 0.001
-    with pytest.raises(ConfigurationError, match=r"own\.yaml: sections: got '/lab2/mine', expected one for /mine"):
-        followed([COMMON + OWN], (), own)
-
-
 @pytest.mark.parametrize(
     ("text", "arguments", "words"),
     [
@@ -148,17 +136,6 @@ def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
 def test_sections_of_others_do_not_matter(followed):
     text = "/lab1/camera: {ros__parameters: {exposure: 3}}\n/**/coil_bridge: {ros__parameters: {rate: 50.0}}\n"
     assert followed([OWN + text], LAB1)[1] == 0.004
-
-
-def test_levels_of_names_and_of_namespaces_are_read_as_ros_reads_them(followed):
-    text = """
-lab1:
-  path_follower:
-    ros__parameters:
-      qos_overrides: {/needle/servo_cv: {publisher: {depth: 3}}}
-      speed: 4e-3
-"""
-    assert followed([text], LAB1)[1] == 0.004
 
 
 # As processes, as launch starts them.
@@ -243,11 +220,3 @@ def test_a_node_of_whose_file_nothing_applies_does_not_start(
     assert errors[0].startswith(f"error: {file}: ")
     assert words in errors[0]
     assert "Traceback" not in said
-
-
-def test_a_managed_node_of_whose_file_nothing_applies_is_not_made(graph, tmp_path: Path):
-    file = tmp_path / "old.yaml"
-    file.write_text("coil_bridge: {ros__parameters: {max_speed: 0.01}}")
-    arguments = ["--ros-args", "--params-file", str(file), "-r", "__ns:=/lab1"]
-    with pytest.raises(ConfigurationError, match="expected one for /lab1/coil_bridge"):
-        CoilBridgeNode(context=graph.context, cli_args=arguments)

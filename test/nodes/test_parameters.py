@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pytest
-from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
@@ -39,22 +37,6 @@ def test_every_setting_is_a_described_parameter(graph):
     # An empty list knows of what it is one.
     assert node.describe_parameter("gravity").type == node.get_parameter("gravity").type_.value == 8
     assert node.describe_parameter("fixed_nodes").type == node.get_parameter("fixed_nodes").type_.value == 7
-
-
-def test_what_stays_while_the_node_is_configured_says_why(graph):
-    node = graph.add(ThreadModelNode)
-    why = node.describe_parameter("formulation").additional_constraints
-    assert why.endswith("; stays while the node is configured: compiled when the node is configured")
-    refused = node.set_parameters([Parameter("formulation", value="paper")])[0]
-    assert not refused.successful
-    assert refused.reason == (
-        "thread_model.formulation: got 'paper', expected its value in force, until the node is cleaned up"
-    )
-    assert node.set_parameters([Parameter("formulation", value="rod")])[0].successful  # which is no change
-    tracker = graph.add(VisionTrackerNode)
-    refused = tracker.set_parameters([Parameter("needle_length", value=0.01)])[0]
-    assert not refused.successful
-    assert tracker.get_parameter("needle_length").value == 0.007
 
 
 @dataclass(frozen=True)
@@ -152,43 +134,6 @@ def test_what_is_refused_changes_nothing_and_is_said_in_a_line(kitchen, values, 
     assert kitchen.in_force == Oven()
 
 
-def test_what_cannot_be_made_is_refused(kitchen):
-    kitchen.refusal = "fewer"
-    assert kitchen.set(dishes=[1.0]) == "oven.dishes: got [1.0], expected fewer"
-    assert kitchen.in_force == Oven()
-
-
-def test_nothing_is_changed_unless_every_callback_agrees(kitchen):
-    refused = SetParametersResult(successful=False, reason="no")
-    kitchen.node._on_set_parameters_callbacks.append(lambda parameters: refused)
-    assert kitchen.set(temperature=350.0) == "no"
-    kitchen.node._on_set_parameters_callbacks.pop()
-    assert kitchen.in_force == Oven()
-    # Nor later, with something else.
-    assert not kitchen.set(use_sim_time=False)
-    assert kitchen.in_force == Oven()
-
-
-def test_what_is_set_from_inside_goes_the_same_way(kitchen):
-    kitchen.changeable.set({"temperature": 350.0, "dishes": [], "owners": ["a"]})
-    assert kitchen.in_force == Oven(temperature=350.0, owners=("a",))
-    kitchen.changeable.set({})
-    with pytest.raises(MagnetosutureError, match="at least 300 K"):
-        kitchen.changeable.set({"temperature": 100.0, "lit": True})
-    with pytest.raises(MagnetosutureError, match="out of range"):
-        kitchen.changeable.set({"temperature": math.nan})
-    assert kitchen.in_force == Oven(temperature=350.0, owners=("a",))
-
-
-def test_other_nodes_can_ask_for_the_description(graph):
-    graph.add(ThreadModelNode)
-    client = graph.probe.create_client(DescribeParameters, "/thread_model/describe_parameters")
-    assert client.wait_for_service(10.0)
-    future = client.call_async(DescribeParameters.Request(names=["viscosity"]))
-    graph.wait(future.done, "the description")
-    assert "Pa s" in future.result().descriptors[0].description
-
-
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
@@ -202,12 +147,6 @@ def test_other_nodes_can_ask_for_the_description(graph):
 def test_a_node_does_not_start_with_a_bad_parameter(graph, parameters, words):
     with pytest.raises(ConfigurationError, match=words):
         graph.add(ThreadModelNode, **parameters)
-
-
-def test_whole_numbers_are_taken_for_real_ones(graph):
-    node = graph.add(ThreadModelNode, viscosity=2, attachment_offset=[0, 0])
-    assert node.get_parameter("viscosity").value == 2.0
-    assert list(node.get_parameter("attachment_offset").value) == [0.0, 0.0]
 
 
 def test_what_nodes_share_and_this_one_does_not_know_is_left_aside(graph):

@@ -16,7 +16,6 @@ from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import PredictedThread, SafetyMargins
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.perception import perception
 from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
@@ -100,70 +99,6 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
     apart, joined = said
     assert len(apart[0]) == FRAMES - 2
     assert apart == joined
-
-
-def test_the_thread_is_handed_over_and_no_message_is_taken_besides(graph, frames):
-    _, model = together(graph)
-    assert not {"/needle/measured_cp", "/thread/measured"} & {entry.topic_name for entry in model.subscriptions}
-    predicted, _ = answers(graph, frames)
-    assert [message.header.stamp.nanosec for message in predicted] == [k * 33_000_000 for k in range(2, FRAMES)]
-
-
-def test_markers_come_only_where_somebody_looks(graph, frames):
-    _, model = together(graph)
-    predicted, _ = answers(graph, frames[:4])
-    (shown,) = [entry for entry in model.publishers if entry.topic_name == f"/{topics.THREAD_MARKERS.name}"]
-    assert not shown.get_subscription_count()
-    markers = graph.listen(topics.THREAD_MARKERS)
-    graph.wait(lambda: shown.get_subscription_count() == 1, "the viewer to be found")
-    for index, image in enumerate(frames[4:], start=4):
-        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 33_000_000)))
-        graph.wait(lambda index=index: len(predicted) >= index - 1, "an answer")
-    graph.wait(lambda: len(markers) == len(frames) - 4, "markers of all frames from then on")
-    assert len(markers[-1].markers[0].points) == len(predicted[-1].positions)
-
-
-def test_both_say_how_they_are(graph, frames):
-    said = graph.listen_later(topics.DIAGNOSTICS)
-    together(graph)
-    names = {"vision_tracker: state", "thread_model: state"}
-    graph.wait(lambda: names <= {array.status[0].name for array in said}, "both diagnostics")
-    answers(graph, frames)
-    graph.wait(
-        lambda: {"tracking", "predicting"} <= {array.status[0].message for array in said},
-        "both to be well",
-        timeout=10.0,
-    )
-
-
-def test_a_stamp_that_is_none_is_refused_by_the_tracker_and_by_the_model(graph, frames):
-    """Each for itself, whoever hands it over."""
-    said, poses = graph.listen_later(topics.DIAGNOSTICS), graph.listen_later(topics.NEEDLE_POSE)
-    given = [Parameter("confirm_frames", value=1), Parameter("scene", value=SCENE)]
-    tracker = VisionTrackerNode(context=graph.context, parameter_overrides=given)
-    model = ThreadModelNode(context=graph.context, listens=False)
-    tracker.hand_to(model)
-    for node in (tracker, model):
-        graph.nodes.append(node)
-        graph.executor.add_node(node)
-
-    def is_refused(field: str) -> bool:
-        return any(f"{field}.header.stamp.nanosec" in array.status[0].message for array in said)
-
-    stamp = Time(sec=5, nanosec=1_500_000_000)
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(frames[0], stamp))
-    graph.wait(lambda: is_refused("camera/image_raw/compressed"), "the tracker's refusal")
-    assert poses == []
-    with graph.between_callbacks():
-        model.on_tracked(stamp, np.zeros(2), np.array([1.0, 0.0]), np.zeros((3, 3)))
-    graph.wait(lambda: is_refused("needle/measured_cp"), "the model's refusal")
-
-
-def test_one_that_cannot_be_made_takes_the_other_along(graph):
-    with pytest.raises(MagnetosutureError, match="thread_model"):
-        together(graph, confirm_frames=3)  # the tracker's; no parameter of the model
-    nodes = graph.probe.get_node_names()
-    graph.wait(lambda: "vision_tracker" not in graph.probe.get_node_names(), f"none of {nodes}")
 
 
 SETUP = """

@@ -34,15 +34,6 @@ sys.exit(program.main())
 WITHIN = 4.0  # s after the beginning: amid imports, the making of a node, or its work
 TIMEOUT = 90.0  # s
 # A compiler that lets no handler of Python run for hours; it says so once it is at work.
-BLOCKED = """
-import hashlib, threading
-from magnetosuture_thread.nodes import vision_tracker
-def compile():
-    threading.Timer(1.0, print, ["blocked"], {"flush": True}).start()
-    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
-vision_tracker.warm_up = compile
-vision_tracker.main()
-"""
 
 
 @pytest.fixture
@@ -108,12 +99,6 @@ def test_a_node_that_compiles_ends_in_order(name: str, which: signal.Signals, en
     assert "ready" not in output
 
 
-@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_ends_though_the_compiler_lets_no_handler_run(which: signal.Signals, environment):
-    code, output = ended(["-c", BLOCKED], environment, "blocked", which)
-    assert code == 0, output
-
-
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
     without = "import sys; sys.modules['rclpy'] = None; sys.argv[0] = sys.argv[1]; " + (
@@ -124,22 +109,3 @@ def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
     )
     assert run.returncode == 1
     assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", run.stderr)
-
-
-def test_an_interruption_while_a_library_calls_python_is_not_lost(environment: dict[str, str]):
-    """As while compiled code is loaded: an exception goes no further there, and Python writes its traceback."""
-    script = """
-import ctypes, os, signal, sys
-import rclpy
-from magnetosuture_thread.nodes.run import run
-
-def make():
-    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()
-    return rclpy.create_node("interrupted")
-
-sys.exit(run(make, []))
-"""
-    ended = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False
-    )
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")

@@ -16,13 +16,9 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
-from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.replay import clock as replay_clock
-from magnetosuture_thread.nodes.replay import player
-from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.nodes.replay.losses import Losses
-from magnetosuture_thread.nodes.replay.player import LiveReplay
+from magnetosuture_thread.nodes import player, topics
+from magnetosuture_thread.nodes.player import LiveReplay, Losses, Timeline
+from test.nodes import wire
 from test.nodes.margins import no_margins
 
 
@@ -37,7 +33,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     def on(duration: float) -> None:
         now[0] += duration
 
-    monkeypatch.setattr(replay_clock, "time", Clock)
+    monkeypatch.setattr(player, "time", Clock)
     return on
 
 
@@ -62,18 +58,6 @@ def test_time_stands_still_before_it_begins_and_while_it_is_paused(clock):
     assert line.left(6 * 10**9) == pytest.approx(0.25)
     line.begin()
     assert line.now() == 3 * 10**9
-
-
-def test_time_that_is_paused_before_it_begins_stands_at_the_start(clock):
-    line = Timeline(0, 1.0)
-    line.pause(True)
-    clock(2.0)
-    line.begin()
-    clock(2.0)
-    assert line.now() == 0
-    line.pause(False)
-    clock(2.0)
-    assert line.now() == 2 * 10**9
 
 
 def diagnostics(node: str, **values: int) -> bytes:
@@ -102,15 +86,6 @@ def test_losses_are_counted_by_the_way_on_which():
     }
 
 
-def test_without_numbers_or_frames_nothing_is_made_up():
-    losses = Losses()
-    losses.heard("needle/measured_cp", 1, None)
-    losses.heard("thread/margins", 1, topics.UNNUMBERED)
-    assert not losses.frames_waiting
-    assert not losses.poses_waiting
-    assert losses.dropped() == {"poses without an answer": 0, "outputs lost by the recording": 0}
-
-
 @dataclass
 class Recorded:
     """A recorded pose."""
@@ -122,13 +97,13 @@ class Recorded:
     def data(self) -> bytes:
         """Return its bytes."""
         stamp = Time(sec=self.time // 10**9, nanosec=self.time % 10**9)
-        return serialize_message(MESSAGES.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
+        return serialize_message(wire.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
 
 
 def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pytest.MonkeyPatch):
     """Here the graph is a probe that answers every other pose."""
     monkeypatch.setattr(player, "SETTLE", 0.5)
-    monkeypatch.setattr(player, "STUCK", 0.6)
+    monkeypatch.setattr(player, "STUCK", 3.0)
     for topic in topics.OUTPUTS:
         if topic.channel is not MARGINS and topic.channel is not NEEDLE_POSE:
             topic.publisher(graph.probe)
@@ -154,9 +129,9 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
     try:
         # Nobody is there for the seen thread.
         monkeypatch.setattr(player, "START_TIMEOUT", 0.5)
-        with pytest.raises(GraphError, match=r"nobody at /thread/measured"):
+        with pytest.raises(GraphError, match=r"nobody at .*/thread/measured"):
             live.wait_for_graph()
-        monkeypatch.setattr(player, "START_TIMEOUT", 20.0)
+        monkeypatch.setattr(player, "START_TIMEOUT", 60.0)
         graph.probe.create_subscription(
             topics.MEASURED_THREAD.message, topics.MEASURED_THREAD.name, lambda message: None, 100
         )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from concurrent.futures import wait
 
 import cv2
 import numpy as np
@@ -15,16 +13,15 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
-from magnetosuture_thread.nodes.replay.clock import Timeline
-from magnetosuture_thread.nodes.rig_simulator.node import RigSimulatorNode
+from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
-from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from test.nodes import wire
 from test.nodes.scenes import scene_told
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
@@ -33,7 +30,7 @@ SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.
 def currents(graph, *values: float) -> CoilCurrents:
     """Return currents from now on."""
     message = CoilCurrents(current=[float(value) for value in values])
-    message.header = MESSAGES.header(graph.now())
+    message.header = wire.header(graph.now())
     return message
 
 
@@ -64,33 +61,6 @@ def test_frames_come_with_their_truth_and_the_camera(graph):
     assert [wrench.force.x, wrench.force.y, wrench.torque.z] == [*frame.pull.tolist(), frame.moment]
 
 
-def test_a_frame_period_is_kept_in_the_stamps(graph):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
-
-    def periods() -> np.ndarray:
-        return np.diff([nanoseconds(needle.header.stamp) for needle in needles]) * 50e-9
-
-    graph.wait(lambda: len(needles) > 10 and np.any(np.abs(periods() - 1.0) < 0.05), "frames, and two in a row")
-    found = periods()
-    # A frame that nobody had time for is left out; the first may come late, by what a tick may come early.
-    assert found.min() > 0.89
-    assert np.abs(found - np.rint(found)).max() < 0.11
-
-
-def test_a_tick_that_comes_late_leaves_no_frame_out_and_moves_none(graph, monkeypatch):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    late = [0.0, 0.05, 0.0, 0.6, 0.02, 0.0, 0.3, 0.85, 0.0]  # of a period
-    ticks = iter([0.02 * (1 + number + part) for number, part in enumerate(late)])
-    monkeypatch.setattr(Timeline, "running", lambda timeline: next(ticks, 1.0))
-    node = graph.add(RigSimulatorNode, frame_rate=50.0, **SMALL)
-    graph.wait(lambda: len(needles) > len(late), "a frame for each tick, and one much later")
-    steps = np.diff([nanoseconds(needle.header.stamp) for needle in needles[: len(late) + 1]])
-    assert steps[:-1] == pytest.approx(2e7, rel=1e-6)
-    assert steps[-1] == pytest.approx(1e9 - 0.18e9, rel=1e-6)
-    assert node._skipped == 40
-
-
 def test_nothing_moves_without_a_current_then_the_needle_is_pulled(graph):
     needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     graph.add(RigSimulatorNode, faults=["dim 0.0 60.0"], **SMALL)
@@ -111,61 +81,6 @@ def refusals(diagnostics) -> list[str]:
     """Return what was refused."""
     values = [value for array in diagnostics for value in array.status[0].values]
     return [value.value for value in values if value.key == "last refusal" and value.value != "none"]
-
-
-@pytest.mark.parametrize("bad", [(1.0, 2.0), (np.nan, 0, 0, 0)])
-def test_bad_currents_are_refused_and_said(graph, bad):
-    diagnostics = graph.listen_later(topics.DIAGNOSTICS)
-    graph.add(RigSimulatorNode, **SMALL)
-    graph.publish(topics.RIG_CURRENTS, currents(graph, *bad))
-    graph.wait(lambda: any("4 finite numbers" in text for text in refusals(diagnostics)), "a refusal")
-
-
-def test_currents_beyond_all_measure_end_nothing(graph):
-    node = graph.add(RigSimulatorNode, **SMALL)
-    needles = graph.listen(topics.GROUND_TRUTH_NEEDLE)
-    graph.publish(topics.RIG_CURRENTS, currents(graph, 1e160, -1e300, 0, 0))
-    graph.wait(lambda: node.rig.running > 0.05, "the currents")
-    count = len(needles)
-    graph.wait(lambda: len(needles) > count + 3, "frames")
-    assert np.abs(node.rig.currents).max() <= 30.0
-    assert np.hypot(needles[-1].pose.position.x, needles[-1].pose.position.y) < 0.0176
-
-
-def test_currents_are_in_force_while_a_frame_is_rendered(graph, monkeypatch):
-    node = graph.add(RigSimulatorNode, **SMALL)
-    render, begun, go_on = node.rig.render, threading.Event(), threading.Event()
-
-    def slow(frame: RigFrame) -> RigFrame:
-        begun.set()
-        assert go_on.wait(30.0)
-        return render(frame)
-
-    monkeypatch.setattr(node.rig, "render", slow)
-    graph.wait(begun.is_set, "a frame")
-    graph.publish(topics.RIG_CURRENTS, currents(graph, 3, 0, 0, 0))
-    graph.wait(lambda: node.rig.currents.any(), "the currents")
-    assert node.rig.currents.tolist() == [3.0, 0.0, 0.0, 0.0]
-    frames = graph.listen(topics.COMPRESSED_IMAGE)
-    go_on.set()
-    graph.wait(lambda: len(frames) > 2, "frames")
-
-
-def test_an_error_while_a_frame_is_rendered_is_not_lost(graph, monkeypatch):
-    node = graph.add(RigSimulatorNode, **SMALL)
-
-    def fail(frame: RigFrame) -> RigFrame:
-        raise RuntimeError("no paint")
-
-    with graph.between_callbacks():
-        monkeypatch.setattr(node.rig, "render", fail)
-        wait(node._rendering)
-        node._take(node.time.elapsed())
-        wait(node._rendering)
-        with pytest.raises(RuntimeError, match="no paint"):
-            node.on_frame()
-        monkeypatch.undo()
-        node._rendering.clear()
 
 
 def test_where_the_simulation_fails_the_coils_go_off_and_it_is_said(graph, monkeypatch):
@@ -228,16 +143,6 @@ def test_a_fault_can_be_asked_for_now(graph):
     assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
 
 
-def test_late_frames_come_late_with_their_own_stamps(graph):
-    frames, needles = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    node = graph.add(RigSimulatorNode, faults=["late_frames 0 60"], **SMALL)
-    graph.publish(topics.RIG_CURRENTS, currents(graph, 0.01, 0, 0, 0))
-    graph.wait(lambda: node.rig.running > 0.0, "the fault's time")
-    frames.clear()
-    graph.wait(lambda: len(frames) > 2 and len(needles) > 2, "frames")
-    assert node.get_clock().now().nanoseconds - nanoseconds(frames[-1].header.stamp) > 0.05e9
-
-
 def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
     needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
     ports = (str(tmp_path / "a"), str(tmp_path / "b"))
@@ -258,19 +163,6 @@ def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
     graph.wait(lambda: bool(np.abs(node.rig.currents).max() < 1e-3), "the currents to go")
     graph.remove(node)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_simulated_clock_runs_at_its_pace(graph):
-    node = graph.add(RigSimulatorNode, use_sim_time=True, rate=3.0, **SMALL)
-    real, elapsed = time.perf_counter(), node.time.elapsed()
-    clocks, needles = graph.listen(topics.CLOCK), graph.listen(topics.GROUND_TRUTH_NEEDLE)
-    graph.wait(lambda: len(clocks) > 20 and len(needles) > 5, "clocks and frames")
-    simulated = (nanoseconds(clocks[-1].clock) - nanoseconds(clocks[0].clock)) * 1e-9
-    assert simulated > 0.0
-    assert nanoseconds(clocks[-1].clock) < 1000e9  # it began near zero
-    assert abs(nanoseconds(needles[-1].header.stamp) - nanoseconds(clocks[-1].clock)) < 1e9
-    assert nanoseconds(clocks[-1].clock) <= node.time.stamp(node.time.elapsed())
-    assert node.time.elapsed() - elapsed == pytest.approx(3.0 * (time.perf_counter() - real), rel=0.3)
 
 
 def test_a_paused_rig_stands_still_and_goes_on_from_there_with_stamps_of_now(graph):
@@ -313,21 +205,6 @@ def later(graph, needles) -> int:
     return len(needles)
 
 
-def test_a_paused_simulated_clock_stands_still(graph):
-    node = graph.add(RigSimulatorNode, use_sim_time=True, **SMALL)
-    clocks = graph.listen(topics.CLOCK)
-    graph.wait(lambda: len(clocks) > 5, "/clock")
-    node.time.pause(True)
-    still = node.time.stamp(node.time.elapsed())
-    graph.wait(lambda: nanoseconds(clocks[-1].clock) == still, "the clock to stand still")
-    count = len(clocks)
-    graph.wait(lambda: len(clocks) > count + 20, "more of it")
-    assert {nanoseconds(message.clock) for message in clocks[count:]} == {still}
-    node.time.pause(False)
-    graph.wait(lambda: nanoseconds(clocks[-1].clock) > still, "the clock to go on")
-    assert nanoseconds(clocks[-1].clock) < still + 60e9
-
-
 def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
     node = graph.add(RigSimulatorNode, **SMALL)
     frames, diagnostics = graph.listen(topics.CAMERA_INFO), graph.listen(topics.DIAGNOSTICS)
@@ -342,8 +219,3 @@ def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
     refusal = "refused: scene: got post where the needle is"
     graph.wait(lambda: any(refusal in d.status[0].message for d in diagnostics), "the refusal")
     assert node.rig.scene.version == other.version
-
-
-def test_without_a_scene_there_is_nothing_to_simulate(graph):
-    with pytest.raises(ConfigurationError, match=r"rig_simulator\.scene: got '', expected a scene file"):
-        graph.add(RigSimulatorNode, needle_start=[0.003, 0.0, 0.0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
@@ -133,14 +132,6 @@ def test_nothing_leads_the_graph_out_of_this_machine(monkeypatch: pytest.MonkeyP
     assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
 
 
-def test_the_environment_is_given_back(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("KEPT", "1")
-    before = dict(os.environ)
-    with environment_of({"OTHER": "2"}):
-        assert dict(os.environ) == {"OTHER": "2"}
-    assert dict(os.environ) == before
-
-
 def test_nodes_end_when_their_parent_is_killed(tmp_path: Path, environment: dict[str, str]):
     program = f"""
 import os, time
@@ -162,46 +153,3 @@ with NodeProcesses(["coil_bridge"], [], dict(os.environ), Path({str(tmp_path)!r}
     while child.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not child.exists()
-
-
-END_AT_WORK = """
-import os
-import signal
-import sys
-import rclpy
-from rclpy.node import Node
-from std_msgs.msg import String
-from magnetosuture_thread.nodes.run import run
-
-class Late(Node):
-    def __init__(self):
-        super().__init__("late")
-        self.said = self.create_publisher(String, "said", 1)
-        self.create_timer(0.01, self.work)
-
-    def work(self):
-        if sys.argv[1] == "asked":
-            rclpy.shutdown()
-        elif sys.argv[1] == "interrupted":
-            os.kill(os.getpid(), signal.SIGINT)
-            print("went on" if rclpy.ok() else "ended", flush=True)
-        else:
-            self.said.destroy()
-        self.said.publish(String(data="late"))
-
-sys.exit(run(Late, []))
-"""
-
-
-@pytest.mark.parametrize(("why", "clean"), [("asked", True), ("broken", False)])
-def test_a_callback_that_is_still_at_work_at_the_end_is_no_failure(environment, why: str, clean: bool):
-    command = [sys.executable, "-c", END_AT_WORK, why]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert (ended.returncode == 0) is clean, ended.stderr
-    assert ("Traceback" not in ended.stderr) is clean
-
-
-def test_an_interruption_waits_until_a_callback_is_done(environment):
-    command = [sys.executable, "-c", END_AT_WORK, "interrupted"]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "went on\n", "")

@@ -44,19 +44,6 @@ def test_every_thread_of_another_process_gets_the_priority_or_it_says_why_not(sl
     assert policies(os.getpid()) == own
 
 
-def test_no_priority_asks_for_nothing(sleeper: int):
-    assert raise_priority(0, sleeper) == "ordinary"
-    assert policies(sleeper) == {(os.SCHED_OTHER, 0)}
-
-
-def test_what_the_system_refuses_is_said(sleeper: int, monkeypatch: pytest.MonkeyPatch):
-    def refuse(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    assert raise_priority(PRIORITY, sleeper).startswith("ordinary; real-time priority 3 refused (Operation not perm")
-
-
 def test_a_process_that_has_ended_is_no_error():
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         process.wait()

@@ -14,9 +14,9 @@ from magnetosuture_msgs.srv import EditShape
 from magnetosuture_thread.interface import ADD_SHAPE, REPLACE_SHAPE
 from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from test.nodes import wire
 
 RATE = 30.0
 FRAMES, APPEARS = 60, 20  # of the needle's motion, and the frame after which the scene changes
@@ -31,7 +31,7 @@ def pose(frame: int) -> Any:
     """Return the needle that goes east."""
     nanoseconds = round(1e9 * (1.0 + frame / RATE))
     stamp = Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-    return MESSAGES.pose_message(stamp, np.array([SPEED * frame / RATE, 0.0]), np.array([1.0, 0.0]))
+    return wire.pose_message(stamp, np.array([SPEED * frame / RATE, 0.0]), np.array([1.0, 0.0]))
 
 
 class Bench:

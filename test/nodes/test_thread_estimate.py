@@ -14,13 +14,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from magnetosuture_msgs.msg import SafetyMargins
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages.cdr import time_of
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
 from test.model.estimator.threads import error_percent, piece_of, poses, thread_of, true_shapes, whole
+from test.nodes import wire
 
 COUNT = 12
 WAY = poses(60)
@@ -29,7 +28,7 @@ SILK = {"material": "silk_6_0"}
 
 
 def stamp(k: float) -> Time:
-    seconds, nanoseconds = time_of(round((1.0 + k / 30.0) * 1e9))
+    seconds, nanoseconds = divmod(round((1.0 + k / 30.0) * 1e9), 10**9)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
@@ -50,12 +49,12 @@ class Bench:
 
     def pose(self, k: int, needle: NeedlePose | None = None) -> None:
         shown = needle or WAY[k]
-        self.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp(k), shown.tail, shown.heading))
+        self.graph.publish(topics.NEEDLE_POSE, wire.pose_message(stamp(k), shown.tail, shown.heading))
 
     def observe(self, k: float, observation: ThreadObservation) -> None:
         """Publish what a frame shows, and wait until the node has taken it."""
         before = self.taken()
-        self.graph.publish(topics.THREAD_OBSERVATION, MESSAGES.observation_message(stamp(k), observation))
+        self.graph.publish(topics.THREAD_OBSERVATION, wire.observation_message(stamp(k), observation))
         self.graph.wait(lambda: self.taken() > before, "the observation to be taken")
 
     def wait_for_estimate(self, k: int) -> None:
@@ -129,20 +128,6 @@ def test_a_frame_without_an_observation_is_only_predicted_and_says_since_when(be
     bench.graph.wait(bench.hears("only a prediction since 1 s"), "a warning")
 
 
-def test_before_the_thread_is_measured_the_margins_are_of_the_prediction(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, initial_shape="straight", scene="dish_35mm")
-    bench.pose(0)
-    graph.wait(lambda: len(bench.margins) == 1, "margins")
-    assert bench.margins[0].source == SafetyMargins.OF_PREDICTION
-    assert set(bench.margins[0].clearance_bound) == {-math.inf}
-    bench.show(1)
-    graph.wait(lambda: len(bench.margins) == 2, "margins")
-    assert bench.margins[1].source == SafetyMargins.OF_ESTIMATE
-    wall = next(each for each in bench.margins[1].minimum if each.barrier == "wall")
-    assert wall.clearance - 1e-3 < wall.clearance_bound < wall.clearance
-    assert not bench.estimated[:-1]
-
-
 def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(bench: Bench):
     for k in range(3):
         bench.show(k)
@@ -162,16 +147,6 @@ def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(benc
     assert not bench.estimated[-1].prediction_only
 
 
-def test_paths_that_end_early_are_estimated_where_no_observations_come(graph: Any):
-    bench = Bench(graph, initial_shape="straight")
-    for k in range(COUNT):
-        graph.publish(topics.MEASURED_THREAD, MESSAGES.path_message(stamp(k), NODES[k, :14]))
-        bench.pose(k)
-        bench.wait_for_estimate(k)
-    graph.wait(lambda: not bench.estimated[-1].prediction_only, "a measured estimate")
-    assert bench.estimated[-1].hidden == pytest.approx(0.5, abs=0.1)
-
-
 def test_what_holds_the_thread_unknown_to_the_model_is_reported(bench: Bench):
     disc, way = Disc((0.0, -2.2e-3), 1.7e-3), poses(150, turn=-0.9)
     held = true_shapes(thread_of(), way, (disc,))
@@ -189,18 +164,6 @@ def test_what_holds_the_thread_unknown_to_the_model_is_reported(bench: Bench):
     warned = next(each.status[0] for each in bench.reports if "held at" in each.status[0].message)
     assert warned.level == DiagnosticStatus.WARN
     assert "N " in warned.message.split("held at")[1]  # so many mN or uN to a side
-
-
-def test_what_is_learned_of_the_thread_is_reported_with_its_interval(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, estimator_slow_parameters=["stiffness_over_drag"])
-    for k in range(3):
-        bench.show(k)
-
-    def learned() -> dict[str, str]:
-        return {value.key: value.value for report in bench.reports for value in report.status[0].values}
-
-    graph.wait(lambda: "learned stiffness_over_drag" in learned(), "what is learned")
-    assert "m^4/s, 95 % in" in learned()["learned stiffness_over_drag"]
 
 
 def spoiled(name: str) -> tuple[float, ThreadObservation]:
@@ -248,27 +211,3 @@ def test_an_observation_that_cannot_be_used_is_survived_and_reported(bench: Benc
         message = bench.show(k)
         assert not message.prediction_only
     assert error(message, COUNT - 1) < 0.1
-
-
-def test_the_estimate_goes_on_after_a_minute_without_an_observation(bench: Bench):
-    bench.show(0)
-    late = WAY[1]
-    at = stamp(1800)
-    bench.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(at, late.tail, late.heading))
-    bench.graph.wait(lambda: len(bench.estimated) == 2, "an estimate")
-    assert bench.estimated[-1].unmeasured_for == pytest.approx(60.0, abs=1e-6)
-    bench.observe(1801, whole(NODES[2], 2))
-    bench.graph.publish(topics.NEEDLE_POSE, MESSAGES.pose_message(stamp(1801), WAY[2].tail, WAY[2].heading))
-    bench.graph.wait(lambda: len(bench.estimated) == 3, "an estimate")
-    assert not bench.estimated[-1].prediction_only
-    assert error(bench.estimated[-1], 2) < 0.2
-
-
-def test_without_the_estimator_there_is_the_prediction_alone(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, estimator=False)
-    for k in range(3):
-        bench.observe(k, whole(NODES[k], k))
-        bench.pose(k)
-        graph.wait(lambda k=k: len(bench.margins) == k + 1, "margins")
-    assert [(each.reason, each.source) for each in bench.margins] == [("", SafetyMargins.OF_PREDICTION)] * 3
-    assert not bench.estimated

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import (
     Disc,
-    Forecast,
     ForecastStart,
     NeedlePose,
     NeedleSafetyFilter,
@@ -25,20 +23,21 @@ from magnetosuture_thread import (
 )
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import FORECAST_PATH
-from magnetosuture_thread.messages.forecasts import forecast_markers, forecast_message, forecast_text
+from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
+from magnetosuture_thread.messages.packing import packed_forecast
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_forecast import make_path_follower
 from test.model.estimator.threads import whole
+from test.nodes import wire
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
 
 HORIZON = 0.6
 
 
 def filter_state(k: int, x: float, y: float) -> FilterState:
-    return FilterState(header=MESSAGES.header(stamp(k)), commanded=Vector3(x=x, y=y), filtered=Vector3(x=x, y=y))
+    return FilterState(header=wire.header(stamp(k)), commanded=Vector3(x=x, y=y), filtered=Vector3(x=x, y=y))
 
 
 def test_every_estimate_has_a_forecast_under_the_present_command(graph: Any, monkeypatch: pytest.MonkeyPatch):
@@ -78,54 +77,6 @@ def forecast_after(bench: Any, forecasts: list[Any]) -> Any:
     return forecasts[-1]
 
 
-def test_no_pose_waits_for_a_forecast_and_the_newest_estimate_is_the_next(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
-    forecasts, begun, go_on, forecast = graph.listen(topics.FORECAST), Event(), Event(), ThreadForecaster.forecast
-
-    def slow(*arguments: Any, **options: Any) -> Forecast:
-        begun.set()
-        assert go_on.wait(60.0)
-        return forecast(*arguments, **options)
-
-    monkeypatch.setattr(ThreadForecaster, "forecast", slow)
-    bench.show(0)
-    assert begun.wait(60.0)
-    for k in (1, 2, 3):
-        bench.show(k)  # waits for the estimate
-    assert not forecasts
-    go_on.set()
-    graph.wait(lambda: len(forecasts) >= 2, "forecasts")
-    bench.show(4)
-    graph.wait(lambda: forecasts[-1].header.stamp == stamp(4), "the forecast of the last")
-    assert [message.header.stamp for message in forecasts] == [stamp(0), stamp(3), stamp(4)]
-
-
-def test_an_unexpected_error_of_a_forecast_is_raised_by_the_next_estimate(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON)
-
-    def broken(*_: Any, **__: Any) -> None:
-        raise ZeroDivisionError("broken")
-
-    monkeypatch.setattr(ThreadForecaster, "forecast", broken)
-    bench.show(0)
-    forecasts = bench.node._forecasts
-    forecasts._worker.join(60.0)
-    with pytest.raises(ZeroDivisionError, match="broken"):
-        forecasts.request(*forecasts._last)
-
-
-def test_estimates_within_the_period_after_one_that_is_forecast_are_not(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    settings = {"forecast_horizon": HORIZON, "forecast_step": 0.03, "forecast_period": 0.08}  # two to three frames
-    bench = counting(monkeypatch, graph, scene="dish_150mm", **settings)
-    forecasts, expected = graph.listen(topics.FORECAST), []
-    for k in range(7):
-        bench.show(k)
-        if k % 3 == 0:
-            expected.append(stamp(k))
-            graph.wait(lambda: len(forecasts) == len(expected), "a forecast")
-    assert [message.header.stamp for message in forecasts] == expected
-
-
 def test_without_a_horizon_nothing_is_forecast(graph: Any, monkeypatch: pytest.MonkeyPatch):
     bench = counting(monkeypatch, graph, scene="dish_150mm")
     bench.show(0)
@@ -138,19 +89,19 @@ def test_message_and_markers_say_what_happens_when():
     forecaster = ThreadForecaster(thread, where, NeedleSafetyFilter(where))
     start = forecaster.straight(NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0])))
     forecast = forecaster.forecast(ForecastStart(start.pose, start.vertices), np.array([0.0, 0.003]), 2.0)
-    message = forecast_message(MESSAGES, stamp(0), forecast)
+    message = topics.FORECAST.decode(packed_forecast(stamp(0), forecast))
     contact = forecast.first_contact
     assert contact is not None
     assert (message.contact_time, message.contact_shape, message.contact_node) == (contact.time, "post", contact.node)
     assert message.clearance[0] == forecast.minima["obstacle"].value
     assert message.clearance_shape[0] == "post"
     assert forecast_text(forecast).startswith(f"touches the post in {contact.time:.1f} s")
-    ghosts = forecast_markers(MESSAGES, stamp(0), forecast).markers
+    ghosts = topics.THREAD_MARKERS.decode(packed_forecast_markers(stamp(0), forecast)).markers
     assert [len(marker.points) for marker in ghosts] == [41, 41, 41, 0]
     assert ghosts[-1].text == forecast_text(forecast)
     still = forecaster.forecast(start, np.zeros(2), 0.1)
     assert not forecast_text(still)
-    assert math.isnan(forecast_message(MESSAGES, stamp(0), still).contact_time)
+    assert math.isnan(topics.FORECAST.decode(packed_forecast(stamp(0), still)).contact_time)
 
 
 def ask(graph: Any, **fields: Any) -> Any:

@@ -7,24 +7,21 @@ import math
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
-from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model import solvers
 from magnetosuture_thread.model.formulations import rod
-from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.examples import FOLDER
-from test.model.worlds import polygon, scene_with
+from test.model.worlds import scene_with
+from test.nodes import wire
 
 
 def stamp(seconds: float) -> Time:
@@ -34,12 +31,12 @@ def stamp(seconds: float) -> Time:
 
 def pose(seconds: float, x: float = 0.0, y: float = 0.0) -> PoseWithCovarianceStamped:
     """Return a needle that points east."""
-    return MESSAGES.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
+    return wire.pose_message(stamp(seconds), np.array([x, y]), np.array([1.0, 0.0]))
 
 
 def seen(seconds: float) -> Path:
     """Return a thread that lies straight behind a needle at the origin."""
-    return MESSAGES.path_message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
+    return wire.path_message(stamp(seconds), np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)]))
 
 
 def test_the_thread_starts_where_it_is_seen_and_follows(graph):
@@ -90,7 +87,7 @@ def place(graph, *geometries: Disc | Polygon) -> Scene:
     """Publish a scene with these shapes, for a node that is made next."""
     scene = scene_with(*geometries)
     graph.said = graph.probe.create_publisher(SceneMessage, topics.SCENE.name, topics.LATCHED)
-    graph.said.publish(MESSAGES.scene_message(graph.now(), scene))
+    graph.said.publish(wire.scene_message(graph.now(), scene))
     return scene
 
 
@@ -118,29 +115,6 @@ def test_friction_slows_the_needle_and_is_shown(graph):
     assert len(markers[-2].markers[1].points) == count
 
 
-def test_the_order_of_pose_and_centreline_does_not_matter(graph):
-    graph.add(ThreadModelNode)
-    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: bool(margins), "margins")
-    assert not margins[0].valid
-    assert margins[0].reason == "waiting for the thread to be seen"
-    assert not margins[0].value
-    graph.publish(topics.MEASURED_THREAD, seen(1.0))
-    graph.wait(lambda: bool(predicted), "the start")
-
-
-def test_poses_that_come_before_the_centreline_of_their_frame_are_not_lost(graph):
-    graph.add(ThreadModelNode)
-    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    for k in range(4):
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k, 1e-4 * k))
-    graph.wait(lambda: len(margins) == 4, "four poses")
-    graph.publish(topics.MEASURED_THREAD, seen(1.1))  # the first frame's centreline was lost
-    graph.wait(lambda: len(predicted) == 3, "three predictions")
-    assert [p.header.stamp for p in predicted] == [pose(1.0 + 0.1 * k).header.stamp for k in (1, 2, 3)]
-
-
 def test_half_of_a_thread_is_not_started_from_where_observations_come(graph):
     graph.add(ThreadModelNode)
     predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
@@ -149,7 +123,7 @@ def test_half_of_a_thread_is_not_started_from_where_observations_come(graph):
     def observed(seconds: float, count: int, last: PieceEnd) -> ThreadObservation:
         piece = ThreadPiece(whole[:count], np.full(count, 1e-5), PieceEnd.TAIL, last, (0.0, 0.0))
         seen_now = ThreadObservation((piece,), complete=last is PieceEnd.FREE)
-        return MESSAGES.observation_message(stamp(seconds), seen_now)
+        return wire.observation_message(stamp(seconds), seen_now)
 
     graph.publish(topics.THREAD_OBSERVATION, observed(1.0, 30, PieceEnd.COVERED))
     graph.publish(topics.NEEDLE_POSE, pose(1.0))
@@ -161,14 +135,6 @@ def test_half_of_a_thread_is_not_started_from_where_observations_come(graph):
     graph.publish(topics.THREAD_OBSERVATION, observed(1.2, 60, PieceEnd.FREE))
     graph.publish(topics.NEEDLE_POSE, pose(1.2))
     graph.wait(lambda: len(predicted) == 1, "the start")
-
-
-def test_it_can_start_straight_without_a_camera(graph):
-    graph.add(ThreadModelNode, initial_shape="straight")
-    predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.003, 0.001))
-    graph.wait(lambda: bool(predicted), "the start")
-    assert predicted[0].positions[25].x == pytest.approx(0.003 - 0.019)
 
 
 def test_shapes_give_margins_and_contact(graph):
@@ -185,29 +151,6 @@ def test_shapes_give_margins_and_contact(graph):
     assert least.obstacle == 0
     assert least.node == 12
     assert least.clearance == pytest.approx(1e-6, abs=1e-9)
-
-
-def test_a_polygon_gives_margins(graph):
-    """A square with its edge 1 mm above the thread."""
-    scene = place(graph, polygon(-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007))
-    node = graph.add(ThreadModelNode, initial_shape="straight")
-    graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
-    margins = graph.listen(topics.MARGINS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: bool(margins), "margins")
-    least = next(entry for entry in margins[0].minimum if entry.barrier == "obstacle")
-    assert least.clearance == pytest.approx(1e-3 - 30e-6, abs=1e-9)
-
-
-def test_the_wall_of_the_dish_has_a_row_in_the_margins(graph):
-    """The thread's end lies 16 mm from the centre of a dish of 35 mm."""
-    graph.add(ThreadModelNode, initial_shape="straight", scene="dish_35mm")
-    margins = graph.listen(topics.MARGINS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.003))
-    graph.wait(lambda: bool(margins), "margins")
-    least = next(entry for entry in margins[0].minimum if entry.barrier == "wall")
-    assert (least.node, least.obstacle) == (25, -1)
-    assert least.clearance == pytest.approx(0.0175 - 0.016 - 30e-6, abs=1e-6)
 
 
 def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -241,26 +184,6 @@ def test_the_papers_formulation_runs_in_the_graph(graph):
     }
 
 
-class LameSolver(BandedSolver):
-    """May take no step."""
-
-    def __init__(self) -> None:
-        super().__init__(iterations=0)
-
-
-def test_a_step_that_fell_back_is_published_and_said(graph, monkeypatch):
-    monkeypatch.setattr(solvers, "BandedSolver", LameSolver)
-    graph.add(ThreadModelNode, initial_shape="straight")
-    predicted, diagnostics = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.publish(topics.NEEDLE_POSE, pose(1.03, 1e-4))
-    graph.wait(lambda: len(predicted) == 2, "a prediction")
-    assert predicted[1].solver == "osqp"
-    assert predicted[1].solver_status.startswith("solved, after banded: iteration limit")
-    assert predicted[1].residual < 1e-6
-    graph.wait(lambda: any("after banded" in d.status[0].message for d in diagnostics), "a warning")
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
@@ -288,28 +211,6 @@ def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
     assert predicted[1].interval == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("at", [Time(sec=-(2**31)), Time(sec=2**31 - 2, nanosec=10**9 - 1)])
-def test_the_first_and_the_last_stamp_that_there_are_go_there_and_back(graph, at):
-    graph.add(ThreadModelNode, initial_shape="straight")
-    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    message = pose(1.0)
-    message.header.stamp = at
-    graph.publish(topics.NEEDLE_POSE, message)
-    graph.wait(lambda: bool(predicted and margins), "the start")
-    assert predicted[0].header.stamp == margins[0].header.stamp == at
-
-
-def test_the_thread_hangs_where_it_is_fixed_to_the_needle(graph):
-    graph.add(ThreadModelNode, attachment_offset=[1e-3, -5e-4])
-    predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.MEASURED_THREAD, seen(1.0))
-    for k in range(3):
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, k * 1e-4))
-        graph.wait(lambda k=k: len(predicted) == k + 1, "a prediction")
-    assert predicted[-1].positions[0].x == pytest.approx(1.2e-3)
-    assert predicted[-1].positions[0].y == pytest.approx(-5e-4)
-
-
 def test_time_set_back_starts_anew(graph):
     graph.add(ThreadModelNode, initial_shape="straight")
     predicted = graph.listen(topics.PREDICTED_THREAD)
@@ -318,19 +219,6 @@ def test_time_set_back_starts_anew(graph):
     graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.002))
     graph.wait(lambda: len(predicted) == 2, "the new start")
     assert predicted[1].solver_status == "started"
-
-
-def test_time_set_back_starts_anew_from_what_is_seen_then(graph):
-    graph.add(ThreadModelNode)
-    predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.MEASURED_THREAD, seen(100.0))
-    graph.publish(topics.NEEDLE_POSE, pose(100.0))
-    graph.wait(lambda: len(predicted) == 1, "the start")
-    for k in range(3):
-        graph.publish(topics.MEASURED_THREAD, seen(1.0 + 0.1 * k))
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + 0.1 * k))
-        graph.wait(lambda k=k: len(predicted) == 2 + k, "a prediction after the bag began again")
-    assert [p.solver_status for p in predicted[1:]] == ["started", "solved", "solved"]
 
 
 def test_a_step_that_did_not_converge_gives_no_margin(graph, monkeypatch):
@@ -360,10 +248,3 @@ def test_an_unproven_solution_gives_no_margin(graph):
     assert invalid.contact_state == SafetyMargins.CONTACT_UNKNOWN
     assert not invalid.minimum
     assert len(predicted) == 1
-
-
-def test_a_seen_thread_that_is_cut_off_is_refused_and_ends_nothing(graph):
-    node = graph.add(ThreadModelNode)
-    whole = serialize_message(Path(header=MESSAGES.header(graph.now()), poses=[PoseStamped()] * 3))
-    node.on_measured_thread_message(whole[:-20])
-    assert node.health._refused == 1

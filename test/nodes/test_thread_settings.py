@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import math
 from functools import partial
 from typing import Any
@@ -10,25 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from magnetosuture_msgs.msg import SafetyMargins, ThreadMaterial
 from magnetosuture_msgs.msg import Scene as SceneMessage
+from magnetosuture_msgs.msg import ThreadMaterial
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene, read_scene
 from test.model.worlds import scene_with
+from test.nodes import wire
 
 SCENE = "dish_150mm"
 POST = Disc((-0.005, 0.003), 0.002)
@@ -57,7 +53,7 @@ class Bench:
             nanoseconds = 1_000_000_000 + k * 33_000_000
             tail, angle = np.array([1e-4 * k, 2e-5 * k]), 0.01 * k
             heading = np.array([math.cos(angle), math.sin(angle)])
-            message = MESSAGES.pose_message(MESSAGES.time(nanoseconds), tail, heading)
+            message = wire.pose_message(wire.time(nanoseconds), tail, heading)
             self.graph.publish(topics.NEEDLE_POSE, message)
             self.shown += 1
             self.graph.wait(lambda: len(self.margins) == self.shown, "the pose's margins")
@@ -80,7 +76,7 @@ class Bench:
 
     def place(self, scene: Scene) -> None:
         """Publish a scene, wait until the node goes by it, and have the session do so too."""
-        self.graph.publish(topics.SCENE, MESSAGES.scene_message(self.graph.now(), scene))
+        self.graph.publish(topics.SCENE, wire.scene_message(self.graph.now(), scene))
         self.graph.wait(lambda: self.node._session.scene_version == scene.version, "the scene")
         self.scene = scene
         self.change()
@@ -247,132 +243,6 @@ def elsewhere(message: SceneMessage) -> SceneMessage:
 def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, scene, alter, words):
     bench = Bench(graph)
     bench.show(4)
-    graph.publish(topics.SCENE, alter(MESSAGES.scene_message(graph.now(), scene)))
+    graph.publish(topics.SCENE, alter(wire.scene_message(graph.now(), scene)))
     graph.wait(lambda: bench.said(words), "a refusal")
     bench.show(4)
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"name": "steel"}, "thread_model.material: got 'steel'"),
-        ({"name": "x" * 100_000}, "thread_model.material"),
-        ({"name": "x" * 300_000}, "bytes, expected at most"),
-        ({"diameter": -1e-5}, "out of range"),
-        ({"diameter": math.inf}, "out of range"),
-        ({"viscosity": 1e300}, "out of range"),
-        ({"viscosity": 0.5, "elastic_modulus": -1.0}, "out of range"),
-        ({"rest_curvature": [math.nan]}, "out of range"),
-        ({"attachment_offset": [1e-3]}, "multiple of 2"),
-        ({"attachment_offset": [1e-3, 1.0]}, "from -0.01 to 0.01 m"),
-        ({"attachment": "knotted"}, "pinned, clamped"),
-    ],
-)
-def test_a_refused_material_is_said_and_leaves_all_as_it_was(graph, fields, words):
-    bench = Bench(graph)
-    bench.show(4)
-    graph.publish(topics.MATERIAL, ThreadMaterial(**fields))
-    graph.wait(lambda: bench.said(words), "a refusal")
-    assert bench.told("viscosity") == 1.0
-    bench.show(4)
-
-
-def test_who_starts_later_gets_the_last_scene_and_the_last_material(graph):
-    publisher = graph.probe.create_publisher(SceneMessage, "scene", topics.LATCHED)
-    other = graph.probe.create_publisher(ThreadMaterial, "thread/material", topics.LATCHED)
-    for radius in (0.001, 0.002):
-        scene = scene_with(Disc((-0.005, 0.003), radius))
-        publisher.publish(MESSAGES.scene_message(graph.now(), scene))
-        other.publish(ThreadMaterial(viscosity=100.0 * radius))
-    node = graph.add(ThreadModelNode)
-    graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
-    graph.wait(lambda: node.get_parameter("viscosity").value == 0.2, "the liquid")
-
-
-def test_a_publisher_that_cannot_be_heard_is_named(graph):
-    bench = Bench(graph)
-    graph.probe.create_publisher(SceneMessage, "scene", QoSProfile(depth=1))
-    graph.wait(
-        lambda: bench.said("publisher of scene: got another durability, expected transient_local"),
-        "a word on the publisher",
-    )
-
-
-def test_a_scene_may_come_while_the_thread_is_waited_for(graph):
-    bench = Bench(graph, initial_shape="measured")
-    bench.show(3)
-    assert [margins.reason for margins in bench.margins] == ["waiting for the thread to be seen"] * 3
-    bench.place(scene_with(POST))
-    thread = np.column_stack([1e-4 - np.linspace(0.0, 0.019, 60), np.full(60, 2e-5)])
-    graph.publish(topics.MEASURED_THREAD, MESSAGES.path_message(MESSAGES.time(1_033_000_000), thread))
-    graph.wait(lambda: len(bench.predicted) == 2 and len(bench.margins) == 5, "the poses that waited")
-    assert [prediction.solver_status for prediction in bench.predicted] == ["started", "solved"]
-    assert 0 in bench.margins[-1].obstacle
-
-
-def test_who_waits_for_a_camera_in_vain_can_be_told_to_start(graph):
-    bench = Bench(graph, initial_shape="measured")
-    bench.show(2)
-    assert bench.set(initial_shape="straight") == []
-    bench.change(initial_shape="straight")
-    bench.show(2)
-    assert len(bench.predicted) == 2
-
-
-def test_of_an_obstacle_upon_the_needle_there_is_no_valid_margin(graph):
-    bench = Bench(graph)
-    bench.show(2)
-    bench.place(scene_with(Disc((0.0, 0.0), 0.005)))
-    bench.show(3)
-    for margins in bench.margins[-3:]:
-        assert not margins.valid
-        assert "not converged" in margins.reason
-        assert margins.contact_state == SafetyMargins.CONTACT_UNKNOWN
-    bench.place(scene_with())
-    bench.show(3)
-    assert bench.margins[-1].valid
-
-
-def alive() -> int:
-    """Return how many predictors there are."""
-    gc.collect()
-    return sum(issubclass(type(found), ThreadPredictor) for found in gc.get_objects())
-
-
-def test_a_hundred_changes_at_the_rate_of_the_camera_lose_no_pose_and_keep_nothing(graph):
-    bench = Bench(graph)
-    bench.show(2)
-    before = alive()
-    for k in range(100):
-        x = -0.005 + 1e-5 * k
-        if k % 2:
-            bench.place(scene_with(Disc((x, 0.003), 0.002)))
-        else:
-            assert bench.set(viscosity=0.5 + 0.001 * k) == []
-            bench.change(viscosity=0.5 + 0.001 * k)
-        bench.show(1)
-    assert len(bench.predicted) == 102
-    assert all(prediction.interval == pytest.approx(0.033) for prediction in bench.predicted[1:])
-    assert bench.refusals() == 0
-    assert alive() == before
-
-
-def test_a_flood_of_what_is_refused_keeps_no_pose_waiting(graph):
-    """A million numbers are refused by their count, before anything is built of them."""
-    bench = Bench(graph)
-    bench.show(2)
-    for _ in range(3):
-        assert "1000000 entries" in bench.set(attachment_offset=[0.0] * 1_000_000)[0]
-        bench.show(1)
-
-
-def test_bytes_that_are_no_message_are_refused_and_end_nothing(graph):
-    """As from a publisher whose definition of the type is another."""
-    bench = Bench(graph)
-    bench.show(2)
-    whole = serialize_message(MESSAGES.scene_message(graph.now(), scene_with(POST)))
-    for data in (b"", whole[:-3], whole[:16], b"\x00\x01\x00\x00" + b"\xff" * 40):
-        bench.node._scene.on_scene(data)
-        bench.node._changes.on_material(data[:20])
-    graph.wait(lambda: bench.refusals() >= 8, "the refusals")
-    bench.show(2)

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread.bags.message_types import MESSAGES, make, typestore
+from magnetosuture_thread.bags.message_types import MESSAGES as BUILDER
+from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
@@ -38,7 +39,9 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
+from magnetosuture_thread.messages.packing import packed_path, packed_pose, packed_wrench
 from magnetosuture_thread.messages.reading import read_path, stamp_of
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.offline.observations import ObservationReader
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
@@ -254,7 +257,7 @@ def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_pat
 @pytest.mark.parametrize("count", [0, 1, 2, 64])
 def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     points = np.random.default_rng(count).normal(size=(count, 2))
-    message = MESSAGES.path_message(5 * 10**9 + 7, points)
+    message: Any = typestore().deserialize_cdr(packed_path(5 * 10**9 + 7, points), MEASURED_THREAD.type_name)
     for pose in message.poses:
         pose.header = make("std_msgs/msg/Header", stamp=message.header.stamp, frame_id=frame)
     data = bytes(typestore().serialize_cdr(message, MEASURED_THREAD.type_name))
@@ -279,7 +282,7 @@ def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
         for render_bag in source.records(set(source.topics)):
             writer.write(render_bag.topic, render_bag.time, render_bag.data)
         stamp = round(1.39e9)
-        writer.write_message(SCENE.recorded, stamp, MESSAGES.scene_message(stamp, wider))
+        writer.write(SCENE.recorded, stamp, packed_scene(stamp, wider))
     for start, found in ((0.0, 12), (0.5, 0)):
         seen = read_observations(Recording(Bag(tmp_path / "wider")), SETUP, start=start)
         # In a dish of twice the diameter, what was the needle is twice as long.
@@ -301,12 +304,12 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
             writer.write(render_bag.topic, render_bag.time, render_bag.data)
         for time, told, version in ((1.39, scene, scene.version), (1.5, scene, "f" * 16), (1.61, too_fine, "")):
             stamp = round(time * 1e9)
-            message = MESSAGES.scene_message(stamp, told)
+            message: Any = typestore().deserialize_cdr(packed_scene(stamp, told), SCENE.type_name)
             message.version = version or message.version
             writer.write_message(SCENE.recorded, stamp, message)
         silk = make(
             MATERIAL.type_name,
-            header=MESSAGES.header(stamp),
+            header=BUILDER.header(stamp, "dish"),
             name="silk_6_0",
             diameter=0.0,
             elastic_modulus=0.0,
@@ -338,13 +341,13 @@ def test_the_true_pull_comes_with_the_pose_of_its_stamp(tmp_path: Path):
         for channel in (NEEDLE_POSE, GROUND_TRUTH_PULL):
             bag.add_topic(channel.recorded, channel.type_name)
         for k, stamp in enumerate(stamps):
-            pose = MESSAGES.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0]))
-            bag.write_message(NEEDLE_POSE.recorded, stamp, pose)
-            pull = MESSAGES.wrench_message(stamp, np.array([1e-6 * k, math.nan if k == 1 else -2e-6]), 3e-9)
+            pose = packed_pose(stamp, np.zeros(2), np.array([1.0, 0.0]))
+            bag.write(NEEDLE_POSE.recorded, stamp, pose)
+            pull = packed_wrench(stamp, np.array([1e-6 * k, math.nan if k == 1 else -2e-6]), 3e-9)
             if k == 2:
-                pull.header.frame_id = "elsewhere"
+                pull = pull.replace(b"dish", b"else")
             if k < 3:
-                bag.write_message(GROUND_TRUTH_PULL.recorded, stamp, pull)
+                bag.write(GROUND_TRUTH_PULL.recorded, stamp, pull)
     reader = ObservationReader(
         Recording(Bag(tmp_path / "bag")), read_setup("petri_35mm_polyamide"), "poses", 0.0, None, lambda share: None
     )

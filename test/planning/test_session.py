@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.planning.executor import ProcedureState
-from magnetosuture_thread.planning.loop_state import NO_MARGINS, NO_POSE, NO_THREAD, NOT_HELD, LoopState
-from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure_text
-from magnetosuture_thread.planning.session import ProcedureSession
+from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
+from magnetosuture_thread.planning.session import NOT_HELD, LoopState, ProcedureSession
 from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.scene import Dish, Scene
 
@@ -35,12 +34,6 @@ def known(now: float = 0.0, **changes: Any) -> LoopState:
     return state
 
 
-def test_a_state_in_which_all_is_known_has_no_problem():
-    condition = known().condition(0.1)
-    assert (condition.problem, condition.friction_nodes, condition.slowdown) == ("", 3, 0.7)
-    assert condition.vertices is not None
-
-
 def test_a_bridge_that_feeds_friction_back_to_the_operator_only_slows_no_procedure():
     condition = known(friction_feedback="operator").condition(0.1)
     assert (condition.friction_nodes, condition.slowdown) == (3, 1.0)
@@ -51,17 +44,6 @@ def test_an_estimate_that_was_not_measured_is_unsure(unmeasured: float):
     state = known()
     state.on_estimate(0.0, unmeasured, {}, thread)
     assert "not been measured" in state.condition(0.1).problem
-
-
-def test_the_first_of_what_is_missing_is_named():
-    state = LoopState(SETTINGS)
-    assert state.condition(0.0).problem == NO_POSE
-    state.on_pose(0.0, 0.0, 0.0175)
-    assert state.condition(0.0).problem == NO_THREAD
-    state.on_prediction(0.0, 1e-5, thread)
-    assert state.condition(0.0).problem == NO_MARGINS
-    state.on_margins(0.0, "", 0, 1.0, "another")
-    assert state.condition(0.0).problem == "thread_model goes by another scene"
 
 
 def test_what_is_known_is_not_known_for_long_and_a_time_without_hearing_does_not_count():
@@ -115,15 +97,6 @@ def test_a_force_that_is_new_is_a_problem_and_one_that_a_person_goes_on_with_is_
     assert not state.condition(0.1).problem
     state.on_estimate(0.0, 0.0, {3.5: "held at 10 mm"}, thread)  # it was gone
     assert "held at 10 mm" in state.condition(0.1).problem
-
-
-def test_a_page_has_to_be_held_within_the_timeout():
-    state = known(settle=0.0)
-    state.hold_to_run = True
-    assert state.condition(0.0).problem == NOT_HELD
-    state.on_hold(0.0)
-    assert not state.condition(0.3).problem
-    assert state.condition(0.31).problem == NOT_HELD
 
 
 def session(now: float = 0.0) -> ProcedureSession:
@@ -205,6 +178,15 @@ def test_only_one_procedure_at_a_time_and_none_of_an_unknown_needle():
         run.resume()
 
 
+def test_a_page_has_to_be_held_within_the_timeout():
+    state = known(settle=0.0)
+    state.hold_to_run = True
+    assert state.condition(0.0).problem == NOT_HELD
+    state.on_hold(0.0)
+    assert not state.condition(0.3).problem
+    assert state.condition(0.31).problem == NOT_HELD
+
+
 def test_another_scene_ends_what_was_only_planned():
     run = session()
     run.plan(far(), 0.0)
@@ -213,65 +195,3 @@ def test_another_scene_ends_what_was_only_planned():
         ProcedureState.FAILED,
         "the scene has changed since it was planned",
     )
-
-
-def test_a_setpoint_is_of_a_path_that_the_needle_is_on():
-    """Between two paths there is none: the start of the last one is where nobody wants the needle any more."""
-    run = session()
-    run.plan(far(), 0.0)
-    run.resume()
-    tail = TAIL.copy()
-    for k in range(400):
-        now = 0.1 + 0.05 * k
-        run.known.on_margins(now, "", 0, 1.0, SCENE.version)
-        velocity = run.on_pose(now, tail, EAST, now)
-        assert velocity is not None
-        if run.status.goal == 1:
-            break
-        assert run.setpoint is not None
-        tail = tail + 0.05 * float(velocity @ EAST) * EAST
-    assert run.status.goal == 1
-    assert run.setpoint is None
-
-
-def test_paths_that_were_planned_in_another_scene_are_not_shown_any_more():
-    run = session()
-    run.plan(far(), 0.0)
-    run.resume()
-    for k in range(4):
-        run.on_pose(0.1 + 0.05 * k, TAIL, EAST, 0.1 + 0.05 * k)
-    plan = run.new_plan()
-    assert plan is not None
-    run.set_scene(Scene(Dish(0.036)))
-    changed = run.new_plan()
-    assert changed is not None
-    assert len(changed) < len(plan)
-
-
-def test_a_scene_that_is_too_small_for_the_needle_is_refused():
-    run = ProcedureSession(NeedlePlannerSettings(needle_length=0.007, keep_out=5e-4), SCENE)
-    with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: .* more than 0\.008 m, room for the needle"):
-        run.set_scene(Scene(Dish(0.0079)))
-    assert run.known.scene_version == SCENE.version
-
-
-def test_a_thread_that_is_estimated_no_more_is_known_by_its_prediction():
-    state = known(settle=0.0)
-    state.on_estimate(0.0, 2.0, {3.5: "held at 10 mm"}, thread)
-    state.on_prediction(0.4, 1e-5, lambda: np.ones((2, 2)))  # the next estimate may be under way
-    assert "not been measured" in state.condition(0.4).problem
-    state.on_prediction(0.6, 1e-5, lambda: np.ones((2, 2)))
-    state.on_margins(0.6, "", 0, 1.0, "1")
-    state.on_pose(0.6, 0.006, 0.0175)
-    condition = state.condition(0.6)
-    assert condition.problem == ""
-    assert condition.vertices is not None
-    assert condition.vertices.tolist() == [[1.0, 1.0], [1.0, 1.0]]
-
-
-def test_a_text_is_a_procedure_or_the_name_of_one():
-    assert read_procedure_text("hernia").name == "hernia"
-    assert len(read_procedure_text("goals: [{withdraw: {}}]").goals) == 1
-    for text in ("goals: [&a {withdraw: {}}, *a]", "a: b: c", "goals: \0", "x" * 5000):
-        with pytest.raises(ConfigurationError):
-            read_procedure_text(text)

@@ -30,15 +30,6 @@ def test_what_is_no_fault_is_refused_in_words(text: str):
         Fault.parse(text)
 
 
-def test_only_its_own_effect_is_seen():
-    calm = schedule("coil_stuck 0 9")
-    assert calm.gain(1.0) == 1.0
-    assert not calm.drops(1.0, 0.0)
-    assert calm.lateness(1.0) == 0.0
-    assert calm.lifted(1.0).tolist() == [0.0, 0.0]
-    assert calm.covers(1.0, TAIL, TIP) == ()
-
-
 def test_exposure():
     assert schedule("dim 0 1").gain(0.5) < 0.5
     assert schedule("overexposed 0 1").gain(0.5) > 1.5
@@ -72,21 +63,3 @@ def inside(point: np.ndarray, outline: np.ndarray) -> bool:
     """Return whether a point is inside of a closed outline, by the winding of its corners around it."""
     angles = np.unwrap(np.arctan2(*(np.vstack([outline, outline[:1]]) - point).T[::-1]))
     return bool(abs(angles[-1] - angles[0]) > np.pi)
-
-
-def test_faults_that_are_over_are_forgotten():
-    faults = schedule("glare 0 1", "hand 0 100")
-    for second in range(2, 300):
-        faults.add(Fault("dim", float(second), 0.5))
-    assert [fault.kind for fault in faults.faults] == ["dim"]
-
-
-def test_a_fault_lies_where_it_does_whatever_others_there_are():
-    alone = schedule("hand 1 2").covers(1.3, TAIL, TIP)[0].outline
-    (other, _) = schedule("glare 0 1", "hand 1 2", "tool 1 2").covers(1.3, TAIL, TIP)
-    assert (alone == other.outline).all()
-
-
-def test_the_same_seed_lies_in_the_same_place():
-    first, second = (schedule("hand 0 2").covers(0.3, TAIL, TIP)[0].outline for _ in range(2))
-    assert (first == second).all()

@@ -25,7 +25,7 @@ def safety(scene: Scene, length: float, curvature: float = 0.0, keep: float = 5e
     )
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_what_is_certified_keeps_clear_and_little_more_would_not(seed: int):
     random = np.random.default_rng(seed)
     tight = 0
@@ -60,17 +60,6 @@ def test_the_kinematics_are_those_of_a_body(curvature: float):
     np.testing.assert_allclose(moved[1], expected[1], atol=1e-12)
 
 
-def test_a_point_goes_straight():
-    tail, heading = NeedleKinematics(0.0).moved(np.zeros(2), EAST, 0.003, 0.004, 2.0)
-    assert tail.tolist() == [0.006, 0.008]
-    assert heading.tolist() == EAST.tolist()
-
-
-def test_certificate_accepts_full_turns_in_free_space():
-    filtered = safety(Scene(Dish(0.05)), 0.001)
-    assert filtered.safe_share(np.array([0.0, 0.03]), np.array([-0.0005, 0.0]), EAST) == (1.0, "")
-
-
 def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
     """A quarter of a turn away from the tip, and beyond half a turn from the tail."""
     post = SceneShape("post", "instrument", Disc((0.0, 0.0051), 0.001))
@@ -86,13 +75,6 @@ def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
     c = (lever**2 + 0.0045**2 - (0.001 + keep) ** 2) / (2.0 * lever * 0.0045)
     assert name == "near"
     assert share * HOLD * 0.05 / lever == pytest.approx(math.asin(c), rel=1e-6)
-
-
-def test_a_straight_edge_stops_a_point_where_it_is_met():
-    wall = SceneShape("block", "wall", Polygon(((-0.01, 0.001), (0.01, 0.001), (0.01, 0.003), (-0.01, 0.003))))
-    share, name = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(np.array([0.001, 0.01]), np.zeros(2), EAST)
-    assert name == "block"
-    assert share * HOLD * 0.01 == pytest.approx(0.0005, rel=1e-6)
 
 
 def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
@@ -125,19 +107,7 @@ def test_a_point_that_comes_from_beyond_an_edges_end_meets_the_edge():
     assert share * HOLD == pytest.approx(0.1, rel=1e-6)
 
 
-@pytest.mark.parametrize("angle", [0.1, 1.7, -2.5])
-def test_far_edges_of_a_shape_of_many_are_met_too(angle: float):
-    turn = np.linspace(-2.9, 2.9, 48).tolist()  # open to the west
-    corners = [(0.004, at) for at in turn] + [(0.005, at) for at in turn[::-1]]
-    ring = Polygon(tuple((radius * math.cos(at), radius * math.sin(at)) for radius, at in corners))
-    scene = Scene(Dish(0.05), (SceneShape("ring", "tissue", ring),))
-    velocity = 0.03 * np.array([math.cos(angle), math.sin(angle)])
-    share, name = safety(scene, 0.0).safe_share(velocity, np.zeros(2), EAST)
-    assert name == "ring"
-    assert 0.004 * math.cos(2.9 / 47) - 5e-4 - 1e-9 <= share * HOLD * 0.03 <= 0.0035 + 1e-5
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_is_certified_for_a_needle_that_drifts_and_turns_fast_keeps_clear_and_little_more_would_not(seed: int):
     """By up to 7 rad in the hold, beside a post and a block."""
     random, tight = np.random.default_rng(seed), 0
@@ -164,26 +134,6 @@ def test_what_is_certified_for_a_needle_that_drifts_and_turns_fast_keeps_clear_a
         if share < 0.9:
             tight += clearance(share + 0.03) < 5.1e-4
     assert tight > 3
-
-
-@pytest.mark.parametrize("angle", [2.0, 3.7])
-def test_a_needle_that_goes_round_is_stopped_by_what_it_meets_within_a_turn(angle: float):
-    """Its middle goes round a circle to its left, and its tip meets a post; past half a turn too."""
-    lever, radius, rate = 0.0035, 0.0042, 14.0
-    ends = math.hypot(lever, radius)
-    at = math.atan2(-radius, lever) + angle
-    post = SceneShape(
-        "post", "instrument", Disc(((ends + 1e-3) * math.cos(at), radius + (ends + 1e-3) * math.sin(at)), 1e-3)
-    )
-    filtered, tail = safety(Scene(Dish(0.05), (post,)), 2.0 * lever), np.array([-lever, 0.0])
-    velocity = rate * np.array([radius, lever])
-    share, name = filtered.safe_share(velocity, tail, EAST)
-    assert name == "post"
-    times = np.linspace(0.0, HOLD, 1501).tolist()
-    gaps = [
-        filtered.clearance(*filtered.kinematics.moved(tail, EAST, rate * radius, rate * lever, time)) for time in times
-    ]
-    assert share * HOLD == pytest.approx(times[int(np.argmax(np.array(gaps) < 5e-4))], abs=1e-3)
 
 
 def test_around_a_dish_both_ends_slide_at_the_bound():
@@ -243,11 +193,6 @@ def test_a_needle_that_drifts_and_turns_goes_as_in_small_steps(curvature: float)
     np.testing.assert_allclose(moved[1], heading, atol=1e-9)
 
 
-def test_a_point_goes_by_its_heading():
-    tail, _ = NeedleKinematics(0.0).moved(np.zeros(2), np.array([0.6, 0.8]), 0.002, 0.001, 0.5)
-    np.testing.assert_allclose(tail, [0.5 * (0.6 * 0.002 - 0.8 * 0.001), 0.5 * (0.8 * 0.002 + 0.6 * 0.001)], rtol=1e-12)
-
-
 def test_inside_a_shape_no_point_of_a_needle_that_turns_gets_deeper():
     """It backs out of a block whose lower side is near, tail first, and turns by up to three rad/s."""
     block = SceneShape("block", "wall", Polygon(((-0.05, 0.0), (0.05, 0.0), (0.05, 0.05), (-0.05, 0.05))))
@@ -266,15 +211,3 @@ def test_inside_a_shape_no_point_of_a_needle_that_turns_gets_deeper():
         assert (np.array(heights) <= heights[0] + 1e-9).all()
         limited += 0.02 < share < 0.98
     assert limited > 3
-
-
-def test_what_ends_a_motion_is_named_whichever_of_many_shapes_it_is():
-    places = [(0.006, 0.0), (0.0, 0.006), (-0.006, 0.0), (0.0, -0.006)]
-    shapes = [SceneShape(f"post_{k}", "instrument", Disc(place, 0.001)) for k, place in enumerate(places)]
-    filtered = safety(Scene(Dish(0.05), tuple(shapes)), 0.0)
-    for k, (x, y) in enumerate(places):
-        share, name = filtered.safe_share(np.array([3.0 * x, 3.0 * y]), np.zeros(2), EAST)
-        assert name == f"post_{k}"
-        assert share * HOLD * 0.018 == pytest.approx(0.0045, rel=1e-5)
-        found = filtered.filter(np.array([3.0 * x, 3.0 * y]), 0.7 * np.array([x, y]), EAST)
-        assert found.active == (f"post_{k}",)

@@ -13,8 +13,8 @@ from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import BAND, MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
-from magnetosuture_thread.safety.motion import filter_velocity, moved_needle, needle_margin, pose_needle
+from magnetosuture_thread.safety.barriers import BAND
+from magnetosuture_thread.safety.filter import MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -68,12 +68,6 @@ def test_towards_the_wall_it_slows_down_and_says_by_what():
     assert (found.active, found.reason) == (("wall",), "")
 
 
-def test_approach_rate_limits_the_filtered_speed():
-    tail = np.array([0.0175 - 2.0 * KEEP - LENGTH, 0.0])
-    found = needle_filter(approach_rate=1.0).filter(np.array([0.02, 0.0]), tail, EAST)
-    assert found.filtered.tolist() == pytest.approx([1.0 * KEEP, 0.0], rel=0.01)
-
-
 @pytest.mark.parametrize("shape", [POST, BLOCK])
 def test_a_shape_limits_the_speed_before_the_hold_would(shape: SceneShape):
     """Of a point 9.7 mm before its bound, at a rate of 1 /s: all of the hold would allow 48 mm/s."""
@@ -86,25 +80,10 @@ def test_a_shape_limits_the_speed_before_the_hold_would(shape: SceneShape):
 
 def test_what_is_left_of_a_command_that_is_next_to_nothing_is_rest():
     safety = needle_filter(max_speed=0.02)
-    tail, data = np.array([0.0175 - KEEP - LENGTH - BAND - 1e-6, 0.0]), safety.compiled_data()
+    tail = np.array([0.0175 - KEEP - LENGTH - BAND - 1e-6, 0.0])
     found = safety.filter(0.03 * EAST, tail, EAST)
     assert found.filtered.tolist() == [0.0, 0.0]
     assert (found.active, found.reason) == (("speed", "wall"), "stopped by wall")
-    needle = pose_needle(data, float(tail[0]), float(tail[1]), 1.0, 0.0)
-    touched = np.zeros(1, np.bool_)
-    assert filter_velocity(data, needle, (0.03, 0.0), 1.0, (0.0, 0.0), math.inf, touched) == (0.0, 0.0)
-
-
-def test_head_on_it_rests_and_says_why():
-    found = needle_filter().filter(0.01 * EAST, np.array([0.0175 - KEEP - LENGTH, 0.0]), EAST)
-    assert found.filtered.tolist() == [0.0, 0.0]
-    assert (found.active, found.reason) == (("wall",), "stopped by wall")
-
-
-def test_rest_is_left_alone_wherever_the_needle_is():
-    for x in (0.0, 0.012, 0.05):
-        found = needle_filter(POST).filter(np.zeros(2), np.array([x, 0.0]), EAST)
-        assert (found.filtered.tolist(), found.active, found.reason) == ([0.0, 0.0], (), "")
 
 
 def test_a_point_slides_along_a_block_and_leaves_it():
@@ -126,17 +105,6 @@ def test_beyond_its_bound_a_needle_that_slides_leaves_a_little(
     assert y / x == pytest.approx(-math.tan(angle), rel=1e-6)
 
 
-def test_between_two_walls_too_near_a_needle_can_still_leave_along_them():
-    walls = [
-        SceneShape(
-            f"wall_{k}", "wall", Polygon(((-0.01, s * 4e-4), (0.01, s * 4e-4), (0.01, s * 2e-3), (-0.01, s * 2e-3)))
-        )
-        for k, s in enumerate((1.0, -1.0))
-    ]
-    found = needle_filter(*walls).filter(np.array([0.004, 0.003]), np.array([-0.0035, 0.0]), EAST)
-    np.testing.assert_allclose(found.filtered, [0.004, 0.0], atol=1e-9)
-
-
 @pytest.mark.parametrize("depth", [1e-5, 8e-5, 1.8e-4])
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_needle_along_a_block_is_taken_off_sideways(depth: float, turned: bool):
@@ -145,17 +113,6 @@ def test_a_needle_along_a_block_is_taken_off_sideways(depth: float, turned: bool
     tail, heading = (np.array([0.5 * LENGTH, y]), -EAST) if turned else (np.array([-0.5 * LENGTH, y]), EAST)
     step = needle_filter(BLOCK).sidestep(tail, heading)
     assert step == pytest.approx((1.0 if turned else -1.0) * min(MAX_SIDESTEP, SIDESTEP_RATE * depth), rel=1e-6)
-
-
-def test_a_needle_that_points_to_a_block_is_not_taken_off_sideways_by_it():
-    step = needle_filter(BLOCK).sidestep(np.array([0.0, -LENGTH - KEEP]), NORTH)
-    assert abs(step) < 1e-12
-
-
-def test_a_needle_along_the_wall_is_taken_off_towards_the_middle():
-    tail = np.array([-0.5 * LENGTH, -0.0175 + KEEP + 1e-4])
-    assert needle_filter().sidestep(tail, EAST) > 1e-4
-    assert needle_filter().sidestep(tail + LENGTH * EAST, -EAST) < -1e-4
 
 
 def test_far_from_everything_and_in_a_gap_there_is_no_step_sideways():
@@ -168,18 +125,6 @@ def test_far_from_everything_and_in_a_gap_there_is_no_step_sideways():
     ]
     gap = needle_filter(*walls)
     assert [gap.sidestep(np.array([-0.5 * LENGTH, y]), EAST) for y in (0.0, 1e-4)] == [0.0, 0.0]
-
-
-def test_a_curved_needle_is_kept_clear_with_its_belly():
-    """Its chord passes the post by more than the distance, its body does not."""
-    chord = 2.0 / 250.0 * math.sin(0.5 * 250.0 * LENGTH)
-    belly = (1.0 - math.cos(0.5 * 250.0 * LENGTH)) / 250.0
-    post = SceneShape("post", "instrument", Disc((0.0, -belly - KEEP - 0.00115), 0.001))
-    heading = np.array([math.cos(-0.5 * 250.0 * LENGTH), math.sin(-0.5 * 250.0 * LENGTH)])
-    # Forwards and down at once, as no needle moves sidewards.
-    velocity, tail = np.array([0.006, -0.01]), np.array([-0.5 * chord, 0.0])
-    assert "post" in needle_filter(post, needle_curvature=250.0).filter(velocity, tail, heading).active
-    assert "post" not in needle_filter(post).filter(velocity, tail, EAST).active
 
 
 def test_a_curved_needle_is_kept_clear_of_the_wall_with_its_belly():
@@ -204,7 +149,7 @@ def test_a_curved_needle_is_kept_clear_of_the_wall_with_its_belly():
         assert name == "wall"
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_it_is_never_faster_than_commanded_and_near_nothing_the_best_there_is(seed: int):
     random = np.random.default_rng(seed)
     rested = 0
@@ -226,11 +171,6 @@ def test_it_is_never_faster_than_commanded_and_near_nothing_the_best_there_is(se
     assert rested < 200
 
 
-def test_a_dish_without_room_is_refused():
-    with pytest.raises(ConfigurationError, match=r"scene\.dish\.diameter: got 0\.007, .* room for the needle"):
-        NeedleSafetyFilter(Scene(Dish(0.007)), keep_out=KEEP, approach_rate=10.0, hold_time=HOLD, needle_length=LENGTH)
-
-
 def test_through_the_channel_of_the_hernia_nothing_is_taken_off():
     safety = NeedleSafetyFilter(
         read_scene("hernia_ring"), keep_out=2.5e-4, approach_rate=10.0, hold_time=0.205, needle_length=0.0025
@@ -239,17 +179,6 @@ def test_through_the_channel_of_the_hernia_nothing_is_taken_off():
         for speed in (0.002, 0.003):
             found = safety.filter(speed * NORTH, np.array([0.0, y]), NORTH)
             assert found.filtered.tolist() == (speed * NORTH).tolist()
-
-
-@pytest.mark.parametrize("place", [0.6, 2.0, -1.1])
-def test_along_the_wall_the_step_sideways_is_that_of_its_ends(place: float):
-    """The ends are closest; away from the wall they get by the cosine of the angle at which they see the middle."""
-    out, along = np.array([math.cos(place), math.sin(place)]), np.array([-math.sin(place), math.cos(place)])
-    middle = 0.0175 - KEEP - 4.5e-4
-    reach = math.hypot(middle, 0.5 * LENGTH)
-    step = SIDESTEP_RATE * (KEEP + SIDESTEP_MARGIN - (0.0175 - reach)) * middle / reach
-    assert 0.0 < step < MAX_SIDESTEP
-    assert needle_filter().sidestep(middle * out - 0.5 * LENGTH * along, along) == pytest.approx(step, rel=1e-6)
 
 
 def test_clearance_is_that_of_the_closest_point_from_wall_and_shapes():
@@ -292,90 +221,12 @@ def test_between_two_points_of_a_curved_needle_nothing_gets_closer_than_keep_out
     assert 1e-3 <= data.keep_wall - bulge < 1.001e-3
 
 
-def test_a_long_needle_has_129_points_and_compiled_loops_get_them():
-    data = NeedleSafetyFilter(Scene(Dish(0.3)), keep_out=1e-4, needle_length=0.08, needle_curvature=5.0).compiled_data()
-    assert len(data.body.points) == 129
-    chord = data.body.points[-1] - data.body.points[0]
-    assert chord / np.linalg.norm(chord) == pytest.approx([data.body.chord_x, data.body.chord_y])
-
-
-def test_approach_rate_limits_a_needle_that_goes_back_to_the_wall_too():
-    tail = np.array([-0.0175 + 2.0 * KEEP, 0.0])
-    found = needle_filter(approach_rate=1.0).filter(np.array([-0.02, 0.0]), tail, EAST)
-    assert found.filtered.tolist() == pytest.approx([-1.0 * KEEP, 0.0], rel=0.01)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_needle_beside_a_post_is_taken_off_away_from_it(side: float):
-    heading = np.array([0.6, 0.8])
-    beside = side * np.array([-0.8, 0.6])
-    depth, radius = 1e-4, 0.001
-    middle = radius + KEEP + SIDESTEP_MARGIN - depth
-    post = SceneShape("post", "instrument", Disc((float(middle * beside[0]), float(middle * beside[1])), radius))
-    step = needle_filter(post).sidestep(-0.5 * LENGTH * heading, heading)
-    assert step == pytest.approx(-side * SIDESTEP_RATE * depth, rel=0.01)
-
-
 def test_shapes_are_named_right_whatever_kinds_come_before_them():
     """Discs come before polygons in compiled code."""
     safety = needle_filter(BLOCK, POST, length=0.0)
-    data = safety.compiled_data()
     for name, at, velocity in (
         ("block", np.array([0.0, -0.001]), 0.02 * NORTH),
         ("post", np.array([0.006, 0.0071]), -0.02 * NORTH),
     ):
         assert safety.safe_share(velocity, at, EAST)[1] == name
         assert safety.filter(velocity, at, EAST).active == (name,)
-        assert (
-            safety.scene.names[needle_margin(data, pose_needle(data, float(at[0]), float(at[1]), 1.0, 0.0))[1]] == name
-        )
-
-
-@pytest.mark.parametrize("length", [LENGTH, 0.0])
-def test_compiled_loops_get_the_velocities_of_the_filter(length: float):
-    safety = needle_filter(POST, length=length, max_speed=0.02, max_acceleration=0.5)
-    data, touched = safety.compiled_data(), np.zeros(2, np.bool_)
-    random, changed = np.random.default_rng(6), 0
-    for k in range(60):
-        angle, tail = float(random.uniform(-3.0, 3.0)), random.uniform(-0.008, 0.008, 2)
-        heading = np.array([math.cos(angle), math.sin(angle)])
-        commanded, previous = random.uniform(-0.03, 0.03, 2), random.uniform(-0.01, 0.01, 2)
-        if k % 4 == 0:
-            commanded[0] = 0.0
-        slowdown, elapsed = float(random.uniform(0.3, 1.0)), float(random.choice([0.01, math.inf]))
-        needle = pose_needle(data, *tail.tolist(), *heading.tolist())
-        found = filter_velocity(
-            data,
-            needle,
-            (float(commanded[0]), float(commanded[1])),
-            slowdown,
-            (float(previous[0]), float(previous[1])),
-            elapsed,
-            touched,
-        )
-        expected = safety.filter(commanded, tail, heading, slowdown=slowdown, previous=previous, elapsed=elapsed)
-        assert found == pytest.approx(expected.filtered.tolist(), rel=1e-9, abs=1e-12)
-        assert needle_margin(data, needle)[0] == pytest.approx(safety.clearance(tail, heading) - KEEP, abs=1e-12)
-        changed += "post" in expected.active or "wall" in expected.active
-    assert changed > 5
-
-
-@pytest.mark.parametrize("curvature", [0.0, 250.0])
-def test_compiled_loops_move_the_needle_as_the_kinematics_do(curvature: float):
-    safety = needle_filter(needle_curvature=curvature)
-    angle, along, across, drift, duration = 0.9, 0.004, 0.011, -0.006, 0.5
-    tail, heading = np.array([0.001, 0.002]), np.array([math.cos(angle), math.sin(angle)])
-    e = safety.kinematics.chord_direction(heading)
-    pose = np.array([*tail, *heading])
-    velocity, added = along * e + across * np.array([-e[1], e[0]]), np.array([0.003, drift, 0.7])
-    moved_needle(safety.compiled_data(), pose, (float(velocity[0]), float(velocity[1])), added, duration)
-    turn = 0.7 * 0.5 * safety.kinematics.chord  # velocity of the tip by that rate of turning
-    expected = safety.kinematics.moved(tail, heading, along + 0.003, across + drift + turn, duration, drift)
-    np.testing.assert_allclose(pose, np.concatenate(expected), atol=1e-12)
-
-
-def test_compiled_loops_move_a_point_straight():
-    pose = np.array([0.001, 0.002, 0.6, 0.8])
-    moved_needle(needle_filter(length=0.0).compiled_data(), pose, (0.004, 0.003), np.array([0.001, 0.002, 5.0]), 0.5)
-    expected = [0.001 + 0.5 * (0.004 + 0.6e-3 - 1.6e-3), 0.002 + 0.5 * (0.003 + 0.8e-3 + 1.2e-3), 0.6, 0.8]
-    assert pose.tolist() == pytest.approx(expected, abs=1e-15)

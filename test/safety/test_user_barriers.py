@@ -53,20 +53,6 @@ class MovingHalfPlane(HalfPlane):
         self.time, self.bound = time, self.start + time * self.rate
 
 
-class Appearing(MovingHalfPlane):
-    """The same bound, which there is only from a time on."""
-
-    def value(self, positions: np.ndarray) -> np.ndarray:
-        """Return a row for each point, or none."""
-        return super().value(positions)[: len(positions) if self.time > 0.1 else 0]
-
-    def gradient(self, positions: np.ndarray) -> Gradient:
-        """Return its gradient."""
-        found = super().gradient(positions)
-        count = len(self.value(positions))
-        return Gradient(found.nodes[:count], found.values[:count])
-
-
 class TurnedAway(Barrier):
     """The needle's tip stays right of its tail: one row over two points, so that only turning can break it."""
 
@@ -110,38 +96,13 @@ def driven(safety: NeedleSafetyFilter, seed: int, periods: int = 300) -> tuple[f
     return least, active
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("barrier", "length"), [(HalfPlane(), LENGTH), (HalfPlane(), 0.0), (TurnedAway(), LENGTH)])
 def test_an_added_barrier_holds_whatever_is_commanded(barrier: Barrier, length: float, seed: int):
     least, active = driven(needle(barrier, length=length), seed)
     # It is checked at 8 instants of a hold, and between two of them the arc of a needle bends by no more than this.
     assert least > -1e-6
     assert barrier.name in active
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_two_added_barriers_hold_together(seed: int):
-    least, active = driven(needle(HalfPlane(), TurnedAway()), seed)
-    assert least > -1e-6
-    assert active >= {"half_plane", "turned_away"}
-
-
-def test_a_needle_slides_along_an_added_barrier():
-    safety = needle(HalfPlane(0.0))
-    found = safety.filter(np.array([0.01, 0.01]), np.array([0.0, -1e-7]), np.array([1.0, 0.0]))
-    assert found.active == ("half_plane",)
-    assert found.filtered[0] > 0.005  # slower, as the needle turns a little towards the bound while it goes
-    assert 0.0 < found.filtered[1] < 1e-5
-    assert found.reason == ""
-    into = safety.filter(np.array([0.0, 0.01]), np.array([0.0, -1e-7]), np.array([1.0, 0.0]))
-    assert into.reason == "stopped by half_plane"
-
-
-def test_where_it_does_not_matter_a_velocity_is_left_bit_for_bit():
-    velocity = np.array([0.005, 0.001])
-    found = needle(HalfPlane(0.01)).filter(velocity, np.array([-0.002, 0.0]), np.array([1.0, 0.0]))
-    assert found.filtered.tolist() == velocity.tolist()
-    assert found.active == ()
 
 
 def test_a_bound_that_comes_nearer_lets_a_needle_flee_and_not_wait_for_it():
@@ -208,31 +169,6 @@ def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit:
     assert found.active == ("half_plane",)
 
 
-def test_beyond_an_added_barrier_a_point_leaves_a_little_as_it_slides():
-    x, y = needle(HalfPlane(0.0), length=0.0).filter(np.array([0.003, 0.004]), np.array([0.0, 1e-3]), EAST).filtered
-    assert x > 0.002
-    assert y / x == pytest.approx(-math.tan(0.1), rel=1e-6)
-
-
-def test_a_barrier_that_appears_within_the_hold_is_kept_too():
-    safety, tail = needle(Appearing(0.0), length=0.0), np.array([0.0, -0.001])
-    assert safety.filter(np.array([0.01, 0.0]), tail, EAST, time=0.0).active == ()
-    found = safety.filter(np.array([0.0, 0.01]), tail, EAST, time=0.0)  # 2 mm in the hold
-    assert found.active == ("half_plane",)
-    assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
-
-
-def test_with_added_barriers_the_share_is_still_that_of_the_wall_and_no_older_reason_is_named():
-    safety, east = needle(MovingHalfPlane(0.002, rate=-0.01)), np.array([0.01, 0.0])
-    at_wall = np.array([0.0175 - LENGTH - 0.0015, -0.002])
-    safety.filter(east, np.zeros(2), EAST, time=0.0)
-    share, name = safety.safe_share(east, at_wall, EAST)
-    assert name == "wall"
-    assert 0.3 < share < 0.6
-    assert safety.filter(east, at_wall, EAST, time=0.0).active == ("wall",)
-    assert safety.filter(np.array([0.0, 0.01]), np.zeros(2), EAST, time=0.15).active == ("half_plane",)
-
-
 PERIOD, CLEARANCE = 0.05, 1e-4  # s and m
 
 
@@ -262,14 +198,6 @@ def test_a_needle_that_is_slower_than_the_disc_behind_it_flees_as_fast_as_it_is_
     filtered, least = chased(command, disc_from(-1.0), steps=20)
     assert all(np.allclose(velocity, command, rtol=1e-9) for velocity in filtered)
     assert least[-1] == pytest.approx(CLEARANCE - (0.002 - 0.001) * 20 * PERIOD)  # it is run over, and does not wait
-
-
-def test_a_needle_that_is_faster_than_the_disc_behind_it_is_never_touched():
-    command = np.array([0.0005, 0.003])  # off its way, too slowly by itself
-    filtered, least = chased(command, disc_from(-1.0))
-    assert min(least) > -1e-6
-    assert filtered[0][0] > 0.001
-    assert max(math.hypot(*velocity) for velocity in filtered) <= math.hypot(*command) * (1.0 + 1e-9)
 
 
 def test_between_two_discs_that_close_in_a_needle_leaves_sideways_and_does_not_run_into_one():

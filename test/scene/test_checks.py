@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pytest
-import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, shape_from_mapping
-from magnetosuture_thread.scene.checks import farthest_point, scene_warnings
-from magnetosuture_thread.scene.labels import LabelPosition, label_positions
+from magnetosuture_thread.scene.checks import scene_warnings
 
 WIDTH = 0.0004
 SQUARE = ((0.0, 0.0), (0.004, 0.0), (0.004, 0.004), (0.0, 0.004))
@@ -58,11 +56,6 @@ def test_a_gap_is_told_while_it_is_narrower_than_the_needle(gap: float, warned: 
         assert "narrower than the needle" in found[0].text
 
 
-def test_gaps_of_discs_count_their_rims():
-    (warning,) = scene_warnings(scene(Disc((0.0, 0.0), 0.002), Disc((0.0043, 0.0), 0.002)), WIDTH)
-    assert warning.value == pytest.approx(0.0003, abs=1e-6)
-
-
 def test_check_reports_a_shape_near_or_across_the_wall():
     (near,) = scene_warnings(scene(Disc((0.0, 0.0152), 0.002)), WIDTH)
     assert near.what == "gap"
@@ -83,48 +76,3 @@ def test_check_reports_a_hole_too_narrow_for_the_needle():
     (warning,) = scene_warnings(Scene(Dish(), (ring,)), WIDTH)
     assert (warning.what, warning.shapes) == ("hole", ("ring",))
     assert warning.value == pytest.approx(0.00038, rel=0.02)
-
-
-def test_the_width_of_a_hole_with_a_corner_is_that_of_its_largest_circle():
-    """Two channels of 0.3 mm meet at a corner, where a circle touches both outer sides and the inner corner."""
-    corner = ((0.0, 0.0), (4.0, 0.0), (4.0, 0.3), (0.3, 0.3), (0.3, 4.0), (0.0, 4.0))
-    hole = tuple((1e-3 * x, 1e-3 * y) for x, y in corner)
-    around = ((-0.001, -0.001), (0.005, -0.001), (0.005, 0.005), (-0.001, 0.005))
-    (warning,) = scene_warnings(scene(Polygon(around, (hole,))), WIDTH)
-    assert warning.what == "hole"
-    assert warning.value == pytest.approx(0.0006 / (1.0 + 0.5**0.5), abs=0.02 * WIDTH)
-
-
-def test_the_farthest_point_of_a_disc_in_the_middle_is_on_its_rim():
-    assert farthest_point(SceneShape("a", "wall", Disc((0.0, 0.0), 0.002))) == (0.002, 0.0)
-
-
-def test_names_stand_clear_of_other_shapes_and_of_each_other():
-    known = read_scene("hernia_ring")
-    sizes = [(0.003, 0.001), (0.006, 0.001), (0.006, 0.001)]
-    boxes = [
-        shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2)
-        for (x, y), (w, h) in zip((place.middle for place in label_positions(known, sizes)), sizes, strict=True)
-    ]
-    for place, shape, box in zip(label_positions(known, sizes), known.shapes, boxes, strict=True):
-        start, end = map(shapely.Point, place.line)
-        assert box.distance(start) < 1e-12
-        assert shape.solid.distance(end) < 1e-12
-    for index, box in enumerate(boxes):
-        assert shapely.Point(0.0, 0.0).buffer(0.025).contains(box)
-        assert not any(box.intersects(shape.solid) for shape in known.shapes)
-        assert not any(box.intersects(other) for other in boxes[:index])
-
-
-def test_a_name_beside_a_flat_shape_keeps_its_own_height_from_it():
-    flat = Polygon(((-0.015, -0.0004), (0.015, -0.0004), (0.015, 0.0004), (-0.015, 0.0004)))
-    (place,) = label_positions(scene(flat), [(0.006, 0.001)])
-    # Beside it there is no dish; above its right half is the next direction, at 45 degrees.
-    across, upward = 0.015 + 0.003 + 0.001, 0.0004 + 0.0005 + 0.001
-    assert place.middle == pytest.approx((across * 0.5**0.5, upward * 0.5**0.5))
-
-
-def test_a_name_that_fits_stands_in_its_shape_and_one_that_fits_nowhere_too():
-    known = scene(moved(0.0, 0.0), Disc((-0.01, 0.0), 0.0005))
-    places = label_positions(known, [(0.002, 0.0005), (0.05, 0.01)])
-    assert places == [LabelPosition(known.shapes[0].label_point), LabelPosition((-0.01, 0.0))]

@@ -9,8 +9,7 @@ import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, scene_to_mapping, write_scene
-from magnetosuture_thread.scene.files import parse_yaml
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene, write_scene
 from magnetosuture_thread.untrusted import MAX_TEXT_BYTES
 from test.scene.scenes import SHAPES, every_shape
 
@@ -44,31 +43,6 @@ def test_geometry_without_a_definition_is_written_bit_for_bit(tmp_path: Path, en
     assert read_scene(str(tmp_path / f"bare{ending}")).version == bare.version
 
 
-def test_a_shape_whose_points_are_one_list_is_written_without_aliases(tmp_path: Path):
-    point = [0.001, 0.0]
-    shape = SceneShape(
-        "a", "wall", Disc((0.0, 0.0), 0.001), {"capsule": {"start": point, "end": point, "radius": 0.001}}
-    )
-    write_scene(Scene(Dish(), (shape,)), tmp_path / "a.yaml")
-    assert "&" not in (tmp_path / "a.yaml").read_text()
-
-
-def test_a_scene_that_cannot_be_written_leaves_nothing(tmp_path: Path):
-    (tmp_path / "there.yaml").mkdir()
-    for path in (tmp_path / "there.yaml", tmp_path / "nowhere" / "a.yaml"):
-        with pytest.raises(ConfigurationError, match=r"scene file: got '.*', expected a file that can be written"):
-            write_scene(Scene(), path)
-    assert list(tmp_path.rglob("*")) == [tmp_path / "there.yaml"]
-
-
-def test_a_dish_alone_is_a_scene(tmp_path: Path):
-    for text in ("dish: {diameter: 0.035}\n", f"{DISH}shapes:\n", f"{DISH}shapes: {{}}\n"):
-        (tmp_path / "dish.yaml").write_text(text)
-        scene = read_scene(str(tmp_path / "dish.yaml"))
-        assert scene == Scene(Dish(0.035, 0.003))
-        assert scene_to_mapping(scene) == {"dish": {"diameter": 0.035, "depth": 0.003}, "shapes": {}}
-
-
 @pytest.mark.parametrize("ending", [".yaml", ".geojson"])
 @pytest.mark.parametrize("self_contact", [True, False])
 def test_self_contact_is_written_where_the_depth_does_not_decide(tmp_path: Path, ending: str, self_contact: bool):
@@ -87,41 +61,29 @@ def test_numbers_are_read_as_ros_reads_them(tmp_path: Path):
 
 BAD = [
     ("", "scene: got None, expected dish, and shapes by name"),
-    ("[]", "scene: got [], expected dish, and shapes by name"),
-    ("shapes: {}", "scene: got {'shapes': {}}, expected dish, and shapes by name"),
     (f"{DISH}obstacles: []", "obstacles: got [], expected dish and shapes, nothing else"),
     ("dish: 0.035", "dish: got 0.035, expected diameter and depth [m]"),
     ("dish: {depth: 0.003}", "dish: got {'depth': 0.003}, expected diameter and depth [m]"),
     ("dish: {diameter: 35}", "dish.diameter: got 35.0, expected a number from 0.005 to 0.5 m"),
     ("dish: {diameter: 35 mm}", "dish.diameter: got '35 mm', expected a number [m]"),
     ("dish: {diameter: .nan}", "dish.diameter: got nan, expected a number"),
-    ("dish: {diameter: .inf}", "dish.diameter: got inf, expected a number"),
-    ("dish: {diameter: true}", "dish.diameter: got True, expected a number [m]"),
     ("dish: {diameter: 0.035, self_contact: 1}", "dish.self_contact: got 1, expected true or false or nothing"),
-    ("dish: {diameter: 0.035, self_contact: 'yes'}", "dish.self_contact: got 'yes', expected true or false or nothing"),
     ("dish: {diameter: 0.035, radius: 0.01}", "dish.radius: got 0.01, expected one of diameter, depth"),
     ("dish: {diameter: 1" + 400 * "0" + "}", "dish.diameter: got 1000000"),
     (f"{DISH}shapes: [post]", "shapes: got ['post'], expected shapes by name"),
-    (f"{DISH}shapes: false", "shapes: got False, expected shapes by name"),
     (f"{DISH}shapes: {{post: 3}}", "post: got 3, expected a shape, one of disc"),
     (
         f"{DISH}shapes: {{post: {{disc: {{center: [0, 0], raduis: 0.1}}}}}}",
         "post.disc.radius: got None, expected a value",
     ),
     (f"{DISH}shapes: {{1: {{}}}}", "scene file: got 'the name 1 that is no text in line 2', expected valid YAML"),
-    (f"{DISH}shapes: {{on: {{}}}}", "scene file: got 'the name on that is no text in line 2', expected valid YAML"),
-    (f"{DISH}shapes: {{[a]: {{}}}}", "scene file: got 'a name that is no text in line 2', expected valid YAML"),
     (f"{DISH}shapes: {{a: 1, a: 2}}", "scene file: got 'a is given twice in line 2', expected valid YAML"),
     (f"{DISH}{DISH}", "scene file: got 'dish is given twice in line 2', expected valid YAML"),
     (f"{DISH}shapes: {{a", "scene file: got \"did not find expected ',' or '}' in line"),
     ("dish: \x07", "scene file: got '"),
     ("a: &a [*a]", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
-    ("dish: &d {diameter: 0.035}", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
-    ("<<: {dish: 1}", "scene file: got 'the name << that is no text in line 1'"),
     ("dish: !!python/object/apply:os.system [ls]", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
-    ("dish: !!int '35'", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
     ("[" * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
-    ("- " * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
     ("dish: " + "9" * 2000, "scene file: got 'a word of 2000 characters in line 1'"),
     (f"{DISH}---\n{DISH}", "scene file: got 'but found another document in line 2', expected valid YAML"),
 ]
@@ -136,11 +98,6 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: s
     assert str(caught.value).startswith(f"{path}: {words}")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500 + len(str(path))
-
-
-def test_many_names_take_no_time_to_compare():
-    text = "\n".join(f"name{index}: 1" for index in range(20_000))
-    assert len(parse_yaml(text)) == 20_000
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path: Path):

@@ -11,7 +11,7 @@ import shapely
 from scipy.integrate import quad
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.scene import shape_from_mapping
 from magnetosuture_thread.scene.shapes import ARC_TOLERANCE
 
@@ -33,13 +33,6 @@ def solid(shape: Polygon) -> shapely.Polygon:
 def bounds(shape: Polygon) -> list[float]:
     """Return least x and y, greatest x and y [m]."""
     return list(solid(shape).bounds)
-
-
-def test_a_disc_is_a_disc():
-    shape = shape_from_mapping("post", {"disc": {"center": [0.0077, 0.0039], "radius": 0.0015}, "kind": "instrument"})
-    assert shape.geometry == Disc((0.0077, 0.0039), 0.0015)
-    assert (shape.name, shape.kind) == ("post", "instrument")
-    assert shape.solid.area == pytest.approx(math.pi * 0.0015**2, rel=2e-4)
 
 
 @pytest.mark.parametrize(("inner", "outer"), [(0.0045, 0.006), (0.0001, 0.0002), (0.02, 0.05)])
@@ -82,15 +75,6 @@ def test_a_corner_radius_takes_the_four_corners_off_a_sector():
     assert soft.can_contain(0.001)
 
 
-def test_the_sides_of_the_hernia_are_mirrored():
-    fields = {"center": [0.0, 0.005], "inner_radius": 0.0077, "outer_radius": 0.0111, "inset": 0.00085}
-    right = polygon(annular_sector={**fields, "start_angle": -HALF_PI, "end_angle": HALF_PI}, corner_radius=0.0012)
-    left = polygon(annular_sector={**fields, "start_angle": HALF_PI, "end_angle": 3 * HALF_PI}, corner_radius=0.0012)
-    mirrored = shapely.Polygon([(-x, y) for x, y in right.outline])
-    assert solid(left).symmetric_difference(mirrored).area < 1e-10  # 0.1 mm^2 would be a strip of 2 um all around
-    assert bounds(right)[0] == pytest.approx(0.00085, abs=ARC_TOLERANCE)
-
-
 @pytest.mark.parametrize("angle", [0.0, 0.6, HALF_PI, -2.0])
 def test_a_capsule_reaches_a_radius_around_its_segment(angle: float):
     length, radius = 0.006, 0.001
@@ -130,13 +114,6 @@ def test_a_polygon_keeps_its_points_bit_for_bit_and_its_holes():
     assert len(soft.outline) > 20
 
 
-def test_rounded_corners_are_as_close_to_circles_as_other_arcs():
-    """The chords of a fourth of a circle of 4 mm lie 15 um off it at 10 degrees each."""
-    shape = polygon(rectangle={"center": [0.0, 0.0], "width": 0.01, "height": 0.01}, corner_radius=0.004)
-    exact = 1e-4 - (4.0 - math.pi) * 0.004**2
-    assert shape.area == pytest.approx(exact, abs=ARC_TOLERANCE * 2.0 * math.pi * 0.004)
-
-
 def test_a_corner_radius_has_to_fit_into_the_outline_and_not_beside_its_holes():
     hole = [[0.001, 0.001], [0.009, 0.001], [0.009, 0.009], [0.001, 0.009]]
     frame = polygon(polygon={"outline": SQUARE, "holes": [hole]}, corner_radius=0.002)
@@ -151,44 +128,30 @@ DISC = {"center": [0.0, 0.0], "radius": 0.001}
 
 BAD: list[tuple[Any, str]] = [
     (None, "post: got None, expected a shape, one of disc, annulus"),
-    ([], "post: got [], expected a shape"),
     ({}, "post: got 'no shape', expected kind, corner_radius, friction and one of disc"),
-    ({"disk": DISC}, "post: got 'disk', expected kind, corner_radius, friction and one of disc"),
     ({"disc": DISC, "annulus": RING}, "post: got ['disc', 'annulus'], expected"),
-    ({"disc": DISC, "color": "red"}, "post: got 'color', expected"),
     ({"disc": DISC, "kind": "bone"}, "post.kind: got 'bone', expected one of tissue, instrument, wall"),
-    ({"disc": DISC, "kind": ["wall"]}, "post.kind: got ['wall'], expected one of"),
     ({"disc": 0.001}, "post.disc: got 0.001, expected fields by name"),
     ({"disc": {"center": [0.0, 0.0]}}, "post.disc.radius: got None, expected a value"),
     ({"disc": {**DISC, "angle": 1.0}}, "post.disc.angle: got 1.0, expected one of center, radius"),
     ({"disc": {"center": [0.0, 0.0], "raduis": 0.1}}, "post.disc.radius: got None, expected a value; what is left"),
     ({"disc": {**DISC, "radius": 1.5}}, "post.disc.radius: got 1.5, expected a number from 1e-06 to 1 m"),
-    ({"disc": {**DISC, "radius": "1.5 mm"}}, "post.disc.radius: got '1.5 mm', expected a number from 1e-06 to 1 m"),
     ({"disc": {**DISC, "radius": math.nan}}, "post.disc.radius: got nan"),
-    ({"disc": {**DISC, "radius": math.inf}}, "post.disc.radius: got inf"),
     ({"disc": {**DISC, "radius": True}}, "post.disc.radius: got True"),
     ({"disc": {**DISC, "radius": 0.0}}, "post.disc.radius: got 0.0"),
     ({"disc": {**DISC, "radius": 10**400}}, "post.disc.radius: got 1000000000"),
     ({"disc": {**DISC, "radius": {}}}, "post.disc.radius: got {}"),
     ({"disc": {**DISC, "center": [7.7, 3.9]}}, "post.disc.center: got [7.7, 3.9], expected two coordinates x, y of at"),
-    ({"disc": {**DISC, "center": [0.0]}}, "post.disc.center: got [0.0], expected two coordinates"),
-    ({"disc": {**DISC, "center": "00"}}, "post.disc.center: got '00', expected two coordinates"),
-    ({"disc": {**DISC, "center": [0.0, math.nan]}}, "post.disc.center: got [0.0, nan]"),
-    ({"disc": {**DISC, "center": [True, 0.0]}}, "post.disc.center: got [True, 0.0]"),
     ({"disc": DISC, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected 0 m: a disc has no corners"),
     ({"annulus": {**RING, "inner_radius": 0.002}}, "post.annulus.inner_radius: got 0.002, expected less than outer"),
     ({"annular_sector": {**SECTOR, "end_angle": 0.0}}, "post.annular_sector.end_angle: got 0.0, expected more than"),
-    ({"annular_sector": {**SECTOR, "end_angle": 90.0}}, "post.annular_sector.end_angle: got 90.0, expected a number"),
-    ({"annular_sector": {**SECTOR, "end_angle": 6.5}}, "post.annular_sector.end_angle: got 6.5, expected more than"),
     ({"annular_sector": {**SECTOR, "inset": 0.001}}, "post.annular_sector.inset: got 0.001, expected less than inner"),
     ({"annular_sector": {**SECTOR, "inset": 0.0006}}, "post.annular_sector.inset: got 0.0006, expected less than half"),
-    ({"annular_sector": {**SECTOR, "inset": -0.1}}, "post.annular_sector.inset: got -0.1, expected a number from 0"),
     ({"annular_sector": SECTOR, "corner_radius": 0.0006}, "post.corner_radius: got 0.0006, expected a radius with"),
     (
         {"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}},
         "post.capsule.end: got [0.0, 0.0], expected anoth",
     ),
-    ({"rectangle": {"center": [0, 0], "width": 0.01, "height": 0}}, "post.rectangle.height: got 0, expected a number"),
     (
         {"rectangle": {"center": [0, 0], "width": 0.01, "height": 0.002}, "corner_radius": 0.001},
         "post.corner_radius: got 0.001, expected at most 0.49 of the shorter side, 0.00098 m",
@@ -198,11 +161,9 @@ BAD: list[tuple[Any, str]] = [
         "post.corner_radius: got",
     ),
     ({"polygon": {"outline": SQUARE[:2]}}, "post.polygon.outline: got [[0.0, 0.0], [0.01, 0.0]], expected at least 3"),
-    ({"polygon": {"outline": "square"}}, "post.polygon.outline: got 'square', expected at least 3 points"),
     ({"polygon": {"outline": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "post.polygon.outline: got 'Self-intersection"),
     ({"polygon": {"outline": [[0, 0], [0.1, 0.1], [0.2, 0.2]]}}, "post.polygon.outline: got 'zero area'"),
     ({"polygon": {"outline": [[0, 0], [1e-8, 0], [0, 1e-8]]}}, "post.polygon.outline: got 1e-08, expected an extent"),
-    ({"polygon": {"outline": [*SQUARE, [0.0]]}}, "post.polygon.outline[4]: got [0.0], expected two coordinates"),
     ({"polygon": {"outline": SQUARE, "holes": [SQUARE]}}, "post.polygon.holes[0]: got 'a hole"),
     ({"polygon": {"outline": SQUARE, "holes": [[[0.1, 0.1], [0.2, 0.1], [0.1, 0.2]]]}}, "post.polygon.holes[0]: got"),
     (
@@ -222,25 +183,3 @@ def test_a_bad_shape_is_refused_in_one_line_that_names_file_shape_and_field(desc
     assert text.startswith(f"lab.yaml: {words}")
     assert "\n" not in text
     assert len(text) < 500
-
-
-@pytest.mark.parametrize("name", ["", "x" * 65, "a\nb", " post", 3, None, "\ud800"])
-def test_a_bad_name_is_refused(name: Any):
-    with pytest.raises(ConfigurationError, match=r"^lab\.yaml: shapes: got .*expected names of 1 to 64 printable"):
-        shape_from_mapping(name, {"disc": DISC}, "lab.yaml")
-
-
-def test_the_error_for_something_huge_is_short():
-    nested: list[Any] = []
-    for _ in range(300):
-        nested = [nested, nested]  # 2^300 lists, if anybody wrote them out
-    for description in ({"disc": nested}, {"disc": {"center": nested, "radius": 1}}, "x" * 10**6, {"y" * 10**6: 1}):
-        with pytest.raises(ConfigurationError) as caught:
-            shape_from_mapping("post", description, "lab.yaml")
-        assert len(str(caught.value)) < 500
-
-
-def test_numpys_numbers_and_tuples_are_taken_and_kept_as_plain_ones():
-    shape = shape_from_mapping("post", {"disc": {"center": (np.float64(0.001), 0.0), "radius": np.float64(0.002)}})
-    assert shape.definition == {"disc": {"center": [0.001, 0.0], "radius": 0.002}}
-    assert type(shape.definition["disc"]["radius"]) is float

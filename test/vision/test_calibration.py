@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import load_setup
 from magnetosuture_thread.vision.calibration import (
     CORNERS,
-    _homography,
     calibrate_by_dish,
     calibrate_by_markers,
     measure_needle_length,
@@ -86,12 +84,6 @@ def test_missing_markers_and_those_of_another_size_are_refused():
         calibrate_by_markers([markers(view)], 0.035, SPACING, 0.8 * SIDE)
 
 
-def test_a_marker_that_one_frame_hides_is_taken_from_another():
-    view = DishView((318.4, 243.7), 1.2e-4, 0.1)
-    found = calibrate_by_markers([markers(view, (0, 1, 2)), markers(view, (1, 2, 3))], 0.035, SPACING, SIDE)
-    assert np.linalg.norm(np.subtract(found.view.centre_px, view.centre_px)) < 0.3
-
-
 def test_markers_from_a_camera_that_moved_between_frames_are_refused():
     view, moved = DishView((305.0, 240.0), 1.2e-4), DishView((335.0, 240.0), 1.2e-4)
     with pytest.raises(
@@ -103,13 +95,6 @@ def test_markers_from_a_camera_that_moved_between_frames_are_refused():
         calibrate_by_markers([markers(view, (0, 1)), markers(nudged, (1, 2, 3))], 0.035, SPACING, SIDE)
     still = calibrate_by_markers([markers(view), markers(view)], 0.035, SPACING, SIDE)
     assert still.scatter_px < 0.2
-
-
-def test_markers_need_a_newer_opencv_than_some_systems_have(monkeypatch: pytest.MonkeyPatch):
-    frame = markers(DishView((318.4, 243.7), 1.2e-4))
-    monkeypatch.delattr(cv2.aruco, "ArucoDetector")
-    with pytest.raises(InvalidInputError, match=r"OpenCV 4\.7 or newer, which is needed for markers"):
-        calibrate_by_markers([frame], 0.035, SPACING, SIDE)
 
 
 def test_what_is_written_is_a_set_up(tmp_path: Path):
@@ -181,29 +166,3 @@ def test_a_needle_under_a_tilted_camera_is_measured_with_its_homography(factor: 
     off, turn = pose.error(found)
     assert off < 0.7
     assert abs(turn) < np.radians(1.0)
-
-
-def test_a_homography_gives_the_view_at_the_dishes_centre_and_is_that_of_a_camera_above_it():
-    square = np.array(CORNERS, dtype=float)
-    points = np.vstack([0.5 * SPACING * centre + 0.5 * SIDE * square for centre in square])
-
-    def projected(points: np.ndarray, tilt: float, mirror: float = 1.0) -> np.ndarray:
-        """Return the pixels of points under a pinhole camera, 0.3 m away and tilted."""
-        depth = 0.3 + points[:, 1] * math.sin(tilt)
-        return np.column_stack(
-            [320.0 + 3700.0 * mirror * points[:, 0] / depth, 240.0 - 3700.0 * points[:, 1] * math.cos(tilt) / depth]
-        )
-
-    found = _homography(points, projected(points, 0.5))
-    assert found is not None
-    view, homography, residual = found
-    assert residual < 1e-4
-    np.testing.assert_allclose(view.centre_px, (320.0, 240.0), atol=1e-6)
-    pixel = 1e-6 * square  # of 4e-12 m^2 in the dish, whose area in the image tells the scale
-    u, v = projected(pixel, 0.5).T
-    area = 0.5 * abs(u @ np.roll(v, 1) - v @ np.roll(u, 1))
-    assert view.metres_per_pixel == pytest.approx(math.sqrt(4e-12 / area), rel=1e-4)
-    straight = np.column_stack([projected(points, 0.5), np.ones(len(points))]) @ homography.T
-    np.testing.assert_allclose(straight[:, :2] / straight[:, 2:], view.to_pixels(points), atol=1e-4)
-    assert _homography(points, projected(points, 0.7)) is None  # 40 degrees
-    assert _homography(points, projected(points, 0.3, mirror=-1.0)) is None

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.camera.dish_camera import Cover
-from magnetosuture_thread.vision.dish import find as dish
+from magnetosuture_thread.rig.camera import Cover
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -120,12 +119,6 @@ def test_a_needle_that_leaves_over_the_rim():
     assert check(Pose(np.array([0.5, 0.5]), 0.0), render(Pose(np.array([0.5, 0.5]), 0.0)))
 
 
-def test_a_second_needle_is_not_chosen_between():
-    one, other = Pose(np.array([0.002, 0.005]), 0.4), Pose(np.array([-0.005, -0.006]), 0.4)
-    seen = TRACKER.look(np.minimum(render(one), render(other)))
-    assert seen.reason == "2 needles in the dish"
-
-
 def test_of_two_needles_the_one_with_a_thread_is_taken_and_none_if_both_have_one():
     one, other = Pose(np.array([0.002, 0.006]), 0.4), Pose(np.array([-0.004, -0.007]), 0.4)
     threads = [each.tail - np.linspace(0.0, 0.01, 40)[:, None] * np.array([1.0, 0.1]) for each in (one, other)]
@@ -134,28 +127,9 @@ def test_of_two_needles_the_one_with_a_thread_is_taken_and_none_if_both_have_one
     assert TRACKER.look(np.minimum(with_thread, render(other, threads[1]))).reason == "2 needles in the dish"
 
 
-def test_a_second_dark_thing_is_passed_over():
-    pose = Pose(np.array([0.002, 0.004]), 0.4)
-    frame = render(pose)
-    cv2.line(frame, (200, 300), (290, 330), (45, 45, 45), 4, cv2.LINE_AA)
-    assert check(pose, frame) == ""
-
-
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_empty_frames(level: int):
     assert TRACKER.look(np.full((480, 640, 3), level, np.uint8)).reason == "no dish in the image"
-
-
-class TestGuards:
-    """Each guard refuses what nothing else does: without it the frame would give a pose."""
-
-    def test_a_saturated_floor_without_a_dark_ring_is_no_dish(self, monkeypatch: pytest.MonkeyPatch):
-        bright = np.full((480, 640), 255, np.uint8)
-        v, u = np.mgrid[:480, :640]
-        bright[np.hypot(u - 322.0, v - 238.0) > 219.0] = 150  # an edge, but nothing tells where the light moved it
-        assert dish.find_dish(bright, 0.035) is None
-        monkeypatch.setattr(dish, "SATURATED_SHARE", 2.0)
-        assert dish.find_dish(bright, 0.035) is not None
 
 
 def something_else(kind: str, size: tuple[int, int] = (640, 480)) -> np.ndarray:
@@ -188,31 +162,6 @@ def test_a_video_of_something_else_is_lost_with_its_reason_and_the_needle_is_bac
     back = tracker.track(frame, 0.24)
     assert back.state is State.TRACKED
     assert pose.is_right(back)
-
-
-def test_half_a_dish_gives_no_wrong_pose_and_the_whole_one_is_tracked_at_once():
-    pose = Pose(np.array([0.003, -0.002]), 0.4)
-    frame = render(pose, random_thread(np.random.default_rng(1), pose))
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
-    assert tracker.track(frame, 0.0).state is State.TRACKED
-    half = frame.copy()
-    half[:, 300:] = 40  # a sheet
-    for index in range(1, 5):
-        seen = tracker.track(half, 0.02 * index)
-        assert seen.state is not State.TRACKED or pose.is_right(seen)
-    assert tracker.track(frame, 0.1).state is State.TRACKED
-
-
-def test_frames_that_change_size_begin_anew_each_time():
-    pose = Pose(np.array([0.003, -0.002]), 0.4)
-    frame = render(pose)
-    large = cv2.resize(frame, (1280, 960), interpolation=cv2.INTER_CUBIC)
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=2), SCENE)
-    for index, image in enumerate((frame, large, frame, large)):
-        tracker.track(image, 0.04 * index)
-        seen = tracker.track(image, 0.04 * index + 0.02)
-        assert seen.state is State.TRACKED
-        assert pose.is_right(seen)
 
 
 def test_a_bumped_camera_is_tracked_again_once_its_view_and_the_needle_agree_in_three_frames_each():

@@ -10,18 +10,14 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.vision.image_header import ImageHeader, image_header
 from magnetosuture_thread.vision.images import (
-    FLOOR_DEPTH_PX,
-    Layer,
-    Wall,
+    ImageHeader,
     decode_image,
     glare_mask,
+    image_header,
     prepare,
     unpack_image,
 )
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.sampling import median_of_windows, straighten, straighten_both
 
 
 def test_bytes_that_are_no_image_are_refused():
@@ -82,13 +78,6 @@ def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(monkeypatc
         decode_image(png(30_000, 30_000))
 
 
-@pytest.mark.parametrize("kind", [0xC4, 0xCC, 0xDB])
-def test_tables_before_the_size_of_a_jpeg_are_skipped(kind: int):
-    data = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
-    table = struct.pack(">BBH", 0xFF, kind, 19) + bytes(range(1, 18))
-    assert image_header(data[:2] + table + data[2:]) == ImageHeader(64, 48)
-
-
 @pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".webp", ".tif"])
 def test_size_and_orientation_are_read_from_the_header(ending: str):
     image = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
@@ -115,47 +104,3 @@ def test_pixels_are_read_as_they_are_stored_whatever_the_orientation(orientation
     turned = oriented_jpeg(image, orientation)
     assert image_header(turned) == ImageHeader(64, 48, orientation)
     assert (decode_image(turned) == decode_image(cv2.imencode(".jpg", image)[1])).all()
-
-
-@pytest.mark.parametrize("shape", [(60, 80), (9, 5), (2, 2)])
-@pytest.mark.parametrize("greatest", [255, 3])
-def test_median_of_windows_is_opencvs(shape: tuple[int, int], greatest: int):
-    image = np.random.default_rng(5).integers(0, greatest, shape, np.uint8, endpoint=True)
-    result = np.empty_like(image)
-    median_of_windows(image, 4, result)
-    np.testing.assert_array_equal(result, cv2.medianBlur(image, 9))
-
-
-def slanted(rows: int, columns: int) -> np.ndarray:
-    """Return an image 1 + 2 u + 3 v, which is the same between its pixels."""
-    return (1.0 + 2.0 * np.arange(columns) + 3.0 * np.arange(rows)[:, None]).astype(np.uint8)
-
-
-@pytest.mark.parametrize("curvature", [0.0, 0.03, -0.02])
-def test_a_strip_along_an_arc_is_the_image_there_and_beyond_its_border_the_nearest_pixels(curvature: float):
-    image, start = slanted(40, 50), (20.0, 15.0, 0.4, curvature)
-    along, aside = np.arange(-6.0, 51.0), np.linspace(-25.0, 25.0, 11)
-    arc = Arc(np.array(start[:2]), *start[2:])
-    at = np.stack([arc.at(along, each) for each in aside], axis=1)
-    expected = 1.0 + at.clip(0.0, (49.0, 39.0)) @ (2.0, 3.0)
-    strip, other = np.empty(expected.shape), np.empty(expected.shape)
-    straighten(image, start, along, aside, strip)
-    np.testing.assert_allclose(strip, expected, atol=0.01)
-    exact = image.astype(np.float32)
-    straighten_both(exact, 2.0 * exact, start, along[0], aside, strip, other)
-    np.testing.assert_allclose(strip, expected, atol=0.01)
-    np.testing.assert_allclose(other, 2.0 * expected, atol=0.02)
-
-
-@pytest.mark.parametrize("factor", [1, 2])
-def test_the_floor_beyond_the_wall_is_the_one_that_lies_towards_the_centre(factor: int):
-    """The pixel i of a shrunk image has its middle at factor i + (factor - 1) / 2."""
-    u, v = (factor * np.arange(side // factor) + 0.5 * (factor - 1) for side in (50, 40))
-    floor = (10.0 + 2.0 * u + 2.0 * v[:, None]).astype(np.uint8)
-    wall, box = Wall((24.0, 19.0), FLOOR_DEPTH_PX + 15.0), (slice(3, 37), slice(5, 45))
-    offset = np.stack(np.meshgrid(np.arange(5, 45), np.arange(3, 37)), axis=-1) - wall.centre
-    away = np.linalg.norm(offset, axis=-1)
-    at = offset * np.minimum(1.0, 15.0 / np.maximum(away, 1.0))[..., None] + wall.centre
-    found = wall.floor(Layer(floor, floor, floor), factor, box)
-    assert np.abs(found - (10.0 + 2.0 * at.sum(axis=-1))).max() < 0.51
-    np.testing.assert_allclose(wall.distances(box), away, rtol=1e-5)

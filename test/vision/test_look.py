@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,19 +11,14 @@ import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene, Lighting
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.dish.tilt import Tilt
-from magnetosuture_thread.vision.look import FoundDish, State, _in_dish, see_dish, tilted
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.dish.watch import see_dish
+from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import (
-    CURVATURES,
     NOWHERE,
     PIXEL,
     SCENE,
@@ -104,46 +97,6 @@ def test_rendered_needles_are_measured_in_any_light(light: str, curved: bool):
     assert 0.05 < np.mean(scaled) < 5.0  # 1 for errors as large as the covariance says
 
 
-def test_over_curvatures_lights_and_noise_tail_heading_and_thread_are_accurate():
-    tails: list[float] = []
-    angles: list[float] = []
-    lines: list[tuple[float, float]] = []
-    lost: list[str] = []
-    for number, light in enumerate(LIGHTS.values()):
-        for curvature in CURVATURES:
-            random = np.random.default_rng(200 + number)
-            drawn = random_pose(random, curved=False, within=0.0125)
-            pose = Pose(drawn.tail, drawn.heading, curvature)
-            thread = random_thread(random, pose)
-            seen = TRACKER.look(render(pose, thread, seed=5 + number, lighting=light))
-            if seen.reason:
-                lost.append(seen.reason)
-                continue
-            apart, turned = pose.error(seen)
-            tails.append(apart)
-            angles.append(turned)
-            lines.append(line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread)))
-            assert np.sign(seen.curvature) == np.sign(curvature)
-    assert min(CURVATURES) < 0.0 < max(CURVATURES)
-    assert len(lost) <= 2, lost
-    assert np.sqrt(np.mean(np.square(tails))) <= 0.5
-    assert np.degrees(np.sqrt(np.mean(np.square(angles)))) <= 1.0
-    assert np.mean([mean for mean, _ in lines]) <= 1.0
-    assert np.mean([share for _, share in lines]) >= 0.95
-
-
-def test_over_many_poses_the_covariance_is_about_right():
-    """With a view that is given: one that is found leaves the camera's tilt unknown, and this camera has none."""
-    scaled = []
-    for seed in range(10):
-        random = np.random.default_rng(100 + seed)
-        pose = random_pose(random, curved=True)
-        seen = GIVEN_VIEW.look(render(pose, random_thread(random, pose)))
-        error = np.array([*(seen.tail - pose.tail), pose.error(seen)[1]])
-        scaled.append(error @ np.linalg.solve(seen.covariance, error) / 3.0)
-    assert 0.3 < np.mean(scaled) < 2.0
-
-
 def test_a_larger_dish_with_a_faint_thread_is_tracked():
     view = DishView((644.0, 476.0), 0.15 / 875.0)
     camera = DishCamera(
@@ -161,12 +114,6 @@ def test_a_larger_dish_with_a_faint_thread_is_tracked():
     mean, share = line_error(view.to_pixels(seen.centreline), view.to_pixels(thread))
     assert mean < 1.0
     assert share > 0.95
-
-
-def test_without_a_dish_it_says_lost():
-    seen = TRACKER.look(np.full((480, 640, 3), 120, np.uint8))
-    assert (seen.state, seen.reason, seen.view) == (State.LOST, "no dish in the image", None)
-    assert seen.tail.size == seen.heading.size == seen.centreline.size == seen.covariance.size == 0
 
 
 def test_a_dish_of_another_size_than_the_scale_says_is_none():
@@ -264,60 +211,6 @@ def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str,
     assert lost <= (end == "side" and gap == 0.0)  # as 1 of 240 others was
 
 
-def test_a_wrong_scale_leaves_unknown_how_far_out_a_tail_is_and_nothing_else():
-    outward, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
-    covariance = FoundDish(VIEW, scale_error=0.02).covariance(0.01 * outward, across, 0.0175)
-    place = covariance[:2, :2]
-    assert math.sqrt(outward @ place @ outward) == pytest.approx(0.02 * 0.01)
-    np.testing.assert_allclose(place @ across, 0.0, atol=1e-15)
-    np.testing.assert_allclose(covariance[2], 0.0, atol=1e-15)
-
-
-def test_the_scale_is_known_only_where_it_is_given_and_the_dish_agrees():
-    gray = render(Pose(np.zeros(2), 0.3))
-    errors = {}
-    for scale in (0.0, 8e-5, 8.4e-5):
-        found = see_dish(gray, VisionTrackerSettings(metres_per_pixel=scale), 0.035)
-        assert found is not None
-        assert found.view.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
-        errors[scale] = found.scale_error
-    assert errors[8e-5] == 0.0 < errors[0.0] == errors[8.4e-5]
-
-
-def test_a_covariance_in_the_image_is_that_of_what_it_moves_in_the_dish():
-    """By differences: the needle is moved along and aside of its axis and turned, and looked at in the dish."""
-    view = DishView((322.0, 238.0), 8e-5, rotation=0.4)
-    arc = Arc(np.array([350.0, 200.0]), 0.7, 0.0)
-    along, aside = np.array([math.cos(0.7), math.sin(0.7)]), np.array([-math.sin(0.7), math.cos(0.7)])
-    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.003], [0.0, 0.003, 0.0004]])
-    needle = MeasuredNeedle(arc, 87.0, 5.0, covariance=covariance)
-
-    def pose(arc: Arc) -> np.ndarray:
-        moved = replace(needle, arc=arc)
-        heading = view.directions_to_dish(moved.direction_px)
-        return np.array([*view.to_dish(moved.tail_edge_px), math.atan2(heading[1], heading[0])])
-
-    step = 1e-4
-    changed = [replace(arc, start=arc.start + step * way) for way in (along, aside)] + [replace(arc, angle=0.7 + step)]
-    moves = np.column_stack([(pose(each) - pose(arc)) / step for each in changed])
-    np.testing.assert_allclose(_in_dish(needle, view), moves @ covariance @ moves.T, rtol=1e-3, atol=1e-16)
-
-
-def test_under_a_tilted_camera_pieces_of_thread_are_as_unsure_as_the_view_is_at_their_farthest_point():
-    points = np.array([[0.002, 0.001], [0.006, 0.009], [0.004, 0.003]])
-    piece = ThreadPiece(points, np.array([3e-5, 4e-5, 5e-5]), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), True, 1.0)
-    seen = replace(TRACKER.look(render(Pose(np.zeros(2), 0.3))), observation=ThreadObservation((piece,)))
-    dish = FoundDish(VIEW, tilt=Tilt(0.2, 0.4))
-    track = tilted(seen, dish, 0.0175)
-    assert track.warning == "the camera is tilted by 11 degrees"
-    (less_sure,) = track.observation.pieces
-    assert dish.tilt is not None
-    unsure = dish.tilt.covariance(points[1], np.array([1.0, 0.0]), 0.0175)[:2, :2]
-    ways = np.column_stack([np.cos(turns := np.linspace(0.0, np.pi, 2000)), np.sin(turns)])
-    greatest = np.einsum("ki,ij,kj->k", ways, unsure, ways).max()
-    np.testing.assert_allclose(less_sure.deviation**2, piece.deviation**2 + greatest, rtol=1e-5)
-
-
 def test_a_dark_frame_is_taken_for_a_negative_only_where_its_negative_shows_the_dish():
     settings = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel)
     frame = render(Pose(np.zeros(2), 0.3))
@@ -325,18 +218,6 @@ def test_a_dark_frame_is_taken_for_a_negative_only_where_its_negative_shows_the_
         found = see_dish(image, settings, 0.035)
         assert found is not None
         assert found.dark_field == negative
-
-
-def test_a_scale_that_is_not_given_makes_a_thread_less_sure_across_it_the_farther_out_it_is():
-    """An error s of the scale moves a point p by s p, and across a thread with the tangent t by s |p x t|."""
-    pose = Pose(np.array([0.012, -0.004]), -1.5)
-    frame = render(pose, pose.tail + np.linspace(0.0, 0.011, 60)[:, None] * np.array([0.05, 1.0]))
-    (given, *_), (found, *_) = (tracker.look(frame).observation.pieces for tracker in (GIVEN_VIEW, TRACKER))
-    along = np.diff(found.points, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    across = np.abs(found.points[1:, 0] * along[:, 1] - found.points[1:, 1] * along[:, 0])
-    more = np.mean(found.deviation**2) - np.mean(given.deviation**2)
-    assert more == pytest.approx(np.mean((0.001 * across) ** 2), rel=0.1)
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,8 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.vision.look import State, no_pose
-from magnetosuture_thread.vision.overlay import FONT, OverlayWriter, draw_dish, draw_overlay
+from magnetosuture_thread.vision.overlay import OverlayWriter, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import SCENE, VIEW, Pose, render
@@ -30,26 +28,6 @@ def test_needle_and_state_are_drawn_where_they_are():
     assert changed[-20:].mean() > 20
     lost = draw_overlay(frame[:, :, 1], TRACKER.look(0 * frame), 0.007)
     assert lost.shape == frame.shape
-
-
-@pytest.mark.parametrize("width", [640, 200])
-def test_the_heading_is_written_and_a_text_that_is_too_long_is_cut(width: int, monkeypatch: pytest.MonkeyPatch):
-    heading = np.array([np.cos(2.5), np.sin(2.5)])
-    track = replace(no_pose(State.TRACKED, "", VIEW), tail=np.zeros(2), tip=0.007 * heading, heading=heading)
-    written: list[tuple[str, tuple[int, int]]] = []
-    monkeypatch.setattr(cv2, "putText", lambda image, text, at, *rest: written.append((text, at)))
-    draw_overlay(np.zeros((480, width, 3), np.uint8), track, 0.007)
-    [(text, (left, _))] = written
-    assert left + cv2.getTextSize(text, FONT, 0.42, 1)[0][0] <= width
-    assert text.endswith("...") == (width < 640)
-    assert (f"heading {np.degrees(2.5):+.1f} deg" in text) == (width == 640)
-
-
-def test_a_dish_is_drawn_with_its_radius():
-    image = np.zeros((200, 200, 3), np.uint8)
-    draw_dish(image, (100.0, 90.0), 70.0)
-    v, u = np.nonzero(image.any(axis=2))
-    assert np.abs(np.hypot(u - 100.0, v - 90.0) - 70.0).max() < 2.0
 
 
 def test_a_folder_gets_png_files(tmp_path: Path):

@@ -10,14 +10,13 @@ import shapely
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.camera import scene as drawn
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import Look
+from magnetosuture_thread.rig import camera as drawn
+from magnetosuture_thread.rig.camera import DishCamera, Look
 from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.look import Track, mask_of
+from magnetosuture_thread.vision.look import Track
 from magnetosuture_thread.vision.overlay import draw_scene
-from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
+from magnetosuture_thread.vision.scene_mask import scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import PIXEL, VIEW, Pose, line_error, random_thread
@@ -114,42 +113,6 @@ def test_a_thread_that_ends_at_a_dark_outline_is_not_followed_around_it():
     assert line_error(masked.centreline / PIXEL, thread / PIXEL)[1] > 0.95
 
 
-def test_the_mask_is_made_once_for_a_view_and_a_scene(monkeypatch: pytest.MonkeyPatch):
-    made: list[Scene] = []
-
-    def counted(gray: np.ndarray, view: DishView, settings: VisionTrackerSettings, scene: Scene) -> SceneMask | None:
-        made.append(scene)
-        return mask_of(gray, view, settings, scene)
-
-    monkeypatch.setattr("magnetosuture_thread.vision.tracker.mask_of", counted)
-    scene = read_scene("dish_35mm_post")
-    pose = Pose(np.array([0.0, -0.003]), 0.3)
-    frame = frame_of(scene, SILICONE, pose, random_thread(np.random.default_rng(0), pose))
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), scene)
-    states = [tracker.track(frame, 0.1 * index).reason for index in range(4)]
-    assert (states, made) == ([""] * 4, [scene])
-    other = scene.remove("post")
-    tracker.set_scene(other)
-    assert tracker.track(frame, 0.5).reason == ""  # tracked without a pause
-    assert made == [scene, other]
-    shifted = np.roll(frame, 9, axis=1)
-    for index in range(4):
-        tracker.track(shifted, 0.6 + 0.1 * index)
-    assert made == [scene, other, other]
-
-
-def test_a_scene_with_another_dish_gives_another_scale():
-    scene = Scene()
-    pose = Pose(np.array([0.0, -0.003]), 0.3)
-    frame = frame_of(scene, SILICONE, pose, random_thread(np.random.default_rng(0), pose))
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), scene)
-    assert tracker.track(frame, 0.0).reason == ""
-    tracker.set_scene(scene_from_mapping({"dish": {"diameter": 0.07, "depth": 0.003}}))
-    seen = tracker.track(frame, 0.1)
-    assert seen.view is not None
-    assert seen.view.metres_per_pixel == pytest.approx(2.0 * PIXEL, rel=0.01)
-
-
 @pytest.mark.parametrize("factor", [1, 2])
 def test_solid_and_depth_agree_with_the_geometry(factor: int):
     scene = read_scene("hernia_ring")
@@ -171,22 +134,6 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
     inside = mask.solid[tuple(pixels.astype(int).T[::-1] // factor)] > 0
     assert (exact[inside] > 3e-4 / view.metres_per_pixel - 1.5).all()
     assert inside.sum() > 20
-
-
-@pytest.mark.parametrize("factor", [2, 3])
-def test_a_shrunk_pixel_is_solid_where_all_of_its_pixels_are(factor: int):
-    scene, view = read_scene("hernia_ring"), DishView((322.3, 238.4), 1.1e-4, rotation=0.3)
-    whole, small = (scene_mask(scene, view, (481, 641), each, 3e-4, 8) for each in (1, factor))
-    assert whole is not None
-    assert small is not None
-    rows, columns = small.solid.shape
-    fill = ((0, rows * factor - 481), (0, columns * factor - 641))
-    blocks = np.pad(whole.solid, fill, mode="edge").reshape(rows, factor, columns, factor)
-    np.testing.assert_array_equal(small.solid, blocks.min(axis=(1, 3)))
-
-
-def test_an_empty_scene_has_no_mask():
-    assert scene_mask(Scene(), VIEW, (480, 640), 2, 3e-4, 8) is None
 
 
 def test_outlines_are_drawn_where_the_shapes_are():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.look import State

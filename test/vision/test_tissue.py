@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shapely
 from scipy.interpolate import CubicSpline
 
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
+from magnetosuture_thread.rig.camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -81,35 +80,6 @@ def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
         turned = [assert_measured(setup, taking, frame, tail, heading) for frame in different.values()]
         assert len(turned) >= 5
         assert np.ptp(turned) < np.radians(1.5)  # a fit that stops at the first guess goes by the noise
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "degrees", "end"),
-    [(-0.0005, -0.0053, -69.0, (0.0045, -0.0097)), (0.0015, -0.0015, -125.0, (0.0070, -0.0131))],
-)
-def test_a_thread_around_the_ring_is_measured_although_it_lies_along_an_edge_nearly_everywhere(
-    setup: Setup, camera: DishCamera, x: float, y: float, degrees: float, end: tuple[float, float]
-):
-    """What is wide has the same edge in a shrunk image; the ring is, and the thread is not."""
-    ring, reach = np.array([0.0, 0.005]), 0.00605
-    tail, heading = np.array([x, y]), np.radians(degrees)
-
-    def tangent(point: np.ndarray, side: float) -> float:
-        """Return the angle at which a straight thread from a point below meets the ring on a side."""
-        away = point - ring
-        return float(np.arctan2(away[1], away[0]) + side * np.arccos(reach / np.linalg.norm(away)))
-
-    around = np.linspace(tangent(tail, 1.0), tangent(np.array(end), -1.0) + 2.0 * np.pi, 200)
-    thread = np.vstack([tail, ring + reach * np.column_stack([np.cos(around), np.sin(around)]), end])
-    length = float(np.linalg.norm(np.diff(thread, axis=0), axis=1).sum())
-    settings = replace(setup.vision, thread_length=length)
-    seen = VisionTracker(settings, setup.scene).look(camera.render(tail, heading, thread))
-    assert seen.state is State.TRACKED, seen.reason
-    assert seen.observation.complete
-    (piece,) = seen.observation.pieces
-    line = shapely.LineString(thread)
-    off = max(line.distance(shapely.Point(point)) for point in piece.points)
-    assert off < 2.0 * camera.view.metres_per_pixel
 
 
 # Around the ring and out through the penetration path again, where the needle comes back beside it [um].

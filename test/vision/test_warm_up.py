@@ -9,7 +9,7 @@ SWEEP = """
 import importlib, pkgutil
 import numpy as np
 import magnetosuture_thread.vision as vision
-from benchmarks.vision.classes import CLASSES
+from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.scene import Scene

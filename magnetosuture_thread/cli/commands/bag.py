@@ -37,8 +37,6 @@ def add(subparsers: Subparsers) -> None:
     check.add_argument("--frame", default="dish", metavar="NAME", help="the bag's name of the dish frame")
     check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
     repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
-    unverified = "salvage from a damaged bag without checksums what passes checks of its values; marks the new bag"
-    repair.add_argument("--unverified", action="store_true", help=unverified)
 
 
 def run_bag_check(options: argparse.Namespace) -> int:
@@ -48,13 +46,13 @@ def run_bag_check(options: argparse.Namespace) -> int:
     many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
     went back; the types follow. What is damaged is reported, with what is lost; all else is shown as it can be read.
     """
+    from magnetosuture_thread.bags.check import inspect_bag
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.report import inspect_bag
 
     console = make_console()
     with progress(console, "bag check") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
-        found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share)).to_json()
+        found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share))
     console.print(_table(found))
     for line in _lines(found):
         make_log(console)(line)
@@ -69,12 +67,10 @@ def run_repair(options: argparse.Namespace) -> int:
     indices and metadata.yaml are made anew. The command reports how many messages there are and what is lost or
     changed, where and when.
 
-    A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others. With
-    --unverified, those are written that decode, are finite, are within reach of the dish, and have their stamps in
-    order. The new bag says in its notes that it is unverified, and so does every later check, report and table.
+    A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others.
     """
+    from magnetosuture_thread.bags.check import write_repaired_bag
     from magnetosuture_thread.bags.reader import Bag
-    from magnetosuture_thread.bags.repair import write_repaired_bag
     from magnetosuture_thread.bags.storage import pluralize
     from magnetosuture_thread.jobs.output import whole_folder
 
@@ -83,13 +79,8 @@ def run_repair(options: argparse.Namespace) -> int:
     with progress(console, "bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         with whole_folder(options.output) as folder:
-            report = write_repaired_bag(
-                bag,
-                folder,
-                options.output.name,
-                unverified=options.unverified,
-                progress=lambda share: advance(0.5 + 0.5 * share),
-            )
+            name = options.output.name
+            report = write_repaired_bag(bag, folder, name, lambda share: advance(0.5 + 0.5 * share))
     if bag.damage is not None:
         log(str(bag.damage))
     for line in (f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks):

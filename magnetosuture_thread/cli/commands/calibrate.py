@@ -81,7 +81,6 @@ def add(subparsers: Subparsers) -> None:
     option = command(subparsers, "calibrate-coils", run_calibrate_coils).add_argument
     option("measurements", type=Path, metavar="MEASUREMENTS", help="CSV file")
     option("--output", type=output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
-    option("--model", choices=("loops", "dipoles"), default="loops", help="field of a coil (default: %(default)s)")
     option("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
 
 
@@ -237,7 +236,7 @@ def run_calibrate_coils(options: argparse.Namespace) -> int:
     """
     console = make_console()
     log = make_log(console)
-    found = calibrate_coils(options.measurements, options.output, options.model, options.name).to_json()
+    found = calibrate_coils(options.measurements, options.output, options.name).to_json()
     console.print(_coil_table(found))
     for line in _coil_lines(found):
         log(line)
@@ -245,26 +244,24 @@ def run_calibrate_coils(options: argparse.Namespace) -> int:
     return DONE
 
 
-def calibrate_coils(measurements: Path, output: Path, model: str = "loops", name: str = "") -> CalibrationFit:
+def calibrate_coils(measurements: Path, output: Path, name: str = "") -> CalibrationFit:
     """Fit the coils' model to measurements and write the calibration, whole or not at all.
 
     Args:
         measurements: a CSV file; see `read_measurements`.
         output: the YAML file to write.
-        model: loops or dipoles.
         name: of the rig; the output's own without its ending if empty.
 
     Raises:
         InvalidInputError: the measurements cannot be used; the message says which and why.
         BagError: the file cannot be written.
     """
-    from magnetosuture_thread.coils.calibration_fit import fit_calibration
-    from magnetosuture_thread.coils.measurements import read_measurements
+    from magnetosuture_thread.coils.calibration_fit import fit_calibration, read_measurements
     from magnetosuture_thread.jobs.output import whole_file
 
     if output.exists() and output.samefile(measurements):
         raise BagError(output, "holds the measurements; write the calibration to another file")
-    fit = fit_calibration(read_measurements(measurements), model)
+    fit = fit_calibration(read_measurements(measurements))
     x, y = fit.background
     if math.hypot(x, y) > MAX_BACKGROUND:
         text = f"a background of {1e3 * math.hypot(x, y):.3g} mT"

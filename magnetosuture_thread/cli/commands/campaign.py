@@ -21,9 +21,6 @@ def add(subparsers: Subparsers) -> None:
     option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
-    option("--follower", action="store_true", help="run the setup's path follower instead, for comparison")
-    follows = "follow paths by the path tracker, or by model predictive control (default: tracking)"
-    option("--local", choices=("tracking", "predictive"), default="tracking", help=follows)
     bags = "seeds whose runs are recorded as bags (default: none)"
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
     workers = count_argument("processes", 1, 256)
@@ -55,8 +52,6 @@ def run_campaign(options: argparse.Namespace) -> int:
             options.output,
             setup=options.setup,
             camera=options.camera,
-            follower=options.follower,
-            local=options.local,
             bags=options.bags,
             workers=options.workers,
             scheduler=options.scheduler,

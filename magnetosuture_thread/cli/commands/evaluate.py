@@ -89,6 +89,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
       NAME.html    a page for each bag, which needs no network: plots to zoom, the worst frames
       table.csv    a row for each bag, SI units and %
       table.json   the same, with mean and worst, and prediction and estimate side by side
+      table.parquet  table.csv for DuckDB or pandas, where pyarrow is installed (extra `cluster`)
     A bag that cannot be evaluated has its row too, with the problem in it; the exit code is 1 then.
 
     Reference trajectories: files DIR/*.npz with the needle's poses and the thread that followed (arrays t, pose, X and

@@ -226,18 +226,16 @@ def run_console(options: argparse.Namespace) -> int:
 
     from magnetosuture_thread.jobs.console import console
 
+    token = options.token or os.environ.pop(TOKEN, None) or None  # no node gets it
+    served = {"address": options.address, "port": options.port, "token": token, "origin": options.origin}
+    served |= {"certificate": options.certificate, "private_key": options.key}
     console(
         options.setup,
+        recordings=options.record,
         running=options.graph,
         namespace=options.namespace,
         bag=options.replay,
-        recordings=options.record,
-        address=options.address,
-        port=options.port,
-        token=options.token or os.environ.pop(TOKEN, None) or None,  # no node gets it
-        certificate=options.certificate,
-        private_key=options.key,
-        origin=options.origin,
+        served={name: value for name, value in served.items() if value is not None},
         log=make_log(make_console()),
     )
     return DONE
@@ -259,7 +257,7 @@ def run_coils(options: argparse.Namespace) -> int:
     The same by any ROS 2 tool: services coils/arm (std_srvs/SetBool), coils/emergency_stop and coils/reset
     (std_srvs/Trigger).
     """
-    from magnetosuture_thread.nodes.coil_bridge.client import CoilClient
+    from magnetosuture_thread.nodes.clients import CoilClient
 
     log = make_log(make_console())
     with CoilClient(options.namespace) as client:
@@ -283,7 +281,7 @@ def run_hernia(options: argparse.Namespace) -> int:
     `magnetosuture console hernia_ring` is the same with a whole rig.
     DIR, which must not exist, gets hernia.json and hernia.png: six instants, and the barriers over time.
     """
-    from magnetosuture_thread.reproduce.hernia.replay import hernia_lines, hernia_table, replay_hernia
+    from magnetosuture_thread.reproduce.hernia import hernia_lines, hernia_table, replay_hernia
 
     console = make_console()
     log = make_log(console)

@@ -83,7 +83,7 @@ def run_draw(options: argparse.Namespace) -> int:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
 
     from magnetosuture_thread import read_scene
-    from magnetosuture_thread.evaluation.scene_plot import plot_scene
+    from magnetosuture_thread.evaluation.plots import plot_scene
     from magnetosuture_thread.jobs.output import whole_file
 
     scene = read_scene(options.file)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from magnetosuture_thread.coils.drivers.protocol import CoilDriver, DriverState, Vector
+from magnetosuture_thread.coils.drivers.protocol import (
+    CoilDriver,
+    DriverState,
+    RecordingDriver,
+    SimulatedDriver,
+    Vector,
+)
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
-from magnetosuture_thread.coils.drivers.simulated import RecordingDriver, SimulatedDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 

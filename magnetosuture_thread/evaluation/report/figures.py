@@ -9,11 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
-from magnetosuture_thread.evaluation.frames import TimeSeries
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.pull import pull_error_percent
-from magnetosuture_thread.evaluation.silence import SensorSilence
-from magnetosuture_thread.model.estimator import SlowParameter
+from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
 from magnetosuture_thread.model.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
@@ -39,7 +35,7 @@ class LiveFigures:
 
 
 @dataclass(frozen=True)
-class BagFigures:
+class Figures:
     """How prediction and estimate did on one bag. Lengths in m, times in s.
 
     Attributes:
@@ -73,24 +69,24 @@ class BagFigures:
     predicted: int
     error: Mapping[str, Mapping[str, float] | None]
     recorded_error: Mapping[str, Mapping[str, float] | None]
+    estimate_error: Mapping[str, Mapping[str, float] | None]
+    compared: Mapping[str, Mapping[str, float | None]]
+    estimation: EstimationFigures
     target: str
     measured_share: float
     strain: float
     residual: float
+    tension: float
+    pull: float
+    pull_error: float
     minimum: Mapping[str, MinimumMargin]
     contact_frames: int
     step_time: Percentiles | None
     processing: Percentiles | None
     interval: float
-    live: LiveFigures = field(default_factory=LiveFigures)
-    silence: SensorSilence = field(default_factory=SensorSilence)
-    span: float = math.nan
-    tension: float = math.nan
-    pull: float = math.nan
-    pull_error: float = math.nan
-    estimate_error: Mapping[str, Mapping[str, float] | None] = field(default_factory=dict)
-    compared: Mapping[str, Mapping[str, float | None]] = field(default_factory=lambda: compare_errors(TimeSeries([])))
-    estimation: EstimationFigures = field(default_factory=EstimationFigures)
+    live: LiveFigures
+    silence: SensorSilence
+    span: float
 
     @property
     def silent_share(self) -> float:
@@ -100,7 +96,7 @@ class BagFigures:
     @classmethod
     def of(
         cls, metrics: RunMetrics, live: LiveFigures | None = None, within: tuple[float, float] | None = None
-    ) -> BagFigures:
+    ) -> Figures:
         """Return the figures of a run.
 
         Args:
@@ -123,7 +119,7 @@ class BagFigures:
             residual=metrics.maximum("residual"),
             tension=metrics.maximum("tension"),
             pull=metrics.maximum("pull"),
-            pull_error=pull_error_percent(metrics.series),
+            pull_error=metrics.pull_error_percent,
             minimum=metrics.minimum_margins,
             contact_frames=metrics.contact_frames,
             step_time=metrics.percentiles("step_time"),
@@ -204,29 +200,28 @@ class Headline:
     assessment: str
 
 
-def headlines(about: BagDetails, figures: BagFigures) -> list[Headline]:
+def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
     """Return the figures of the page's head, in their order."""
-    return [
-        *(
-            _error(about, errors, kind, target)
-            for target in AGAINST
-            for kind, errors in (("estimate", figures.estimate_error), ("prediction", figures.error))
-            if target in errors and (kind == "prediction" or figures.estimation.estimated)
-        ),
-        *([_consistency(figures.estimation), _hidden(figures.estimation)] if figures.estimation.estimated else []),
-        *(_learned(each) for each in figures.estimation.learned),
-        _frames(figures),
-        _margin(about, figures),
-        _strain(figures),
-        _tension(figures),
-        _duration("model step", figures.step_time, figures.interval, "one step of the thread model"),
-        *(
-            [_duration("tracker", figures.processing, figures.interval, "one camera frame")]
-            if figures.processing
-            else []
-        ),
-        _latency(figures),
+    estimation, interval = figures.estimation, figures.interval
+    kinds = {"estimate": figures.estimate_error} if estimation.estimated else {}
+    kinds["prediction"] = figures.error
+    found = [
+        _error(about, errors[target], f"{kind}, error against {against}", target)
+        for target, against in AGAINST.items()
+        for kind, errors in kinds.items()
+        if target in errors
     ]
+    if estimation.estimated:
+        found += [_consistency(estimation), _hidden(estimation)]
+    for parameter in estimation.learned:
+        value, range_95 = str(parameter).split(", ", 1)
+        name = parameter.name.replace("_", " ")
+        found.append(Headline(name, value, range_95, NONE, "learned by the estimate"))
+    found += [_frames(figures), _margin(about, figures), _strain(figures), _tension(figures)]
+    found.append(_duration("model step", figures.step_time, interval, "one step of the thread model"))
+    if figures.processing:
+        found.append(_duration("tracker", figures.processing, interval, "one camera frame"))
+    return [*found, _latency(figures)]
 
 
 def _grade(value: float, *grades: tuple[float, str, str]) -> tuple[str, str]:
@@ -234,9 +229,7 @@ def _grade(value: float, *grades: tuple[float, str, str]) -> tuple[str, str]:
     return next((grade, words) for limit, grade, words in grades if value <= limit)
 
 
-def _error(about: BagDetails, errors: Mapping[str, Mapping[str, float] | None], kind: str, target: str) -> Headline:
-    name = f"{kind}, error against {AGAINST[target]}"
-    found = errors[target]
+def _error(about: BagDetails, found: Mapping[str, float] | None, name: str, target: str) -> Headline:
     if found is None:
         missing = "not in this bag" if target == "truth" else "no frame shows half of the thread"
         return Headline(name, "none", missing, NONE, "not scored")
@@ -258,25 +251,20 @@ def _consistency(estimation: EstimationFigures) -> Headline:
 
 
 def _hidden(estimation: EstimationFigures) -> Headline:
-    name, found = "thread hidden", estimation.hidden
+    found = estimation.hidden
     assert found is not None
     grades = ((0.0, GOOD, "never"), (1.0 - 1e-9, NONE, "at times"), (1.0, NONE, "always"))
     detail = f"of the time, in part or all; {100.0 * found.length:.1f} % of the length in the mean"
     if found.all_time > 0.0:
         detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
-    return Headline(name, f"{100.0 * found.time:.1f} %", detail, *_grade(found.time, *grades))
-
-
-def _learned(parameter: SlowParameter) -> Headline:
-    value, interval = str(parameter).split(", ", 1)
-    return Headline(parameter.name.replace("_", " "), value, interval, NONE, "learned by the estimate")
+    return Headline("thread hidden", f"{100.0 * found.time:.1f} %", detail, *_grade(found.time, *grades))
 
 
 def _frames_of(count: float) -> str:
     return "1 frame" if count == 1 else f"{count:.0f} frames"
 
 
-def _frames(figures: BagFigures) -> Headline:
+def _frames(figures: Figures) -> Headline:
     share = figures.predicted / figures.frames if figures.frames else 0.0
     grades = ((-0.95, GOOD, "nearly all"), (-0.5, MIDDLING, "with gaps"), (0.0, BAD, "few"))
     detail = f"{100.0 * share:.1f} %; needle found in {figures.tracked}"
@@ -288,8 +276,8 @@ def _frames(figures: BagFigures) -> Headline:
     return Headline("frames predicted", f"{figures.predicted} of {figures.frames}", detail, *_grade(-share, *grades))
 
 
-def _margin(about: BagDetails, figures: BagFigures) -> Headline:
-    """Return the least margin: of something solid where all barriers hold, else the one that is broken most."""
+def _margin(about: BagDetails, figures: Figures) -> Headline:
+    """Return the minimum margin: of something solid where all barriers hold, else the one that is broken most."""
     minima = figures.minimum.values()
     if not minima:
         return Headline("minimum margin", "none", "no prediction converged", NONE, "not known")
@@ -298,9 +286,9 @@ def _margin(about: BagDetails, figures: BagFigures) -> Headline:
     if not broken:
         worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
     touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
-    name = f"minimum margin, {worst.kind.replace('_', ' ')}"
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
     grade, words = (BAD, f"broken: {', '.join(broken)}") if broken else (GOOD, "every barrier holds")
+    name = f"minimum margin, {worst.kind.replace('_', ' ')}"
     return Headline(name, micrometres(worst.clearance), detail, grade, words)
 
 
@@ -321,42 +309,34 @@ def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
     return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"
 
 
-def _strain(figures: BagFigures) -> Headline:
+def _strain(figures: Figures) -> Headline:
     name, detail = "maximum stretch", "of a segment, either way"
     if not math.isfinite(figures.strain):
         return Headline(name, "none", detail, NONE, "not known")
-    grades = (
-        (EXACT, GOOD, "inextensible"),
-        (10.0 * EXACT, MIDDLING, "more than 0.1 %"),
-        (math.inf, BAD, "more than 1 %"),
-    )
+    grades = ((EXACT, GOOD, "inextensible"), (0.01, MIDDLING, "more than 0.1 %"), (math.inf, BAD, "more than 1 %"))
     return Headline(name, f"{format_number(100.0 * figures.strain)} %", detail, *_grade(figures.strain, *grades))
 
 
-def _tension(figures: BagFigures) -> Headline:
-    name = "peak tension"
+def _tension(figures: Figures) -> Headline:
     if not math.isfinite(figures.tension):
-        return Headline(name, "none", "of a segment, by the model", NONE, "no force is known")
+        return Headline("peak tension", "none", "of a segment, by the model", NONE, "no force is known")
     detail = f"of a segment, by the model; the thread pulls the needle with at most {micronewtons(figures.pull)}"
-    return Headline(name, micronewtons(figures.tension), detail, NONE, "by the model's multipliers")
+    return Headline("peak tension", micronewtons(figures.tension), detail, NONE, "by the model's multipliers")
 
 
 def _duration(name: str, found: Percentiles | None, interval: float, detail: str) -> Headline:
     if found is None:
         return Headline(f"{name}, median", "none", detail, NONE, "not known")
-    grade, words = NONE, "frame rate not known"
-    if math.isfinite(interval) and interval > 0.0:
-        grade, words = _grade(
-            found.p99 / interval,
-            (0.5, GOOD, f"keeps up with {1.0 / interval:.3g} frames/s"),
-            (1.0, MIDDLING, "just keeps up"),
-            (math.inf, MIDDLING, "slower than the frames, on this machine"),
-        )
+    grade = NONE, "frame rate not known"
+    if interval > 0.0:
+        slow = math.inf, MIDDLING, "slower than the frames, on this machine"
+        fast = 0.5, GOOD, f"keeps up with {1.0 / interval:.3g} frames/s"
+        grade = _grade(found.p99 / interval, fast, (1.0, MIDDLING, "just keeps up"), slow)
     detail = f"{detail}; 99th percentile {milliseconds(found.p99)}"
-    return Headline(f"{name}, median", milliseconds(found.median), detail, grade, words)
+    return Headline(f"{name}, median", milliseconds(found.median), detail, *grade)
 
 
-def _latency(figures: BagFigures) -> Headline:
+def _latency(figures: Figures) -> Headline:
     name, live = "latency, frame to prediction", figures.live
     found = live.latency.get("frame to prediction")
     if found is None:

@@ -9,28 +9,25 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from jinja2 import Template
 from plotly.offline import get_plotlyjs
 
-from magnetosuture_thread.evaluation.error_map import ErrorMap
-from magnetosuture_thread.evaluation.frames import MARGIN, Array, WorstFrame
+from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame, with_gaps
 from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.evaluation.plots import ReportPicture
 from magnetosuture_thread.evaluation.report import figures as report
-from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, BagFigures
-from magnetosuture_thread.evaluation.report.pictures import ReportPicture
+from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, Figures
 from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
 from magnetosuture_thread.model.margins import SOLID
 
 SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
 MAX_POINTS = 5000  # of a line
-MAX_BANDS = 400
+MAX_BANDS = 400  # of times in which the needle was not found
 MIN_RANGE = 1.0  # s
 MIN_STRAIN = 1e-7  # %, on a scale of powers of ten
-LINE_GAP = 5.0  # times the usual interval; a line is broken where nothing came for longer
 DIGITS = 5  # of a value in the page
 LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
 
@@ -49,7 +46,7 @@ FORCE_LINES = (
 Line = tuple[str, str, str, str]  # column, name, colour, dash
 
 
-def write_page(about: BagDetails, metrics: RunMetrics, figures: BagFigures, pictures: Sequence[ReportPicture]) -> str:
+def write_page(about: BagDetails, metrics: RunMetrics, figures: Figures, pictures: Sequence[ReportPicture]) -> str:
     """Return the page.
 
     It loads nothing: style, script, plots' library, data and pictures are in it, and its own policy forbids the browser
@@ -121,98 +118,87 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
         worst: the worst frames, numbered in their order.
         limit: points of a line.
     """
-    table, times = metrics.series, metrics.observed.times
-    solid = [f"{MARGIN}{name}" for name in SOLID]
-    others = [name for name in table.names if name.startswith(MARGIN) and name not in solid]
-    # In the units of the plots: %, mm, µm, ms.
-    scales = {
-        "strain": 100.0,
-        "step_time": 1e3,
-        "tension": 1e6,
-        "pull": 1e6,
-        "true_pull": 1e6,
-        **dict.fromkeys(solid, 1e3),
-        **dict.fromkeys(others, 1e6),
-    }
-    columns = {name: scales.get(name, 1.0) * table.column(name) for name in table.names}
-    columns["strain"] = np.maximum(columns["strain"], MIN_STRAIN)
-    predicted_times, predicted = with_gaps(*thinned(table.times, columns, limit))
-    tracked = {"processing": 1e3 * metrics.observed.column("processing")}
-    frame_times, tracked = with_gaps(*thinned(times, tracked, limit))
-
+    estimation, observed = metrics.estimation, metrics.observed.times
+    times, columns = thinned(metrics.series.times, _in_units(metrics), limit)
+    tracked_times, tracked = thinned(observed, {"processing": 1e3 * metrics.observed.column("processing")}, limit)
     errors = [
         (f"{kind}error_{target}", f"{name} against {words}", colour, dash)
         for kind, name, colour in ERROR_LINES
         for (target, words), dash in zip(AGAINST.items(), ("", "dot"), strict=True)
     ]
-    distances = [(f"{MARGIN}{name}", name, colour, "") for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
+    solid = [(f"{MARGIN}{name}", name, colour, "") for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
+    others = [name for name in columns if name.startswith(MARGIN) and name.removeprefix(MARGIN) not in SOLID]
     margins = [
         (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "")
         for k, column in enumerate(others)
     ]
-    durations = _lines(predicted, [("step_time", "model step", "kind0", "")], dots=True)
+    durations = _lines(columns, [("step_time", "model step", "kind0", "")], dots=True)
     durations += _lines(tracked, [("processing", "tracker", "kind1", "")], at="frames", dots=True)
+    moments = {"moments": f"error_{metrics.target}", "floor": 0.0}
+    hidden = _lines(columns if estimation.estimated else {}, [("hidden", "hidden", "kind5", "")])
+    windows, consistency, top = _consistency_lines(metrics, columns)
     plots: list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]] = [
-        (
-            "error",
-            "error [% of length]",
-            _lines(predicted, errors),
-            {"moments": f"error_{metrics.target}", "floor": 0.0},
-        ),
-        *_estimation_plots(metrics, predicted),
-        ("stretch", "stretch [%]", _lines(predicted, [("strain", "maximum", "ink", "")]), {"log": True}),
-        ("tension", "force [µN]", _lines(predicted, FORCE_LINES), {"floor": 0.0}),
-        ("obstacle", "distance [mm]", _lines(predicted, distances), {"zero": True}),
-        ("lengths", "margin [µm]", _lines(predicted, margins), {"zero": True}),
+        ("error", "error [% of length]", _lines(columns, errors), moments),
+        ("consistency", "squared innovation", consistency, {"top": top}),
+        ("hidden", "hidden [% of length]", hidden, {"top": 102.0}),
+        ("stretch", "stretch [%]", _lines(columns, [("strain", "maximum", "ink", "")]), {"log": True}),
+        ("tension", "force [µN]", _lines(columns, FORCE_LINES), {"floor": 0.0}),
+        ("obstacle", "distance [mm]", _lines(columns, solid), {"zero": True}),
+        ("lengths", "margin [µm]", _lines(columns, margins), {"zero": True}),
         ("pace", "time [ms]", durations, {"log": True}),
     ]
-    consistency = metrics.estimation.consistency
-    windows = np.empty(0) if consistency is None else _paired(consistency.begins, consistency.ends)
     return {
         "times": {
-            "predicted": _values(predicted_times, 8),
-            "frames": _values(frame_times, 8),
-            "windows": _values(windows, 8),
+            name: _values(at, 8)
+            for name, at in zip(("predicted", "frames", "windows"), (times, tracked_times, windows), strict=True)
         },
-        "range": _range(times),
+        "range": _range(observed),
         "lost": [[round(a, 4), round(b, 4)] for a, b in _bands(metrics.lost)],
         "moments": [
             {"number": number, "time": round(each.time, 4), "error": _rounded(each.error)}
             for number, each in enumerate(worst, 1)
         ],
-        "disturbances": [
-            [round(event.begin_s, 4), round(event.end_s, 4)] for event in metrics.disturbances.events[:MAX_BANDS]
-        ],
+        "disturbances": [[round(event.begin_s, 4), round(event.end_s, 4)] for event in estimation.disturbances],
         "plots": [{"id": name, "y": label, "series": lines, **kind} for name, label, lines, kind in plots if lines],
         "map": _map(metrics.error_map),
         "estimate_map": _map(metrics.estimate_map),
     }
 
 
-def _estimation_plots(
-    metrics: RunMetrics, columns: Mapping[str, Array]
-) -> list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]]:
-    """Return the plots of the estimate: its consistency, and how much of the thread was hidden."""
-    found = metrics.estimation
-    plots: list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]] = []
-    if (consistency := found.consistency) is not None:
-        low, high, mean = (_paired(each, each) for each in (consistency.low, consistency.high, consistency.means))
-        lines = _lines(columns, [("innovation_squared", "of each frame", "kind5", "")], dots=True)
-        shown = {"low": low, "high": high, "mean": mean}
-        band, mean_name = "95 % band of such a mean", f"mean over {consistency.width:.1f} s"
-        names = [("low", "", "estimated", ""), ("high", band, "estimated", ""), ("mean", mean_name, "ink", "")]
-        lines += _lines(shown, names, at="windows")
-        for line in lines:
-            line["band"] = line["id"] if line["id"] in ("low", "high") else ""
-        top = max(
-            2.5, 1.1 * float(np.nanmax(consistency.means)), float(np.nanpercentile(columns["innovation_squared"], 98))
-        )
-        plots.append(("consistency", "squared innovation", lines, {"top": round(top, 2)}))
-    if found.estimated:
-        hidden = {"hidden": 100.0 * columns["hidden"]}
-        lines = _lines(hidden, [("hidden", "hidden", "kind5", "")])
-        plots.append(("hidden", "hidden [% of length]", lines, {"top": 102.0}))
-    return plots
+def _in_units(metrics: RunMetrics) -> dict[str, Array]:
+    """Return the columns of a run in the units of the plots: %, mm, µm, ms, µN."""
+    scales = {
+        "strain": 100.0,
+        "hidden": 100.0,
+        "step_time": 1e3,
+        **dict.fromkeys(("tension", "pull", "true_pull"), 1e6),
+    }
+    scales |= {name: 1e6 for name in metrics.series.names if name.startswith(MARGIN)}
+    scales |= {f"{MARGIN}{name}": 1e3 for name in SOLID}
+    columns = {name: scales.get(name, 1.0) * metrics.series.column(name) for name in metrics.series.names}
+    columns["strain"] = np.maximum(columns["strain"], MIN_STRAIN)
+    return columns
+
+
+def _consistency_lines(metrics: RunMetrics, columns: Mapping[str, Array]) -> tuple[Array, list[dict[str, Any]], float]:
+    """Return times of the windows, the lines of normalised innovations squared, and the end of their axis."""
+    found = metrics.estimation.consistency
+    if found is None:
+        return np.empty(0), [], 0.0
+    shown = {
+        name: _paired(each, each) for name, each in (("low", found.low), ("high", found.high), ("mean", found.means))
+    }
+    names = [
+        ("low", "", "estimated", ""),
+        ("high", "95 % band of such a mean", "estimated", ""),
+        ("mean", f"mean over {found.width:.1f} s", "ink", ""),
+    ]
+    lines = _lines(columns, [("innovation_squared", "of each frame", "kind5", "")], dots=True)
+    lines += _lines(shown, names, at="windows")
+    for line in lines:
+        line["band"] = line["id"] if line["id"] in ("low", "high") else ""
+    frames = float(np.nanpercentile(columns["innovation_squared"], 98))
+    return _paired(found.begins, found.ends), lines, round(max(2.5, 1.1 * float(np.nanmax(found.means)), frames), 2)
 
 
 def _paired(first: Array, second: Array) -> Array:
@@ -239,17 +225,19 @@ def _range(times: Array) -> list[float]:
 
 
 def _bands(lost: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Return when the needle was not found; of very many bands those nearest to one another become one."""
-    if len(lost) <= MAX_BANDS:
-        return [list(band) for band in lost]
-    gaps = np.array([after[0] - before[1] for before, after in pairwise(lost)])
-    cuts = np.sort(np.argsort(-gaps, kind="stable")[: MAX_BANDS - 1]) + 1
-    begins, ends = [0, *cuts.tolist()], [*cuts.tolist(), len(lost)]
-    return [[lost[begin][0], lost[end - 1][1]] for begin, end in zip(begins, ends, strict=True)]
+    """Return when the needle was not found, bands that a plot cannot tell apart as one."""
+    bands: list[list[float]] = []
+    apart = (lost[-1][1] - lost[0][0]) / MAX_BANDS if len(lost) > MAX_BANDS else 0.0
+    for begin, end in lost:
+        if bands and begin - bands[-1][1] < apart:
+            bands[-1][1] = end
+        else:
+            bands.append([begin, end])
+    return bands
 
 
 def thinned(times: Array, columns: Mapping[str, Array], limit: int) -> tuple[Array, dict[str, Array]]:
-    """Return the envelope of columns: of each run of rows the least and the greatest value, in the order they came.
+    """Return the envelope of columns: of each run of rows the least and the greatest value, with a nan in long gaps.
 
     Rows are left as they are where there are no more than `limit`. Otherwise each run gives two points, at its first
     time and at its middle, so that all columns share their times and a value is off by less than a run.
@@ -259,35 +247,20 @@ def thinned(times: Array, columns: Mapping[str, Array], limit: int) -> tuple[Arr
         columns: each of shape (m,); nan for none.
         limit: of points, at least 2.
     """
-    count = len(times)
-    if count <= limit:
-        return times, dict(columns)
-    run = -(-count // (limit // 2))
-    runs = -(-count // run)
-    first = np.arange(runs) * run
-    at = np.column_stack([times[first], times[np.minimum(first + run // 2, count - 1)]]).ravel()
-    return at, {name: _extremes(column, run, runs) for name, column in columns.items()}
-
-
-def _extremes(column: Array, run: int, runs: int) -> Array:
-    padded = np.full(run * runs, np.nan)
-    padded[: len(column)] = column
-    table = padded.reshape(runs, run)
-    none = np.isnan(table)
-    low = np.argmin(np.where(none, np.inf, table), axis=1)
-    high = np.argmax(np.where(none, -np.inf, table), axis=1)
-    pair = np.column_stack([np.minimum(low, high), np.maximum(low, high)])
-    return np.take_along_axis(table, pair, axis=1).ravel()
-
-
-def with_gaps(times: Array, columns: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Return columns with a nan in each long gap, so that no line is drawn over a time of which nothing is known."""
-    if len(times) < 3:
-        return times, dict(columns)
-    steps = np.diff(times)
-    gaps = np.flatnonzero(steps > LINE_GAP * float(np.median(steps))) + 1
-    middles = 0.5 * (times[gaps - 1] + times[gaps])
-    return np.insert(times, gaps, middles), {name: np.insert(column, gaps, np.nan) for name, column in columns.items()}
+    values = np.array(list(columns.values())).reshape(len(columns), len(times))
+    if (count := len(times)) > limit:
+        run = -(-count // (limit // 2))
+        runs = -(-count // run)
+        padded = np.full((len(columns), runs * run), np.nan)
+        padded[:, :count] = values
+        table = padded.reshape(len(columns), runs, run)
+        low, high = np.nan_to_num(table, nan=np.inf).argmin(axis=2), np.nan_to_num(table, nan=-np.inf).argmax(axis=2)
+        pair = np.stack([np.minimum(low, high), np.maximum(low, high)], axis=2)
+        values = np.take_along_axis(table, pair, axis=2).reshape(len(columns), 2 * runs)
+        first = np.arange(runs) * run
+        times = _paired(times[first], times[np.minimum(first + run // 2, count - 1)])
+    times, values = with_gaps(times, values)
+    return times, dict(zip(columns, values, strict=True))
 
 
 def _lines(

@@ -10,8 +10,7 @@ from magnetosuture_thread.geometry.obstacles.contacts import (
     wall_contact,
 )
 from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distances
-from magnetosuture_thread.geometry.obstacles.shapes import Disc, Mesh, Obstacle, Polygon
-from magnetosuture_thread.geometry.obstacles.triangulation import Triangulation, triangulate
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon, Triangulation, triangulate
 from magnetosuture_thread.geometry.obstacles.workspace import MAX_FRICTION, Contacts, Workspace
 
 __all__ = [
@@ -20,7 +19,6 @@ __all__ = [
     "WALL",
     "Contacts",
     "Disc",
-    "Mesh",
     "Obstacle",
     "Polygon",
     "Triangulation",

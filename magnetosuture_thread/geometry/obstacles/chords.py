@@ -1,4 +1,4 @@
-"""Contacts of a chain's segments, between its nodes: with discs and balls, corners of polygons, edges of meshes."""
+"""Contacts of a chain's segments, between its nodes: with discs, balls and corners of polygons."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.contacts import BALL, EDGES, WorkspaceData, cell_of
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_MARKS, FACE_WIDTH
+from magnetosuture_thread.geometry.obstacles.contacts import BALL, WorkspaceData, cell_of
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
 from magnetosuture_thread.geometry.obstacles.search import Vector
 from magnetosuture_thread.geometry.polyline import Points
 
@@ -103,47 +103,6 @@ def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) ->
 
 
 @compiled_inline
-def _edge(chord: Chord, numbers: NDArray[np.float64], k: int, side: int, reach: float) -> tuple[float, float, Vector]:
-    """Return place, distance and normal of a mesh's edge, one of face k; a place of -1 for none.
-
-    The closest points of the two lines lie on both, and the normal, across both and outwards, is between those of the
-    faces: it points from the edge into neither.
-    """
-    begin, end = _at(numbers, k + 3 * side), _at(numbers, k + 3 * ((side + 1) % 3))
-    outward, across = _at(numbers, k + 21 + 3 * side), _at(numbers, k + 12 + 3 * side)
-    face = _at(numbers, k + 9)
-    none = -1.0, 0.0, outward
-    way = end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]
-    length = math.sqrt(_dot(way, way))
-    way = way[0] / length, way[1] / length, way[2] / length
-    # From the edge into its own face, where the edge runs with the solid below and the face to its left.
-    into = face[1] * way[2] - face[2] * way[1], face[2] * way[0] - face[0] * way[2], face[0] * way[1] - face[1] * way[0]
-    cosine = _dot(chord.along, way)
-    square = 1.0 - cosine * cosine
-    if not square > 1e-12 or not _dot(across, face) < 0.0:  # in line, or no edge that sticks out
-        return none
-    to = chord.start[0] - begin[0], chord.start[1] - begin[1], chord.start[2] - begin[2]
-    s = (cosine * _dot(way, to) - _dot(chord.along, to)) / square
-    t = _dot(way, to) + s * cosine
-    if not (0.0 < s < chord.length and 0.0 <= t <= length):
-        return none
-    u, v, size = chord.along, way, math.sqrt(square)
-    normal = (
-        (u[1] * v[2] - u[2] * v[1]) / size,
-        (u[2] * v[0] - u[0] * v[2]) / size,
-        (u[0] * v[1] - u[1] * v[0]) / size,
-    )
-    if _dot(normal, outward) < 0.0:
-        normal = -normal[0], -normal[1], -normal[2]
-    if _dot(normal, across) > CONE or _dot(normal, into) > CONE:
-        return none
-    distance = _dot(to, normal)
-    if not -0.5 * chord.length < distance <= reach:
-        return none
-    return s / chord.length, distance, normal
-
-
-@compiled_inline
 def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance from the centre and normal of a disc or ball; a place of -1 for none."""
     to = centre[0] - chord.start[0], centre[1] - chord.start[1], centre[2] - chord.start[2]
@@ -178,7 +137,7 @@ def find_chord_contacts(
 ) -> int:
     """Write where the chords between nodes are closest to what sticks out of obstacles; what nodes touch is not in it.
 
-    The distance from a corner or an edge is that of the chord. That from a disc or ball of radius R is of the arc: at a
+    The distance from a corner is that of the chord. That from a disc or ball of radius R is of the arc: at a
     place s it lies beyond the chord by what the thread turns there, with second differences c and the normal n, and by
     no more than an arc on the surface, with the thread's radius rho:
 
@@ -230,21 +189,10 @@ def find_chord_contacts(
             if own < 0:
                 continue
             for entry in range(data.entries[own], data.entries[own + 2]):
-                feature = data.entries[entry]
-                if kind == EDGES:
-                    place, distance, normal = _corner(chord, data.numbers, table[6] + EDGE_WIDTH * feature, reach)
-                    if place >= 0.0:
-                        count = _write(count, place, distance, normal, i, o, to)
-                    continue
-                for side in range(3):
-                    if data.entries[table[7] + FACE_MARKS * feature + side] == 0:
-                        continue  # the neighbour's to give
-                    k = table[6] + FACE_WIDTH * feature
-                    place, distance, normal = _edge(chord, data.numbers, k, side, reach)
-                    if place >= 0.0:
-                        count = _write(count, place, distance, normal, i, o, to)
-            if count < 0:
-                return -1
+                k = table[6] + EDGE_WIDTH * data.entries[entry]
+                place, distance, normal = _corner(chord, data.numbers, k, reach)
+                if place >= 0.0:
+                    count = _write(count, place, distance, normal, i, o, to)
         if count < 0:
             return -1
     return count

@@ -9,19 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.search import (
-    ContactRows,
-    Nearest,
-    Vector,
-    add_row,
-    search_edges,
-    search_faces,
-)
+from magnetosuture_thread.geometry.obstacles.search import ContactRows, Nearest, Vector, add_row, search_edges
 from magnetosuture_thread.geometry.polyline import Points
 
 FRICTION = 6
 """Column of `WorkspaceData.frames` with the coefficient of friction."""
-BALL, EDGES, FACES = range(3)
+BALL, EDGES = range(2)
 """Kinds of obstacles."""
 WALL = -1
 """Index of the dish wall in place of an obstacle's."""
@@ -37,12 +30,11 @@ class WorkspaceData(NamedTuple):
         wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
         frames: shape (o + 1, 7): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
             ball its centre (3) [m], 0, 0, its radius [m]; then the coefficient of friction, in row 0 the wall's.
-        tables: shape (o + 1, 9): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
-            features, where they begin in `numbers`, where their marks begin in `entries`, where the spokes of a mesh
-            begin in `numbers`.
-        numbers: features and spokes, flat.
-        entries: cells, their entries and marks, flat. A cell is two integers: where its entries begin (they end
-            where those of the next cell begin), and whether it is inside where no feature is near.
+        tables: shape (o + 1, 7): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
+            edges, where they begin in `numbers`.
+        numbers: edges, flat.
+        entries: cells and their entries, flat. A cell is two integers: where its entries begin (they end where those of
+            the next cell begin), and whether it is inside where no edge is near.
     """
 
     reach: float
@@ -75,12 +67,10 @@ def nearest_of(
     count: int,
     rows: ContactRows,
 ) -> Nearest:
-    """Return the nearest boundary point of a polygon or mesh; see `search_edges` for the arguments."""
-    table, numbers, entries = data.tables[obstacle + 1], data.numbers, data.entries
-    if table[0] == FACES:
-        return search_faces(point, reach, table, numbers, entries, first, last, count, rows)
+    """Return the nearest boundary point of a polygon; see `search_edges` for the arguments."""
+    base = data.tables[obstacle + 1, 6]
     x, y, _ = point
-    return search_edges(x, y, reach, numbers, table[6], entries, first, last, count, rows.distance, rows.normal)
+    return search_edges(x, y, reach, data.numbers, base, data.entries, first, last, count, rows.distance, rows.normal)
 
 
 @compiled_inline
@@ -111,7 +101,7 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
 
 @compiled_inline
 def _shape_contacts(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
-    """Write the rows of a polygon or mesh at one point; return the new count, -1 when they are too many."""
+    """Write the rows of a polygon at one point; return the new count, -1 when they are too many."""
     cell = cell_of(point, obstacle + 1, data)
     if cell < 0:
         return count

@@ -10,29 +10,21 @@ from numpy.typing import NDArray
 from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.contacts import (
     BALL,
-    FACES,
     WALL,
     WorkspaceData,
     cell_of,
     nearest_of,
     wall_contact,
 )
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, FACE_WIDTH
-from magnetosuture_thread.geometry.obstacles.search import (
-    ContactRows,
-    Vector,
-    closest_in_space,
-    closest_on_segment,
-)
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
+from magnetosuture_thread.geometry.obstacles.search import ContactRows, Vector, closest_on_segment
 from magnetosuture_thread.geometry.obstacles.workspace import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
 TOLERANCE = 1e-7
 """By how much a distance may be given too short; it is never too long but for rounding [m]."""
 
-_CUT_TOLERANCE = 1e-10  # of the tangents, which close in on the distance quickly [m]
 _MAX_BISECTIONS = 500  # of a half segment that is inside; what is left then has its lower bound
-_MAX_CUTS = 60  # tangents of one feature's distance
 _NO_ROWS = -1.0  # in place of a reach
 
 
@@ -46,95 +38,49 @@ def _along(start: Vector, end: Vector, s: float) -> Vector:
 
 
 @compiled_inline
-def _from_feature(point: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> tuple[float, Vector]:
-    """Return the distance of a point from an edge or a face, and the vector from there to the point."""
-    x, y, z = point
-    if kind == FACES:
-        a = (numbers[k], numbers[k + 1], numbers[k + 2])
-        b = (numbers[k + 3], numbers[k + 4], numbers[k + 5])
-        c = (numbers[k + 6], numbers[k + 7], numbers[k + 8])
-        qx, qy, qz, _ = closest_in_space(point, a, b, c)
-    else:
-        qx, qy, _ = closest_on_segment(x, y, numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3])
-        qz = z
-    rx, ry, rz = x - qx, y - qy, z - qz
-    return math.sqrt(rx * rx + ry * ry + rz * rz), (rx, ry, rz)
+def _from_edge(point: Vector, k: int, numbers: NDArray[np.float64]) -> float:
+    """Return the distance of a point from the edge whose numbers begin at k."""
+    x, y, _ = closest_on_segment(point[0], point[1], numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3])
+    return math.hypot(point[0] - x, point[1] - y)
 
 
-@compiled_inline
-def _slope(distance: float, away: Vector, start: Vector, end: Vector) -> float:
-    """Return the derivative of a distance along the way from start to end, by the part of that way."""
-    if not distance > 0.0:
+@compiled_uncounted
+def _between(start: Vector, end: Vector, k: int, numbers: NDArray[np.float64]) -> float:
+    """Return the distance of a straight line from an edge: 0 where they cross, else that of one of the four ends."""
+    ax, ay, bx, by = numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3]
+    ux, uy, dx, dy = end[0] - start[0], end[1] - start[1], bx - ax, by - ay
+    first, second = (ax - start[0]) * uy - (ay - start[1]) * ux, (bx - start[0]) * uy - (by - start[1]) * ux
+    third, fourth = (start[0] - ax) * dy - (start[1] - ay) * dx, (end[0] - ax) * dy - (end[1] - ay) * dx
+    if first * second < 0.0 and third * fourth < 0.0:
         return 0.0
-    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
-    return (away[0] * x + away[1] * y + away[2] * z) / distance
+    least = min(_from_edge(start, k, numbers), _from_edge(end, k, numbers))
+    for x, y in ((ax, ay), (bx, by)):
+        qx, qy, _ = closest_on_segment(x, y, start[0], start[1], end[0], end[1])
+        least = min(least, math.hypot(x - qx, y - qy))
+    return least
 
 
 @compiled_uncounted
-def _lowest(start: Vector, end: Vector, k: int, kind: int, numbers: NDArray[np.float64]) -> float:
-    """Return the least distance of a way from an edge or a face, a lower bound within the tolerance.
-
-    The distance from what is convex is convex along a straight way: it is above its tangents, and least between those
-    of opposite slopes, where the next one is taken.
-    """
-    low, high = 0.0, 1.0
-    left, away = _from_feature(start, k, kind, numbers)
-    falls = _slope(left, away, start, end)
-    if falls >= 0.0:
-        return left
-    right, away = _from_feature(end, k, kind, numbers)
-    rises = _slope(right, away, start, end)
-    if rises <= 0.0:
-        return right
-    bound = 0.0
-    for _ in range(_MAX_CUTS):
-        s = (left - right - falls * low + rises * high) / (rises - falls)
-        bound = max(left + falls * (s - low), 0.0)
-        distance, away = _from_feature(_along(start, end, s), k, kind, numbers)
-        if not (low < s < high) or distance - bound <= _CUT_TOLERANCE:
-            break
-        slope = _slope(distance, away, start, end)
-        if slope == 0.0:
-            return distance
-        if slope < 0.0:
-            low, left, falls = s, distance, slope
-        else:
-            high, right, rises = s, distance, slope
-    return bound
-
-
-@compiled_uncounted
-def _nearest_feature(
-    point: Vector, kind: int, base: int, width: int, first: int, last: int, data: WorkspaceData
-) -> int:
-    """Return where the numbers of the nearest of some features begin."""
+def _nearest_edge(point: Vector, base: int, first: int, last: int, data: WorkspaceData) -> int:
+    """Return where the numbers of the nearest of some edges begin."""
     best, at = np.inf, base
     for slot in range(max(first, 0), last):
-        k = base + width * (data.entries[slot] if first >= 0 else slot)
-        distance, _ = _from_feature(point, k, kind, data.numbers)
+        k = base + EDGE_WIDTH * (data.entries[slot] if first >= 0 else slot)
+        distance = _from_edge(point, k, data.numbers)
         if distance < best:
             best, at = distance, k
     return at
 
 
 @compiled
-def _deepest(
-    start: Vector,
-    end: Vector,
-    length: float,
-    obstacle: int,
-    first: int,
-    last: int,
-    data: WorkspaceData,
-) -> float:
-    """Return the least signed distance on a way that is inside in part, a lower bound within the tolerance.
+def _deepest(start: Vector, end: Vector, obstacle: int, first: int, last: int, data: WorkspaceData) -> float:
+    """Return the least signed distance on a line that is inside in part, a lower bound within the tolerance.
 
-    The depth of a point is at most its distance from any feature, which is convex, so between two points at most the
+    The depth of a point is at most its distance from any edge, which is convex, so between two points at most the
     greater of theirs; and it changes by no more than the way. Intervals are halved where this is not enough.
     """
-    table, rows = data.tables[obstacle + 1], ContactRows(np.empty(0), np.empty((0, 3)))
-    kind, base = int(table[0]), int(table[6])
-    width = FACE_WIDTH if kind == FACES else EDGE_WIDTH
+    rows, base = ContactRows(np.empty(0), np.empty((0, 2))), int(data.tables[obstacle + 1, 6])
+    length = math.hypot(end[0] - start[0], end[1] - start[1])
     lows, highs = np.empty(64), np.empty(64)
     lows[0], highs[0], pending = 0.0, 1.0, 1
     best = min(
@@ -152,10 +98,8 @@ def _deepest(
         bound = 0.5 * (before + after - (high - low) * length)
         if bound < best - TOLERANCE:
             for point in (p, q):
-                k = _nearest_feature(point, kind, base, width, first, last, data)
-                one, _ = _from_feature(p, k, kind, data.numbers)
-                other, _ = _from_feature(q, k, kind, data.numbers)
-                bound = max(bound, -max(one, other))
+                k = _nearest_edge(point, base, first, last, data)
+                bound = max(bound, -max(_from_edge(p, k, data.numbers), _from_edge(q, k, data.numbers)))
         if bound >= best - TOLERANCE or halvings >= _MAX_BISECTIONS or pending + 2 > len(lows):
             lowest = min(lowest, bound)
             continue
@@ -167,24 +111,21 @@ def _deepest(
 
 
 @compiled_uncounted
-def _from_shape(start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData) -> float:
-    """Return the least signed distance on a way from a polygon or mesh; `signed` is that of its start."""
+def _from_polygon(start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData) -> float:
+    """Return the least signed distance on a line from a polygon; `signed` is that of its start."""
     table = data.tables[obstacle + 1]
-    kind, base = int(table[0]), int(table[6])
-    width = FACE_WIDTH if kind == FACES else EDGE_WIDTH
-    length = math.sqrt((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2 + (end[2] - start[2]) ** 2)
+    length = math.hypot(end[0] - start[0], end[1] - start[1])
     cell, first, last = cell_of(start, obstacle + 1, data), -1, int(table[5])
     if cell >= 0 and abs(signed) + 2.0 * length <= data.frames[obstacle + 1, 4]:
-        first, last = int(data.entries[cell]), int(data.entries[cell + 2])  # what is near to any point of the way
+        first, last = int(data.entries[cell]), int(data.entries[cell + 2])  # what is near to any point of the line
     best = abs(signed)
     for slot in range(max(first, 0), last):
-        k = base + width * (data.entries[slot] if first >= 0 else slot)
-        distance, _ = _from_feature(start, k, kind, data.numbers)
-        if distance < best + length:
-            best = min(best, _lowest(start, end, k, kind, data.numbers))
+        k = int(table[6]) + EDGE_WIDTH * (data.entries[slot] if first >= 0 else slot)
+        if _from_edge(start, k, data.numbers) < best + length:
+            best = min(best, _between(start, end, k, data.numbers))
     if signed > 0.0 and best > TOLERANCE:
         return best
-    return _deepest(start, end, length, obstacle, first, last, data)
+    return _deepest(start, end, obstacle, first, last, data)
 
 
 @compiled_inline
@@ -218,7 +159,7 @@ def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, 
         elif data.tables[obstacle + 1, 0] == BALL:
             found = _from_ball(start, end, data.frames[obstacle + 1], data.frames[obstacle + 1, 5])
         else:
-            found = _from_shape(start, end, signed, obstacle, data)
+            found = _from_polygon(start, end, signed, obstacle, data)
         least = min(least, found)
     return least
 
@@ -241,8 +182,8 @@ def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contac
 
         min sd(x_i + s (x_j - x_i) / 2)  over  0 <= s <= 1,  j = i - 1, i + 1
 
-    Exact for discs, balls and the wall, and within 0.1 um below for polygons and meshes: so the least over all nodes is
-    that of the whole polyline, but for shapes that no node is near.
+    Exact for discs, balls, the wall and outside of polygons, within 0.1 um below inside of them: so the least over all
+    nodes is that of the whole polyline, but for shapes that no node is near.
 
     Args:
         points: nodes, shape (n + 1, d) [m].

@@ -1,4 +1,4 @@
-"""Shapes of obstacles: discs, polygons with holes, and meshes in space."""
+"""Shapes of obstacles: discs, which are balls in space, and polygons with holes; polygons cut into triangles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from shapely.validation import explain_validity
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.arrays import as_numbers
 from magnetosuture_thread.geometry.polyline import Points
 
 MAX_COORDINATE = 10.0
@@ -313,88 +312,91 @@ def _arc(before: Vertex, corner: Vertex, after: Vertex, turned: float, tangent: 
     )
 
 
+Obstacle = Disc | Polygon
+"""Any shape that `Workspace` takes."""
+
+
 @dataclass(frozen=True, eq=False)
-class Mesh:
-    """A solid in space, bounded by a closed surface of triangles.
-
-        volume = sum over the faces of a . (b x c) / 6
-
-    Faces are kept counter-clockwise seen from outside; when all were given the other way, all are flipped.
+class Triangulation:
+    """A polygon cut into triangles.
 
     Attributes:
-        vertices: shape (v, 3) [m].
-        faces: indices of vertices, shape (f, 3).
-        source: the file that the shape came from, for the error.
-
-    Raises:
-        ConfigurationError: when it bounds no solid: not finite, an index out of range, a face without
-            area, an edge that is not between two faces in opposite directions, no volume, or coordinates
-            that cannot be metres.
+        vertices: those of the polygon, outline first, then hole by hole, shape (v, 2) [m].
+        triangles: indices of vertices, counter-clockwise, shape (t, 3).
+        boundary: edges of the polygon in order, the solid to their left, shape (v, 2).
     """
 
     vertices: Points
-    faces: NDArray[np.int64]
-    source: str = field(default="", repr=False)
+    triangles: NDArray[np.int64]
+    boundary: NDArray[np.int64]
 
-    def __post_init__(self) -> None:
-        """Check and normalise what was given."""
-        vertices = np.array(as_numbers("mesh.vertices", self.vertices))
-        as_numbers("mesh.faces", self.faces)
-        faces = np.array(self.faces)
-        if vertices.ndim != 2 or vertices.shape[1] != 3:
-            self._refuse("vertices", f"shape {vertices.shape}", "shape (v, 3) [m]")
-        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
-            self._refuse("faces", f"shape {faces.shape} of {faces.dtype}", "integers of shape (f, 3), f >= 1")
-        faces = faces.astype(np.int64)
-        check_metres("mesh.vertices", vertices, self.source)
-        outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
-        if len(outside):
-            self._refuse(
-                f"faces[{outside[0]}]", faces[outside[0]].tolist(), f"indices of vertices, 0 to {len(vertices) - 1}"
-            )
-        self._check_faces(vertices, faces)
-        self._check_edges(faces)
-        a, b, c = np.moveaxis(vertices[faces] - vertices[faces[0, 0]], 1, 0)
-        volume = float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
-        if abs(volume) <= 1e-12 * float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) ** 3:
-            self._refuse("faces", f"a volume of {volume:.3g} m^3", "a surface around a volume")
-        if volume < 0.0:
-            faces = np.ascontiguousarray(faces[:, ::-1])
-        for name, array in (("vertices", vertices), ("faces", faces)):
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-
-    def _refuse(self, name: str, value: object, expectation: str) -> None:
-        raise ConfigurationError(f"mesh.{name}", value, expectation, self.source)
-
-    def _check_faces(self, vertices: Points, faces: NDArray[np.int64]) -> None:
-        """Refuse a face without area, to rounding."""
-        a, b, c = np.moveaxis(vertices[faces], 1, 0)
-        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        longest = np.max([np.sum((b - a) ** 2, axis=1), np.sum((c - b) ** 2, axis=1), np.sum((a - c) ** 2, axis=1)], 0)
-        flat = np.flatnonzero(area <= 1e-10 * longest)
-        if len(flat):
-            self._refuse(f"faces[{flat[0]}]", faces[flat[0]].tolist(), "three vertices that are not on one line")
-
-    def _check_edges(self, faces: NDArray[np.int64]) -> None:
-        """Refuse a surface that is open, or whose faces do not agree on what is outside."""
-        n = int(faces.max()) + 1
-        tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-        either, counts = np.unique(np.minimum(tails, heads) * n + np.maximum(tails, heads), return_counts=True)
-        if (counts != 2).any():
-            edge, count = int(either[counts != 2][0]), int(counts[counts != 2][0])
-            self._refuse(
-                "faces", f"{count} faces at the edge of vertices {edge // n} and {edge % n}", "a closed surface: 2 each"
-            )
-        edges, counts = np.unique(tails * n + heads, return_counts=True)
-        if (counts != 1).any():
-            edge = int(edges[counts != 1][0])
-            self._refuse(
-                "faces",
-                f"two faces that both run from vertex {edge // n} to {edge % n}",
-                "faces all counter-clockwise, or all clockwise, seen from outside",
-            )
+    @property
+    def areas(self) -> NDArray[np.float64]:
+        """Area of each triangle, shape (t,) [m^2]."""
+        a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
+        areas: NDArray[np.float64] = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        return areas
 
 
-Obstacle = Disc | Polygon | Mesh
-"""Any shape that `Workspace` takes."""
+def triangulate(polygon: Polygon) -> Triangulation:
+    """Return the constrained Delaunay triangulation of a polygon, without vertices of its own.
+
+    Every edge of the polygon is an edge of exactly one triangle, every other edge of exactly two, and
+    the areas add up to the polygon's: this is checked.
+
+    Raises:
+        ConfigurationError: with what the triangulation missed.
+    """
+    rings = polygon.rings
+    vertices = np.vstack(rings)
+    firsts = np.cumsum([0, *(len(ring) for ring in rings)])
+    boundary = np.vstack(
+        [
+            np.stack([np.arange(len(ring)), np.roll(np.arange(len(ring)), -1)], axis=1) + first
+            for ring, first in zip(rings, firsts[:-1], strict=True)
+        ]
+    )
+    shape = shapely.Polygon(polygon.outline, polygon.holes)
+    try:
+        pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
+    except shapely.errors.GEOSException as error:  # corners apart by less than rounding
+        raise _refusal(polygon, str(error)) from error
+    index = {tuple(vertex): i for i, vertex in enumerate(vertices.tolist())}
+    try:
+        triangles = np.array(
+            [[index[corner] for corner in piece.exterior.coords[:3]] for piece in pieces], dtype=np.int64
+        ).reshape(-1, 3)
+    except KeyError as error:
+        raise _refusal(polygon, f"a triangle's corner {error} that is none of the polygon") from error
+    found = Triangulation(vertices, triangles, boundary)
+    clockwise = found.areas < 0.0
+    triangles[clockwise] = triangles[clockwise][:, ::-1]
+    _check(polygon, found)
+    for array in (vertices, triangles, boundary):
+        array.setflags(write=False)
+    return found
+
+
+def _refusal(polygon: Polygon, problem: str) -> ConfigurationError:
+    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", polygon.source)
+
+
+def _check(polygon: Polygon, found: Triangulation) -> None:
+    """Refuse a triangulation that does not conform to its polygon."""
+    # As one number per directed edge: tail * v + head.
+    v = len(found.vertices)
+    tails, heads = found.triangles.ravel(), np.roll(found.triangles, -1, axis=1).ravel()
+    edges, counts = np.unique(tails * v + heads, return_counts=True)
+    if (counts > 1).any():
+        raise _refusal(polygon, f"triangles that overlap at vertex {edges[counts > 1][0] // v}")
+    wanted = found.boundary[:, 0] * v + found.boundary[:, 1]
+    missing = ~np.isin(wanted, edges)
+    if missing.any():
+        tail, head = found.boundary[np.flatnonzero(missing)[0]].tolist()
+        raise _refusal(polygon, f"the edge from vertex {tail} to {head} lost")
+    inner = np.setdiff1d(edges, wanted)
+    if not np.isin(inner % v * v + inner // v, inner).all():
+        raise _refusal(polygon, "an edge inside that belongs to one triangle only")
+    total, area = float(found.areas.sum()), polygon.area
+    if abs(total - area) > 1e-9 * area + 1e-14 * float(np.ptp(found.vertices, axis=0).max()) ** 2:
+        raise _refusal(polygon, f"triangles of {total:.9g} m^2 in a shape of {area:.9g} m^2")

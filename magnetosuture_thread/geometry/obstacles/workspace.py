@@ -17,27 +17,21 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.contacts import (
     BALL,
     EDGES,
-    FACES,
     FRICTION,
     WorkspaceData,
     find_contacts,
     nearest_of,
 )
-from magnetosuture_thread.geometry.obstacles.features import Features, edges_of, faces_of
-from magnetosuture_thread.geometry.obstacles.search import (
-    MIN_DISTANCE,
-    ContactRows,
-    closest_in_space,
-    closest_on_segment,
-)
-from magnetosuture_thread.geometry.obstacles.shapes import MIN_EXTENT, Disc, Mesh, Obstacle, Polygon
+from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH, edges_of
+from magnetosuture_thread.geometry.obstacles.search import MIN_DISTANCE, ContactRows, closest_on_segment
+from magnetosuture_thread.geometry.obstacles.shapes import MIN_EXTENT, Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 
 _MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of features
 _MIN_CELLS = 200
 _MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
 MAX_FRICTION = 2.0  # a coefficient
-_INITIAL_ROWS = 256  # contacts that `near` has room for at first
+_MIN_ROWS, _ROWS_A_POINT = 4096, 16  # contacts that `near` has room for; a point in a narrow corner has two
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def plan_grid(low: Points, high: Points, reach: float, budget: int) -> Grid:
     return Grid(padded, size, cells, growth)
 
 
-def fill_grid(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
+def fill_grid(grid: Grid, low: Points, high: Points, edges: NDArray[np.float64]) -> tuple[NDArray[np.int64], ...]:
     """Return the features near each cell: starts, shape (cells + 1,), and feature numbers, ascending.
 
     A feature is listed when its box, grown, meets the cell's box, and it is itself as near as that to
@@ -103,7 +97,7 @@ def fill_grid(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64
         grid: the cells.
         low: least coordinates of each feature, shape (f, d) [m].
         high: greatest coordinates of each feature, shape (f, d) [m].
-        corners: features, shape (f, 2, 2) or (f, 3, 3), or (f, 0, d) to go by the boxes alone [m].
+        edges: of a polygon, shape (f, EDGE_WIDTH), or (f, 0) to go by the boxes alone [m].
     """
     dimension = low.shape[1]
     first = np.zeros((len(low), 3), dtype=np.int64)
@@ -113,7 +107,7 @@ def fill_grid(grid: Grid, low: Points, high: Points, corners: NDArray[np.float64
         cell = np.floor((edge - base) / grid.size)
         table[:, :dimension] = np.clip(cell, 0, grid.counts[:dimension] - 1).astype(np.int64)
     radius = grid.growth + 0.5 * grid.size * math.sqrt(dimension) * (1.0 + 1e-9)
-    arguments = (first, last, grid.counts, grid.low, grid.size, radius, np.ascontiguousarray(corners))
+    arguments = (first, last, grid.counts, grid.low, grid.size, radius, edges)
     starts = np.zeros(grid.cells + 1, dtype=np.int64)
     _visit_cells(*arguments, starts, np.empty(0, dtype=np.int64))
     starts = np.concatenate([[0], np.cumsum(starts[:-1])])
@@ -130,19 +124,18 @@ def _visit_cells(
     low: NDArray[np.float64],
     size: float,
     radius: float,
-    corners: NDArray[np.float64],
+    edges: NDArray[np.float64],
     cursor: NDArray[np.int64],
     entries: NDArray[np.int64],
 ) -> None:
     """Count the features of each cell in `cursor`, or, with room in `entries`, write them there."""
     for feature in range(len(first)):
         for k in range(first[feature, 2], last[feature, 2] + 1):
-            z = low[2] + (k + 0.5) * size
             for j in range(first[feature, 1], last[feature, 1] + 1):
                 y = low[1] + (j + 0.5) * size
                 for i in range(first[feature, 0], last[feature, 0] + 1):
                     x = low[0] + (i + 0.5) * size
-                    if corners.shape[1] > 0 and _distance(x, y, z, corners[feature]) > radius:
+                    if edges.shape[1] > 0 and _distance(x, y, edges[feature]) > radius:
                         continue
                     cell = i + counts[0] * (j + counts[1] * k)
                     if len(entries) > 0:
@@ -151,37 +144,10 @@ def _visit_cells(
 
 
 @compiled
-def _distance(x: float, y: float, z: float, corner: NDArray[np.float64]) -> float:
-    """Return the distance of a point from a segment in the plane, or from a triangle in space [m]."""
-    if len(corner) == 2:
-        u, v, _ = closest_on_segment(x, y, corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1])
-        return float(np.hypot(x - u, y - v))
-    a = (corner[0, 0], corner[0, 1], corner[0, 2])
-    b = (corner[1, 0], corner[1, 1], corner[1, 2])
-    c = (corner[2, 0], corner[2, 1], corner[2, 2])
-    u, v, w, _ = closest_in_space((x, y, z), a, b, c)
-    return float(np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2))
-
-
-class _FlatArray:
-    """Concatenates arrays and keeps the offset of each."""
-
-    def __init__(self) -> None:
-        self._parts: list[NDArray[np.generic]] = []
-        self.length = 0
-
-    def add(self, array: NDArray[np.generic]) -> int:
-        """Append an array; return where it begins."""
-        begin = self.length
-        self._parts.append(array.ravel())
-        self.length += array.size
-        return begin
-
-    def array(self, kind: type[np.generic]) -> NDArray[np.generic]:
-        """Return all in one array."""
-        if kind is np.int32 and self.length > np.iinfo(np.int32).max:
-            raise MemoryError(f"{self.length} entries of obstacles' grids")
-        return np.concatenate([np.empty(0, kind), *self._parts]).astype(kind)
+def _distance(x: float, y: float, edge: NDArray[np.float64]) -> float:
+    """Return the distance of a point from an edge [m]."""
+    u, v, _ = closest_on_segment(x, y, edge[0], edge[1], edge[2], edge[3])
+    return float(np.hypot(x - u, y - v))
 
 
 def pack_obstacles(
@@ -189,8 +155,8 @@ def pack_obstacles(
 ) -> WorkspaceData:
     """Return all obstacles with their grids in flat arrays.
 
-    Each obstacle has a grid of its own over its workspace, so that its cells fit its features; a grid over
-    all obstacles tells which of these a point is in, so that the far ones cost nothing.
+    Each polygon has a grid of its own, so that its cells fit its edges; a grid over all obstacles tells which of these
+    a point is in, so that the far ones cost nothing.
 
     Args:
         shapes: the obstacles, all of this dimension.
@@ -200,50 +166,44 @@ def pack_obstacles(
     """
     # A point on the boundary is found at reach 0 too, whichever way its distance is rounded.
     reach = max(reach, MIN_DISTANCE)
-    frames, tables = np.zeros((len(shapes) + 1, FRICTION + 1)), np.zeros((len(shapes) + 1, 9), dtype=np.int64)
-    index, numbers = _FlatArray(), _FlatArray()
+    frames, tables = np.zeros((len(shapes) + 1, FRICTION + 1)), np.zeros((len(shapes) + 1, 7), dtype=np.int64)
     low, high = np.empty((len(shapes), dimension)), np.empty((len(shapes), dimension))
-    features: dict[int, Features] = {}
+    numbers, cells = [np.empty((0, EDGE_WIDTH))], [np.empty(0, np.int64)]
+    edges = {o: edges_of(shape).numbers for o, shape in enumerate(shapes) if not isinstance(shape, Disc)}
+    total = sum(map(len, edges.values()))
+
+    def add_grid(row: int, grid: Grid, starts: NDArray[np.int64], entries: NDArray[np.int64]) -> None:
+        """Append entries and cells, none of them inside yet."""
+        frames[row, :FRICTION] = [*grid.low.tolist(), 1.0 / grid.size, grid.growth, 0.0]
+        begin = sum(map(len, cells))
+        tables[row, 1:5] = [*grid.counts, begin + len(entries)]
+        cells.extend((entries, np.stack([starts + begin, np.zeros_like(starts)], axis=1).ravel()))
+
     for o, shape in enumerate(shapes):
         if isinstance(shape, Disc):
             frames[o + 1, :dimension], frames[o + 1, 5] = shape.centre, shape.radius
             tables[o + 1, 0] = BALL
             grown = (shape.radius + reach) * (1.0 + 1e-9) + 1e-12
             low[o], high[o] = np.array(shape.centre) - grown, np.array(shape.centre) + grown
-        else:
-            features[o] = edges_of(shape) if isinstance(shape, Polygon) else faces_of(shape)
-    total = sum(len(found.corners) for found in features.values())
-    for o, found in features.items():
-        least, most = found.corners.min(axis=1), found.corners.max(axis=1)
-        grid = plan_grid(least, most, reach, max(_MAX_CELLS * len(least) // total, _MIN_CELLS))
-        frames[o + 1, :FRICTION] = _frame(grid)
-        kind = EDGES if isinstance(shapes[o], Polygon) else FACES
-        cells = _add_cells(index, *fill_grid(grid, least, most, found.corners))
-        starts = numbers.add(found.numbers), index.add(found.marks), numbers.add(found.spokes)
-        tables[o + 1] = [kind, *grid.counts, cells, len(least), *starts]
+            continue
+        ends = edges[o][:, :4].reshape(-1, 2, 2)
+        least, most = ends.min(axis=1), ends.max(axis=1)
+        grid = plan_grid(least, most, reach, max(_MAX_CELLS * len(ends) // total, _MIN_CELLS))
+        add_grid(o + 1, grid, *fill_grid(grid, least, most, edges[o]))
+        tables[o + 1, 0], tables[o + 1, 5:] = EDGES, (len(ends), sum(table.size for table in numbers))
+        numbers.append(edges[o])
         low[o], high[o] = least.min(axis=0) - grid.growth, most.max(axis=0) + grid.growth
     if shapes:
         over = plan_grid(low, high, 0.0, _MAX_OVERVIEW_CELLS)
         # The boxes are grown already: only rounding is left to allow for.
         over = dataclasses.replace(over, growth=1e-6 * over.size)
-        frames[0, :FRICTION] = _frame(over)
-        cells = _add_cells(index, *fill_grid(over, low, high, np.empty((len(low), 0, dimension))))
-        tables[0, :5] = [-1, *over.counts, cells]
-    flat = np.asarray(numbers.array(np.float64)), np.asarray(index.array(np.int32))
+        add_grid(0, over, *fill_grid(over, low, high, np.empty((len(low), 0))))
+        tables[0, 0] = -1
+    flat = np.concatenate(numbers).ravel(), np.concatenate(cells).astype(np.int32)
     data = WorkspaceData(reach, float(wall_radius), frames, tables, *flat)
-    for o in features:
+    for o in edges:
         _mark_inside(o, data, ContactRows(np.empty(0), np.empty((0, dimension))))
     return data
-
-
-def _frame(grid: Grid) -> list[float]:
-    return [*grid.low.tolist(), 1.0 / grid.size, grid.growth, 0.0]
-
-
-def _add_cells(index: _FlatArray, starts: NDArray[np.int64], entries: NDArray[np.int64]) -> int:
-    """Append entries and cells, none of them inside yet; return where the cells begin."""
-    begin = index.add(entries)
-    return index.add(np.stack([starts + begin, np.zeros_like(starts)], axis=1))
 
 
 @compiled
@@ -255,18 +215,16 @@ def _mark_inside(obstacle: int, data: WorkspaceData, rows: ContactRows) -> None:
     """
     frame, table, entries = data.frames[obstacle + 1], data.tables[obstacle + 1], data.entries
     size = 1.0 / frame[3]
-    for k in range(table[3]):
-        z = frame[2] + (k + 0.5) * size if rows.normal.shape[1] == 3 else 0.0
-        for j in range(table[2]):
-            y = frame[1] + (j + 0.5) * size
-            inside = 0
-            for i in range(table[1]):
-                x = frame[0] + (i + 0.5) * size
-                cell = table[4] + 2 * (i + table[1] * (j + table[2] * k))
-                found = nearest_of((x, y, z), -1.0, obstacle, entries[cell], entries[cell + 2], data, 0, rows)
-                if np.sqrt(found.square) <= frame[4]:
-                    inside = 1 if found.signed < 0.0 else 0
-                entries[cell + 1] = inside
+    for j in range(table[2]):
+        y = frame[1] + (j + 0.5) * size
+        inside = 0
+        for i in range(table[1]):
+            x = frame[0] + (i + 0.5) * size
+            cell = table[4] + 2 * (i + table[1] * j)
+            found = nearest_of((x, y, 0.0), -1.0, obstacle, entries[cell], entries[cell + 2], data, 0, rows)
+            if np.sqrt(found.square) <= frame[4]:
+                inside = 1 if found.signed < 0.0 else 0
+            entries[cell + 1] = inside
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +254,7 @@ class Workspace:
     """Obstacles that do not move and the round wall of the dish about the origin, and what of them is near.
 
     Args:
-        shapes: the obstacles: discs, polygons (in the plane only) and meshes (in space only).
+        shapes: the obstacles: discs, which are balls in space, and polygons, in the plane only.
         reach: greatest distance at which a boundary is near, not negative [m].
         dimension: 2 or 3.
         wall_radius: inner radius of the wall, in space a cylinder along z; inf without a wall [m].
@@ -333,7 +291,6 @@ class Workspace:
         _check_friction(self.friction, wall_friction, len(self.shapes), dimension)
         self.data = pack_obstacles(self.shapes, self.reach, dimension, self.wall_radius)
         self.data.frames[:, FRICTION] = wall_friction, *self.friction
-        self._max_rows = _INITIAL_ROWS
 
     def near(self, points: Points) -> Contacts:
         """Return the contacts of points: every local minimum of the distance to an obstacle's boundary.
@@ -358,14 +315,12 @@ class Workspace:
         points = np.array(points, dtype=np.float64, order="C")
         if points.ndim != 2 or points.shape[1] != self.dimension:
             raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
-        while True:
-            node, obstacle = np.empty(self._max_rows, np.int64), np.empty(self._max_rows, np.int64)
-            distance, normal = np.empty(self._max_rows), np.empty((self._max_rows, self.dimension))
-            nearest = np.empty(self._max_rows, np.bool_)
-            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
-            if count >= 0:
-                break
-            self._max_rows *= 2
+        room = _MIN_ROWS + _ROWS_A_POINT * len(points)
+        node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
+        distance, normal = np.empty(room), np.empty((room, self.dimension))
+        count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
+        if count < 0:
+            raise ValueError(f"more than {room} contacts of {len(points)} points; expected a smaller reach")
         found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
         for array in found:
             array.setflags(write=False)
@@ -384,7 +339,5 @@ def _check(name: str, shape: Obstacle, dimension: int) -> None:
     if isinstance(shape, Disc):
         if len(shape.centre) != dimension:
             raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} coordinates [m]")
-    elif isinstance(shape, Polygon) and dimension != 2:
-        raise ConfigurationError(name, "a polygon", "a disc or a mesh in space")
-    elif isinstance(shape, Mesh) and dimension != 3:
-        raise ConfigurationError(name, "a mesh", "a disc or a polygon in the plane; a mesh needs dimension=3")
+    elif dimension != 2:
+        raise ConfigurationError(name, "a polygon", "a disc with three coordinates, which is a ball, in space")

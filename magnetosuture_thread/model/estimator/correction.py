@@ -34,7 +34,7 @@ from magnetosuture_thread.model.estimator.association import MeasuredPoints
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.model.formulations.rod_step import STRAIN_TOLERANCE, RodProperties, segment_rows
-from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
+from magnetosuture_thread.model.formulations.step_buffers import CONTACTS_PER_NODE, StepBuffers, program_of
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.solvers import BandedSolver, banded
 
@@ -43,7 +43,6 @@ Vector = NDArray[np.float64]
 AXES = (0, 1)
 MAX_SOLVES = 8  # of a correction
 MAX_REWEIGHTED = 3  # of them with new robust weights
-MAX_CONTACTS = 16  # rows of contacts, for each node
 RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 NEIGHBOURS = 2  # on each side of a point, that it is compared with
@@ -98,9 +97,9 @@ class CorrectionBuffers(NamedTuple):
     covariance: NDArray[np.float64]
 
     @classmethod
-    def of(cls, nodes: int, max_contacts: int) -> CorrectionBuffers:
-        """Return buffers for a thread of so many nodes, and so many contacts."""
-        program = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1, max_contacts)
+    def of(cls, nodes: int) -> CorrectionBuffers:
+        """Return buffers for a thread of so many nodes."""
+        program = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1)
         return cls(
             program,
             BandedSolver().buffers(nodes, 2, len(program.first)),
@@ -417,7 +416,7 @@ class Corrector:
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
         nodes = predictor.thread.segments + 1
-        self._formulation, self.work = formulation, CorrectionBuffers.of(nodes, MAX_CONTACTS * nodes)
+        self._formulation, self.work = formulation, CorrectionBuffers.of(nodes)
         self.work.known[[0, *predictor.fixed_nodes]] = True
         self._last: tuple[Prior, MeasuredPoints, float]
 
@@ -430,7 +429,7 @@ class Corrector:
         self._last = (prior, points, scale)
         problem = ""
         if code == NO_ROOM:
-            problem = f"the correction has more than {MAX_CONTACTS} contacts a node"
+            problem = f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
         elif code != CORRECTED or off > 1.0:
             problem = f"the correction was not solved: residual {residual:.1e}, off by {off:.1g}"
         return CorrectionResult(solves, residual, problem)

@@ -9,7 +9,13 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.model.formulations.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.model.formulations.rod import RodFormulation
-from magnetosuture_thread.model.formulations.step import Formulation, PrescribedMotion, StepResult, ThreadState
+from magnetosuture_thread.model.formulations.step import (
+    Formulation,
+    PrescribedMotion,
+    StepResult,
+    ThreadState,
+    WarmStart,
+)
 from magnetosuture_thread.model.program import Solver
 from magnetosuture_thread.model.thread import Thread
 
@@ -22,6 +28,7 @@ __all__ = [
     "RodFormulation",
     "StepResult",
     "ThreadState",
+    "WarmStart",
     "make_formulation",
 ]
 

@@ -26,33 +26,28 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier, CompiledBarrier
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles import WALL, Workspace, WorkspaceData
+from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.geometry.obstacles import WALL, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.barriers import (
     Connectivity,
     EnhancedConnectivity,
     Stiffness,
-    distance_barrier,
-    moved_inside,
+    move_inside,
     squared_barrier,
-    stiffness_function,
 )
-from magnetosuture_thread.model.formulations.added_rows import LinearRows
 from magnetosuture_thread.model.formulations.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
 from magnetosuture_thread.model.formulations.step import (
+    AddedRows,
     Formulation,
     PrescribedMotion,
     StepResult,
     ThreadState,
-    move_prescribed,
 )
-from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
+from magnetosuture_thread.model.formulations.step_buffers import program_of
 from magnetosuture_thread.model.mechanics import rest_distances
-from magnetosuture_thread.model.program import Solver, Vector
+from magnetosuture_thread.model.program import SPAN, Mask, Solver
 from magnetosuture_thread.model.thread import Thread
 
 
@@ -108,33 +103,31 @@ class PaperFormulation(Formulation):
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
-        unit, options = self._thread.segment_length, self._options
+        unit, options, buffers = self._thread.segment_length, self._options, self._buffers
         options = options._replace(
             gain=min(options.gain, 1.0 / interval), stiffness_gain=min(options.stiffness_gain, 1.0 / interval)
         )
-        before, velocities = state.positions / unit, state.velocities / unit
-        moved, known = move_prescribed(before, *drive.arrays(), unit)
+        before, velocities = np.ascontiguousarray(state.positions / unit), state.velocities / unit
+        moved, known, nodes = before.copy(), np.zeros(len(before), np.bool_), list(drive.nodes)
+        known[nodes] = True
+        moved[nodes] = drive.arrays()[1] / unit
         start = moved if options.lead_ahead else before
         if state.interval == 0.0:
-            self._buffers.forget()
-        while True:
-            contacts, before_depth = _assemble(
-                self._buffers, self._near.data, start, velocities, known, self._rest, unit, self._radius, options
-            )
-            if contacts >= 0:
-                break
-            self._buffers = self._buffers.enlarged()
-        added: LinearRows | None = None
+            buffers.forget()
+        self._write_objective(velocities, options)
+        self._write_barriers(start, options)
+        contacts, before_depth = self._write_obstacles(start, known, options.gain)
+        added: AddedRows | None = None
         if self.added:
             self.added.begin(state.positions, drive.time, interval)
             added = self.added.linearised(start, moved, known, interval)
-        solution = self._solve(contacts, known, velocities, added)
-        keep_multipliers(self._buffers, solution.multipliers[: self._rows + contacts], self._rows)
+        solution = self._solve(program_of(buffers, known, self._rows + contacts), velocities, added)
+        keep_multipliers(buffers, solution.multipliers[: self._rows + contacts], self._rows)
         end = moved + interval * solution.velocities
-        moved_inside(end, known, self._wall_radius)
+        move_inside(end, known, self._wall_radius)
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
         # The hard barriers, h(x + dt u) >= (1 - alpha dt) h(x), where the obstacles themselves are.
-        near = self._near.near(after.positions)
+        near = self.workspace.near(after.positions)
         depth = max(0.0, self._radius - float(near.distance[~known[near.node]].min(initial=self._radius)))
         allowed = (1.0 - options.gain * interval) * before_depth + DEPTH_TOLERANCE
         converged, status = depth <= allowed, solution.status
@@ -142,53 +135,49 @@ class PaperFormulation(Formulation):
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
         return StepResult(after, solution.solver, status, solution.residuals, 1, converged)
 
-    def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
+    def _write_objective(self, velocities: Points, options: PaperOptions) -> None:
+        """Write P = I and q = -kappa v."""
+        self._buffers.blocks[:], self._buffers.couplings[:] = np.eye(self.dimension), 0.0
+        self._buffers.linear[:] = -options.damping * velocities
+
+    def _write_barriers(self, start: Points, options: PaperOptions) -> None:
+        """Write the rows of connectivity, enhanced connectivity and stiffness, with their slacks as compliances."""
+        connectivity, stiffness = 1.0 / options.connectivity_weight, 1.0 / options.stiffness_weight
+        row, buffers = 0, self._buffers
+        for barrier, gain, compliance in (
+            (Connectivity(1.0), options.gain, connectivity),
+            (EnhancedConnectivity(1.0), options.gain, connectivity),
+            (Stiffness(self._rest), options.stiffness_gain, stiffness),
+        ):
+            rows = barrier.rows(start)
+            part = slice(row, row + len(rows.value))
+            first = np.minimum(rows.nodes[:, 0], len(start) - SPAN)
+            buffers.first[part], buffers.gradient[part] = first, 0.0
+            index = np.arange(row, part.stop)[:, None]
+            buffers.gradient[index, rows.nodes - first[:, None]] = rows.gradient
+            buffers.lower[part], buffers.upper[part] = -gain * rows.value, np.inf
+            buffers.compliance[part] = compliance
+            row = part.stop
+
+    def _write_obstacles(self, start: Points, known: Mask, gain: float) -> tuple[int, float]:
+        """Write the rows of obstacles and wall; return how many there are, and the greatest depth of a node [m]."""
+        unit, radius, buffers, first = self._thread.segment_length, self._radius, self._buffers, self._rows
+        workspace = self.workspace.data
+        contacts, depth = contact_rows(buffers, first, workspace, start, start, known, 1.0 / gain, unit, radius, False)
+        if contacts < 0:
+            self._refuse_contacts()
+        for row in range(first, first + contacts):
+            clearance = buffers.value[row]
+            if clearance > 0.0 and buffers.contacts.obstacle[row - first] != WALL:
+                # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
+                signed = clearance + radius / unit
+                buffers.lower[row] = -gain * squared_barrier(signed, radius / unit) / signed
+        return contacts, depth
+
+    def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
         """Return connectivities and stiffness; see `Formulation`. There is none of compression in this formulation.
 
         Connectivity may give way, as the paper's has slack; what is left of it is what the margins say.
         """
         unit = self._thread.segment_length
         return [Connectivity(unit), EnhancedConnectivity(unit), Stiffness(unit * self._rest)]
-
-
-@compiled
-def _assemble(
-    buffers: StepBuffers,
-    workspace: WorkspaceData,
-    start: Points,
-    velocities: Points,
-    known: NDArray[np.bool_],
-    rest: Vector,
-    unit: float,
-    radius: float,
-    options: PaperOptions,
-) -> tuple[int, float]:
-    """Write the program; return contacts, -1 if there is no room for them, and the greatest depth of a node [m]."""
-    nodes, dimension = start.shape
-    segments, gain = nodes - 1, options.gain
-    buffers.couplings[:] = 0.0
-    for i in range(nodes):
-        for a in range(dimension):
-            for b in range(dimension):
-                buffers.blocks[i, a, b] = 1.0 if a == b else 0.0
-            buffers.linear[i, a] = -options.damping * velocities[i, a]
-    enhanced, stiff = segments, 2 * segments - 1
-    rows = 3 * segments - 2
-    one = np.ones(segments)
-    distance_barrier(start, 1, one, buffers.value, buffers.gradient)
-    distance_barrier(start, 2, 2.0 * one, buffers.value[enhanced:], buffers.gradient[enhanced:])
-    stiffness_function(start, rest, buffers.value[stiff:], buffers.gradient[stiff:])
-    for r in range(rows):
-        node = r if r < enhanced else (r - enhanced if r < stiff else r - stiff)
-        buffers.first[r] = min(node, nodes - 3)
-        buffers.lower[r] = -(gain if r < stiff else options.stiffness_gain) * buffers.value[r]
-        buffers.upper[r] = np.inf
-        buffers.compliance[r] = 1.0 / (options.connectivity_weight if r < stiff else options.stiffness_weight)
-    contacts, depth = contact_rows(buffers, rows, workspace, start, start, known, 1.0 / gain, unit, radius, False)
-    for r in range(rows, rows + contacts):
-        clearance = buffers.value[r]
-        if clearance > 0.0 and buffers.obstacle[r - rows] != WALL:
-            # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
-            value, slope = squared_barrier(clearance + radius / unit, radius / unit)
-            buffers.lower[r] = -gain * value / slope
-    return contacts, depth

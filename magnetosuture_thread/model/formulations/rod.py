@@ -32,39 +32,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier, CompiledBarrier
+from magnetosuture_thread.barrier import Barrier
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
 from magnetosuture_thread.model.barriers import Compression, Connectivity
-from magnetosuture_thread.model.forces import ThreadForces
-from magnetosuture_thread.model.formulations.added_rows import LinearRows
-from magnetosuture_thread.model.formulations.friction_rows import friction_of, knows_friction
-from magnetosuture_thread.model.formulations.rod_forces import write_forces
+from magnetosuture_thread.model.forces import ThreadForces, friction_of, write_forces
+from magnetosuture_thread.model.formulations.contact_rows import knows_friction
 from magnetosuture_thread.model.formulations.rod_step import (
     ENDED,
+    MAX_SOLVES,
     NO_ROOM,
-    MotionBuffers,
     RodProperties,
+    StepInput,
+    StepModel,
     accept_step,
     solve_step,
 )
 from magnetosuture_thread.model.formulations.step import (
+    AddedRows,
     Formulation,
     PrescribedMotion,
     StepResult,
     ThreadState,
 )
-from magnetosuture_thread.model.formulations.step_buffers import StepBuffers
-from magnetosuture_thread.model.program import SOLVED, Residuals, Solver, Vector
+from magnetosuture_thread.model.formulations.step_buffers import program_of
+from magnetosuture_thread.model.program import SOLVED, Mask, Residuals, Solver, Vector
 from magnetosuture_thread.model.self_contact import SelfContact
 from magnetosuture_thread.model.solvers import BandedSolver, FallbackSolver, banded
-from magnetosuture_thread.model.thread import Attachment, Medium, Thread
-
-MAX_SOLVES = 8  # in a step
+from magnetosuture_thread.model.thread import Attachment, Thread
 
 
 class RodFormulation(Formulation):
@@ -72,6 +70,9 @@ class RodFormulation(Formulation):
 
     Raises:
         ConfigurationError: gravity or flow has not one value for each dimension.
+
+    Attributes:
+        rod: the thread, for compiled code.
     """
 
     name = "rod"
@@ -86,13 +87,8 @@ class RodFormulation(Formulation):
         barriers: Sequence[Barrier] = (),
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
-        dimension = self.dimension
         medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
-        if len(medium.gravity) not in (0, dimension):
-            raise ConfigurationError("medium.gravity", medium.gravity, f"{dimension} values, or none")
-        gravity = np.zeros(dimension)
-        gravity[: len(medium.gravity)] = medium.gravity
-        self._rod = RodProperties(
+        self.rod = RodProperties(
             clamped,
             thread.segment_length,
             self._radius,
@@ -101,35 +97,28 @@ class RodFormulation(Formulation):
             medium.drag_along,
             medium.mass_per_length,
             medium.bending_damping,
-            gravity,
+            self._vector("gravity", medium.gravity),
             np.ascontiguousarray(thread.rest_angles),
             mechanics.end_corrected_weights(thread.segments),
             mechanics.bending_bands(thread.segments, clamped),
-            self._flow(medium),
+            self._vector("flow", medium.flow),
         )
-        self._axes, (self._banded, self._accepted) = (0, 1, 2)[:dimension], _structured(solver, tolerance)
+        first = solver.first if type(solver) is FallbackSolver else solver
+        self._structured = type(first) is BandedSolver  # another one's way of solving is its own
+        self._solver_buffers = BandedSolver().buffers(thread.segments + 1, self.dimension, len(self._buffers.first))
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
         self._self_contact = selves[0] if selves else None
         self.touches_itself = bool(selves)
-        self._waits = len(barriers) == len(selves)  # there are no added rows until the thread touches itself
-        if not self._waits:  # compiled code knows nothing of their rows, and leaves every solve to `step`
-            self._banded = BandedSolver(iterations=0)
-        self._rubs = knows_friction(self._near.data)
-        self._motion = MotionBuffers.of(thread.segments + 1, dimension)
-        self._use(self._buffers)
+        self._only_self_contact = len(barriers) == len(selves)
+        self._rough = knows_friction(self.workspace.data)
 
     @property
-    def nodes_in_contact(self) -> NDArray[np.bool_]:
+    def nodes_in_contact(self) -> Mask:
         """Which nodes shapes or wall pushed in the last step, at a node or on a chord beside it, shape (n + 1,)."""
         at_nodes, on_chords = self._buffers.push > 0.0
         at_nodes |= on_chords
         at_nodes[1:] |= on_chords[:-1]
         return np.asarray(at_nodes)
-
-    @property
-    def rod(self) -> RodProperties:
-        """The thread, for compiled code."""
-        return self._rod
 
     def set_thread(self, thread: Thread) -> None:
         """Change stiffness, rest curvature and medium from the next step on; the chain itself stays as it is.
@@ -137,25 +126,24 @@ class RodFormulation(Formulation):
         Args:
             thread: of the same length, segments, diameter and attachment.
         """
-        self._thread, self._rod = thread, self.rod_of(thread)
+        self._thread, self.rod = thread, self.rod_of(thread)
 
     def rod_of(self, thread: Thread) -> RodProperties:
         """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
         medium = thread.medium
-        return self._rod._replace(
+        return self.rod._replace(
             bending_stiffness=thread.bending_stiffness,
             drag_across=medium.drag_across,
             drag_along=medium.drag_along,
             rest_angles=np.ascontiguousarray(thread.rest_angles),
-            flow=self._flow(medium),
+            flow=self._vector("flow", medium.flow),
         )
 
-    def _flow(self, medium: Medium) -> Vector:
-        if len(medium.flow) not in (0, self.dimension):
-            raise ConfigurationError("medium.flow", medium.flow, f"{self.dimension} values, or none")
-        flow = np.zeros(self.dimension)
-        flow[: len(medium.flow)] = medium.flow
-        return flow
+    def _vector(self, name: str, values: tuple[float, ...]) -> Vector:
+        """Return a vector of the medium, zeros where it has none."""
+        if len(values) not in (0, self.dimension):
+            raise ConfigurationError(f"medium.{name}", values, f"{self.dimension} values, or none")
+        return np.array(values) if values else np.zeros(self.dimension)
 
     def check_start(self, positions: Points) -> None:
         """Refuse a thread that crosses itself where it cannot; see `Formulation`."""
@@ -166,79 +154,70 @@ class RodFormulation(Formulation):
             raise InvalidInputError("thread's nodes", given, "a thread that does not cross itself, as the scene has it")
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
-        """Move the prescribed nodes and let the thread follow; see `Formulation`."""
-        unit, motion = self._thread.segment_length, self._motion
+        """Move the prescribed nodes and let the thread follow; see `Formulation`.
+
+        Compiled code takes the step as long as the structured solver gets on with it. The rows of added barriers are
+        in the program from where it ends without them and one is not met.
+        """
+        unit, buffers = self._thread.segment_length, self._buffers
         if state.interval == 0.0:
-            self._buffers.forget()
+            buffers.forget()
         # Compiled code would be compiled anew for another layout, in the middle of a run.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
-        nodes, ends = drive.arrays()
+        given = StepInput(positions, velocities, *drive.arrays(), drive.heading, interval, state.interval)
+        model = self.step_model()._replace(structured=self._structured)
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
-        added: LinearRows | None = None
-        takes_rows, max_solves, solver_buffers = not self._waits, MAX_SOLVES, self._solver_buffers
+        added: AddedRows | None = None
+        off = 0.0  # how far the added rows are from being met
         if self.added:
             self.added.begin(positions, drive.time, interval)
         while True:
-            code, contacts, solves, off, number, residuals = solve_step(
-                self._axes,
-                self._rod,
-                self._buffers,
-                self._near.data,
-                solver_buffers,
-                motion,
-                positions,
-                velocities,
-                nodes,
-                ends,
-                drive.heading,
-                interval,
-                state.interval,
-                self._accepted,
-                max_solves,
-                solves,
-                added.off if added is not None else 0.0,
-            )
-            worst, status = worst.or_worse(Residuals(*residuals)), status if status != SOLVED else banded.STATUS[number]
-            if code == ENDED:
-                if self.added and not takes_rows:
-                    added = self.added.linearised(motion.about, motion.start, motion.known, interval)
-                    if added.off > 1.0:  # it is solved again, with the rows of where it would touch itself
-                        takes_rows, max_solves = True, solves + MAX_SOLVES
-                        solver_buffers = self._solver_buffers._replace(iterations=0)
+            done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
+            worst, solves = worst.or_worse(Residuals(*done.residuals)), done.solves
+            status = status if status != SOLVED else banded.STATUS[done.status]
+            if done.code == NO_ROOM:
+                self._refuse_contacts()
+            if done.code == ENDED:
+                if self.added and added is None:
+                    added = self._linearised(interval)
+                    if added.unmet:
+                        model, off = model._replace(structured=False, max_solves=solves + MAX_SOLVES), np.inf
                         continue
                 break
-            if code == NO_ROOM:
-                self._use(self._buffers.enlarged())
-                solver_buffers = self._solver_buffers._replace(iterations=solver_buffers.iterations)
-                continue
-            if takes_rows:
-                added = added or self.added.linearised(motion.about, motion.start, motion.known, interval)
-            solution = self._solve(contacts, motion.known, motion.velocities, added)
-            own = solution.multipliers[: self._rows + contacts]
-            accept_step(self._buffers, self._near.data, motion, solution.velocities, own, interval)
+            program = program_of(buffers, buffers.known, self._rows + done.contacts)
+            solution = self._solve(program, buffers.velocities, added)
+            own, pushes = np.split(solution.multipliers, [len(program.lower)])
+            accept_step(buffers, self.workspace.data, solution.velocities, own, interval)
             if added is not None:
-                pushes = solution.multipliers[self._rows + contacts :] if self._waits else np.zeros(len(added.lower))
-                forces = added.force(pushes, motion.about.shape)
-                self._buffers.contact_force[:] += forces
-                self._buffers.tail_load[:] += forces[0]
-                added = self.added.linearised(motion.about, motion.start, motion.known, interval)
+                if self._only_self_contact:
+                    buffers.contact_force[:] += added.force(pushes, positions.shape)
+                    buffers.tail_load[:] += added.force(pushes, positions.shape)[0]
+                added = self._linearised(interval)
+                off = added.off
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
-        end = ThreadState(motion.about * unit, (motion.about - motion.before) * (unit / interval), interval)
-        if off > 1.0:
-            status = f"not converged in {solves} linearisations, off by {off:.1g} times what is allowed; {status}"
-        buffers = self._buffers
+        end = ThreadState(buffers.about * unit, (buffers.about - buffers.before) * (unit / interval), interval)
+        if done.off > 1.0:
+            words = f"not converged in {solves} linearisations, off by {done.off:.1g} times what is allowed"
+            status = f"{words}; {status}"
         loads = buffers.internal.copy(), buffers.contact_force.copy(), buffers.tail_load.copy()
-        grip = buffers.grip.copy() if self._rubs else None
-        passed = off > 1.0 and self._self_contact is not None and self._self_contact.passed(positions, end.positions)
-        return StepResult(end, solver, status, worst, solves, off <= 1.0, loads, grip, passed)
+        grip, own_way = buffers.grip.copy() if self._rough else None, self._self_contact
+        passed = done.off > 1.0 and own_way is not None and own_way.passed(positions, end.positions)
+        return StepResult(end, solver, status, worst, solves, done.off <= 1.0, loads, grip, passed)
+
+    def step_model(self) -> StepModel:
+        """Return the thread and what is around it, for compiled code."""
+        return StepModel((0, 1, 2)[: self.dimension], self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
+
+    def _linearised(self, interval: float) -> AddedRows:
+        return self.added.linearised(self._buffers.about, self._buffers.start, self._buffers.known, interval)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
         assert result.loads is not None
-        rod, state, (internal, contact, load) = self._rod, result.state, result.loads
+        rod, state, (internal, contact, load) = self.rod, result.state, result.loads
         scale = (rod.drag_across + rod.mass_per_length / state.interval) * rod.unit**2
         tension, force = np.empty(len(internal) - 1), np.empty(self.dimension)
         positions, velocities = state.positions / rod.unit, state.velocities
@@ -252,37 +231,18 @@ class RodFormulation(Formulation):
     def warm_up(self) -> None:
         """Load what follows where the structured solver does not get on with a step; see `Formulation`."""
         super().warm_up()
-        velocities, multipliers = self._motion.velocities.copy(), np.zeros(self._rows)
-        accept_step(self._buffers, self._near.data, self._motion, velocities, multipliers, 1.0)
-        buffers, heading = self._motion, np.eye(self.dimension)[0]
-        chain = np.outer(np.arange(self._thread.segments + 1.0), heading)
-        internal, tension = np.zeros_like(chain), np.zeros(self._thread.segments)
-        written = np.zeros(self.dimension)
-        write_forces(self._rod, chain, buffers.velocities, heading, internal, written, 1.0, tension, written)
-
-    def _use(self, buffers: StepBuffers) -> None:
-        """Use buffers for the step, and as much for the structured solver."""
-        self._buffers = buffers
-        self._solver_buffers = self._banded.buffers(self._thread.segments + 1, self.dimension, len(buffers.first))
+        nodes, heading = self._thread.segments + 1, np.eye(self.dimension)[0]
+        still, chain = np.zeros((nodes, self.dimension)), np.outer(np.arange(nodes), heading)
+        accept_step(self._buffers, self.workspace.data, still, np.zeros(self._rows), 1.0)
+        tension, force = np.zeros(self._rows), np.zeros(self.dimension)
+        write_forces(self.rod, chain, still, heading, still, force, 1.0, tension, force)
 
     def rest_lengths(self, positions: Points, heading: Points) -> Vector:
         """Return the chords of the segments' arcs; see `Formulation`."""
         chords = np.empty(self._thread.segments)
-        mechanics.chord_lengths(positions / self._thread.segment_length, heading, self._rod.clamped, chords)
+        mechanics.chord_lengths(positions / self._thread.segment_length, heading, self.rod.clamped, chords)
         return chords * self._thread.segment_length
 
-    def segment_barriers(self, positions: Points, heading: Points) -> list[CompiledBarrier]:
+    def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
         """Return connectivity and compression; see `Formulation`."""
         return [Connectivity(self._thread.segment_length), Compression(self.rest_lengths(positions, heading))]
-
-
-def _structured(solver: Solver, tolerance: float) -> tuple[BandedSolver, float]:
-    """Return the structured solver if it is the first to be tried, else one that does nothing.
-
-    A step does not leave compiled code for it while its residuals are within the tolerance that is returned
-    too. Of its subclasses nobody knows how they solve.
-    """
-    first = solver
-    if type(solver) is FallbackSolver:
-        first, tolerance = solver.first, min(tolerance, solver.tolerance)
-    return first if type(first) is BandedSolver else BandedSolver(iterations=0), tolerance

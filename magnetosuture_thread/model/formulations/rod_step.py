@@ -5,35 +5,53 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model import mechanics
-from magnetosuture_thread.model.barriers import distance_barrier, moved_inside
+from magnetosuture_thread.model.barriers import move_inside
+from magnetosuture_thread.model.forces import keep_internal_forces
 from magnetosuture_thread.model.formulations.contact_rows import (
     DEPTH_TOLERANCE,
     contact_rows,
+    friction_rows,
+    keep_grips,
     keep_multipliers,
+    knows_friction,
     stays_clear,
 )
-from magnetosuture_thread.model.formulations.friction_rows import friction_rows, keep_grips, knows_friction
-from magnetosuture_thread.model.formulations.internal_forces import keep_internal_forces
-from magnetosuture_thread.model.formulations.step import move_prescribed
-from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
-from magnetosuture_thread.model.program import Vector
+from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_view
+from magnetosuture_thread.model.program import Indices, Mask, Table, Vector
 from magnetosuture_thread.model.solvers import banded
 
 STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
 COMPLIANCE = 1e-7  # of a segment
 FRICTION_TOLERANCE = 0.003  # of the limits of friction; beyond it they are taken from the solve and it is repeated
 MAX_FRICTION_SOLVES = 5  # of a step; then the limits are those of the solve before
+MAX_SOLVES = 8  # of a step
 MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
+ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
 
 
 class RodProperties(NamedTuple):
-    """What stays the same from step to step, for compiled code."""
+    """What stays the same from step to step, for compiled code; D is the segment length.
+
+    Attributes:
+        clamped: whether the thread leaves along the needle's axis.
+        unit: D [m].
+        radius: rho, of the thread [m].
+        bending_stiffness: EI [N m^2].
+        drag_across: zeta_perp [Pa s].
+        drag_along: zeta_par [Pa s].
+        mass_per_length: mu [kg/m].
+        bending_damping: tau [s].
+        gravity: shape (d,) [m/s^2].
+        rest_angles: theta_i, shape (n - 1,) [rad].
+        weights: of the nodes, see `mechanics.end_corrected_weights`, shape (n + 1,).
+        bands: of the bending Hessian, see `mechanics.bending_bands`, shape (4, n + 1).
+        flow: w of the medium, shape (d,) [m/s].
+    """
 
     clamped: bool
     unit: float
@@ -46,8 +64,28 @@ class RodProperties(NamedTuple):
     gravity: Vector
     rest_angles: Vector
     weights: Vector
-    bands: NDArray[np.float64]
+    bands: Table
     flow: Vector
+
+
+class StepModel(NamedTuple):
+    """The thread and what is around it, for compiled code.
+
+    Attributes:
+        axes: 0 to d - 1.
+        rod: the thread.
+        workspace: obstacles and wall, with the reach of the program's rows [m].
+        tolerance: the largest residual with which a solution is accepted.
+        max_solves: of a step.
+        structured: whether the structured solver is to solve; if not, every solve is left to the caller.
+    """
+
+    axes: banded.Axes
+    rod: RodProperties
+    workspace: WorkspaceData
+    tolerance: float
+    max_solves: int = MAX_SOLVES
+    structured: bool = True
 
 
 class StepInput(NamedTuple):
@@ -65,84 +103,63 @@ class StepInput(NamedTuple):
 
     positions: Points
     velocities: Points
-    nodes: NDArray[np.int64]
+    nodes: Indices
     ends: Points
     heading: Points
     interval: float
     last_interval: float
 
 
-class MotionBuffers(NamedTuple):
-    """A step under way, in units of the segment length; kept from step to step, so that none pays for buffers.
-
-    Attributes:
-        before: where the nodes are, shape (n + 1, d).
-        start: the same with the prescribed nodes moved.
-        last: velocities over the last step.
-        velocities: those of this step, better with each solve.
-        about: where they lead.
-        known: the prescribed nodes, shape (n + 1,).
-    """
-
-    before: Points
-    start: Points
-    last: Points
-    velocities: Points
-    about: Points
-    known: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, nodes: int, dimension: int) -> MotionBuffers:
-        """Return buffers for every step of a thread."""
-        before, start, last, velocities, about = np.zeros((5, nodes, dimension))
-        return cls(before, start, last, velocities, about, np.zeros(nodes, dtype=np.bool_))
+@compiled_inline
+def copy_points(given: Points, written: Points) -> None:
+    """Copy positions or velocities; an assignment of slices would make an array."""
+    for i in range(len(given)):
+        for a in range(given.shape[1]):
+            written[i, a] = given[i, a]
 
 
-@compiled_uncounted
+@compiled_inner
 def assemble_step(
     solves: int,
-    rod: RodProperties,
+    model: StepModel,
     buffers: StepBuffers,
-    workspace: WorkspaceData,
-    motion: MotionBuffers,
     given: StepInput,
     elsewhere: float,
-    last_about: Points,
     last_contacts: int,
 ) -> tuple[int, float, bool]:
     """Write the program about a predicted end point; where that came from a solve and is exact, do not.
 
-    Where the program in the buffers was written about, and how many contacts it has, -1 if that is not known, make it
-    cheap to find that out.
+    Where the program in the buffers was written about, `last_about`, and how many contacts it has, -1 if that is not
+    known, make it cheap to find that out.
 
     Returns the number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers the
     point is: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or less if it is
     exact; and whether the limits of friction are still to be found.
     """
-    about, start, known, interval = motion.about, motion.start, motion.known, given.interval
-    segments = len(about) - 1
+    about, start, known, interval = buffers.about, buffers.start, buffers.known, given.interval
+    rod, workspace, segments = model.rod, model.workspace, len(buffers.about) - 1
     mechanics.chord_lengths(about, given.heading, rod.clamped, buffers.chords)
     strain = segment_rows(buffers, about, start, known, interval)
     rough, off = knows_friction(workspace), max(strain / STRAIN_TOLERANCE, elsewhere)
     cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
-    if cheap and stays_clear(buffers, workspace, last_about, about, known, rod.unit, rod.radius):
+    if cheap and stays_clear(buffers, workspace, buffers.last_about, about, known, rod.unit, rod.radius):
         return last_contacts, off, False
     contacts, depth = contact_rows(
         buffers, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
     )
     rubs = False
     if contacts > 0 and rough:
-        rubbing, change = friction_rows(buffers, segments, contacts, workspace, motion.before, start, known, interval)
+        rubbing, change = friction_rows(buffers, segments, contacts, workspace, interval)
         contacts = contacts + rubbing if rubbing >= 0 else -1
         rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
     off = max(off, depth / DEPTH_TOLERANCE)
     if contacts >= 0 and (solves == 0 or off > 1.0 or rubs):
-        _objective(rod, buffers, motion, given)
+        _objective(rod, buffers, given)
     return contacts, off if solves > 0 else np.inf, rubs
 
 
-@compiled_uncounted
-def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, given: StepInput) -> None:
+@compiled_inner
+def _objective(rod: RodProperties, buffers: StepBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
         P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z (v + flow)
@@ -150,7 +167,7 @@ def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, 
     and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
     moved already. In air a = 1, and of Z v only the inertia's part is left; the flow acts on the drag's part alone.
     """
-    about, start, last, heading, interval = motion.about, motion.start, motion.last, given.heading, given.interval
+    about, start, last, heading, interval = buffers.about, buffers.start, buffers.last, given.heading, given.interval
     nodes, dimension = start.shape
     blocks, couplings, linear = buffers.blocks, buffers.couplings, buffers.linear
     inertia = rod.mass_per_length / interval
@@ -188,14 +205,14 @@ def _objective(rod: RodProperties, buffers: StepBuffers, motion: MotionBuffers, 
                 if 0 <= i + apart < nodes:
                     band = weight * rod.bands[abs(apart), min(i, i + apart)]
                     for a in range(dimension):
-                        linear[i, a] += band * (start[i + apart, a] - motion.before[i + apart, a])
+                        linear[i, a] += band * (start[i + apart, a] - buffers.before[i + apart, a])
     mechanics.tension_stiffness(
         start, heading, rod.clamped, buffers.multipliers, -0.5 * rate, interval, (blocks, couplings, linear)
     )
     _taut(buffers, about, start, interval)
 
 
-@compiled_uncounted
+@compiled_inner
 def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
@@ -217,22 +234,27 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
         buffers.couplings[0, i] -= weight
 
 
-@compiled_uncounted
-def segment_rows(
-    buffers: StepBuffers, about: Points, start: Points, known: NDArray[np.bool_], interval: float
-) -> float:
-    """Write the rows  grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt; return the largest |h(y)|."""
+@compiled_inner
+def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask, interval: float) -> float:
+    """Write the rows of connectivity and compression together; return the largest |h(y)|.
+
+        grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt,    h_i = (D_i^2 - |y_{i+1} - y_i|^2) / 2
+
+    with the chord D_i of each segment.
+    """
     nodes, dimension = about.shape
-    distance_barrier(about, 1, buffers.chords, buffers.value, buffers.gradient)
     strain = 0.0
     for i in range(nodes - 1):
-        begin = min(i, nodes - 3)
-        buffers.first[i] = begin
-        bound = -buffers.value[i]
-        for k in range(3):
-            for a in range(dimension):
-                bound -= buffers.gradient[i, k, a] * (start[begin + k, a] - about[begin + k, a])
-        buffers.lower[i] = buffers.upper[i] = bound / interval
+        begin, square, moved = min(i, nodes - 3), 0.0, 0.0
+        shift = i - begin
+        for a in range(dimension):
+            buffers.gradient[i, 0, a] = buffers.gradient[i, 1, a] = buffers.gradient[i, 2, a] = 0.0
+            along = about[i + 1, a] - about[i, a]
+            buffers.gradient[i, shift, a], buffers.gradient[i, shift + 1, a] = along, -along
+            square += along * along
+            moved += along * (start[i, a] - about[i, a] - start[i + 1, a] + about[i + 1, a])
+        buffers.first[i], buffers.value[i] = begin, 0.5 * (buffers.chords[i] ** 2 - square)
+        buffers.lower[i] = buffers.upper[i] = (-buffers.value[i] - moved) / interval
         buffers.compliance[i] = COMPLIANCE
         if known[i] and known[i + 1]:
             # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
@@ -242,133 +264,142 @@ def segment_rows(
     return strain
 
 
-ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
-
-
-@compiled
-def init_step(motion: MotionBuffers, given: StepInput, unit: float) -> None:
+@compiled_inner
+def init_step(buffers: StepBuffers, given: StepInput, unit: float) -> None:
     """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
     Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
     farther than a segment: then the guess is where the thread is.
 
     Args:
-        motion: written.
+        buffers: written.
         given: the step.
         unit: D [m].
     """
     interval, last_interval = given.interval, given.last_interval
-    motion.before[:], motion.last[:] = given.positions / unit, given.velocities / unit
-    motion.velocities[:] = motion.last
-    motion.start[:], motion.known[:] = move_prescribed(motion.before, given.nodes, given.ends, unit)
-    motion.about[:] = motion.start
+    nodes, dimension = given.positions.shape
+    buffers.known[:] = False
+    for i in range(nodes):
+        for a in range(dimension):
+            buffers.before[i, a] = buffers.start[i, a] = given.positions[i, a] / unit
+            buffers.last[i, a] = buffers.velocities[i, a] = given.velocities[i, a] / unit
+    for k in range(len(given.nodes)):
+        buffers.known[given.nodes[k]] = True
+        for a in range(dimension):
+            buffers.start[given.nodes[k], a] = given.ends[k, a] / unit
+    copy_points(buffers.start, buffers.about)
     if not (last_interval > 0.0 and interval <= MAX_STEP_RATIO * last_interval):
         return
-    for i in range(len(motion.start)):
-        for a in range(motion.start.shape[1]):
-            if not motion.known[i]:
-                motion.about[i, a] = motion.start[i, a] + interval * motion.last[i, a]
-                if not abs(motion.about[i, a] - motion.start[i, a]) <= 1.0:
-                    motion.about[:] = motion.start
+    for i in range(nodes):
+        for a in range(dimension):
+            if not buffers.known[i]:
+                buffers.about[i, a] = buffers.start[i, a] + interval * buffers.last[i, a]
+                if not abs(buffers.about[i, a] - buffers.start[i, a]) <= 1.0:
+                    copy_points(buffers.start, buffers.about)
                     return
 
 
-@compiled
+class StepProgress(NamedTuple):
+    """How far a step has got.
+
+    Attributes:
+        code: `ENDED`; `NO_ROOM` for all contacts in the buffers; or `UNSOLVED`, and then the program is there for
+            another solver.
+        contacts: number of rows of contacts and friction.
+        solves: that the step has had.
+        off: how far off the barriers are over what is allowed, 1 or less if they hold; see `assemble_step`.
+        status: the first of the solves that is not 0, see `banded.STATUS`.
+        residuals: the largest of each kind.
+    """
+
+    code: int
+    contacts: int
+    solves: int
+    off: float
+    status: int
+    residuals: tuple[float, float, float]
+
+
+@compiled_uncounted
 def solve_step(
-    axes: tuple[int, ...],
-    rod: RodProperties,
+    model: StepModel,
     buffers: StepBuffers,
-    workspace: WorkspaceData,
     solver_buffers: banded.SolverBuffers,
-    motion: MotionBuffers,
-    positions: Points,
-    velocities: Points,
-    nodes: NDArray[np.int64],
-    ends: Points,
-    heading: Points,
-    interval: float,
-    last_interval: float,
-    tolerance: float,
-    max_solves: int,
+    given: StepInput,
     solves: int,
     elsewhere: float,
-) -> tuple[int, int, int, float, int, tuple[float, float, float]]:
+) -> StepProgress:
     """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
 
-    A solve that does not halve how far off the barriers are is followed by one that is linearised halfway back.
+    A solve whose residuals do not pass is repeated from a cold start. One that does not halve how far off the barriers
+    are is followed by one that is linearised halfway back.
 
     Args:
-        axes: 0 to d - 1.
-        rod: the thread.
-        buffers: has the program in the end, and its multipliers.
-        workspace: obstacles and wall [m].
-        solver_buffers: of the structured solver; one without iterations leaves every solve to the caller.
-        motion: where the step has got to; written.
-        positions: see `StepInput`, as are the following; one tuple of them costs more when this is called from Python.
-        velocities: over the last step.
-        nodes: of prescribed motion.
-        ends: of these.
-        heading: of the needle.
-        interval: of the step.
-        last_interval: of the last one.
-        tolerance: the largest residual with which a solution is accepted.
-        max_solves: of a step.
-        solves: how many this step has had; with none it sets out.
-        elsewhere: how far off the rows are that this code does not know, see `assemble`.
-
-    Returns:
-        `ENDED`, `NO_ROOM` for all contacts in the buffers, or `UNSOLVED`, and then the program is there for
-        another solver; the number of rows of contacts and friction; solves; how far off the barriers are, see
-        `assemble_step`; the first status that is not 0, see `banded.STATUS`; the largest residual of each kind.
+        model: the thread and what is around it.
+        buffers: the step under way; it has the program in the end, and its multipliers.
+        solver_buffers: of the structured solver.
+        given: the step.
+        solves: how many this step has had; with none it begins.
+        elsewhere: how far off the rows are that this code does not know, see `assemble_step`.
     """
-    given = StepInput(positions, velocities, nodes, ends, heading, interval, last_interval)
+    workspace, about, last_about = model.workspace, buffers.about, buffers.last_about
     if solves == 0:
-        init_step(motion, given, rod.unit)
-    worst, status, segments = (0.0, 0.0, 0.0), 0, len(motion.about) - 1
-    last_off, last_about, contacts = np.inf, motion.about.copy(), -1
+        init_step(buffers, given, model.rod.unit)
+    copy_points(about, last_about)
+    primal, dual, complementarity, segments = 0.0, 0.0, 0.0, len(about) - 1
+    # Numbers of a type of their own: a function is compiled again for each number that is written out.
+    first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
+    last_off, contacts, code, u = np.inf, unknown, UNSOLVED, buffers.trial
     while True:
-        contacts, off, rubs = assemble_step(
-            solves, rod, buffers, workspace, motion, given, elsewhere, last_about, contacts
-        )
-        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < max_solves:
+        contacts, off, rubs = assemble_step(solves, model, buffers, given, elsewhere, contacts)
+        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
             # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
-            motion.about[:] = 0.5 * (motion.about + last_about)
-            contacts, _, _ = assemble_step(0, rod, buffers, workspace, motion, given, elsewhere, last_about, -1)
+            for i in range(len(about)):
+                for a in range(about.shape[1]):
+                    about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+            contacts, _, _ = assemble_step(first, model, buffers, given, elsewhere, unknown)
         last_off = off
-        last_about[:] = motion.about
+        copy_points(about, last_about)
         if contacts < 0:
-            return NO_ROOM, contacts, solves, off, status, worst
-        if (off <= 1.0 and not rubs) or solves == max_solves:
+            code = NO_ROOM
+            break
+        if (off <= 1.0 and not rubs) or solves == model.max_solves:
             if off > 1.0:  # whatever else holds, nothing passes the wall
-                moved_inside(motion.about, motion.known, (workspace.wall_radius - rod.radius) / rod.unit)
-            return ENDED, contacts, solves, off, status, worst
-        if solver_buffers.iterations == 0:
-            return UNSOLVED, contacts, solves, off, status, worst
-        rows = segments + contacts
-        program = program_of(buffers, motion.known, rows)
-        u, multipliers = motion.velocities.copy(), buffers.multipliers[:rows].copy()
-        word, _, found = banded.solve_and_check(axes, program, u, multipliers, solver_buffers)
-        if not max(found) <= tolerance:
-            return UNSOLVED, contacts, solves, off, status, worst
-        accept_step(buffers, workspace, motion, u, multipliers, given.interval)
-        worst = (max(worst[0], found[0]), max(worst[1], found[1]), max(worst[2], found[2]))
+                move_inside(about, buffers.known, (workspace.wall_radius - model.rod.radius) / model.rod.unit)
+            code = ENDED
+            break
+        if not model.structured:
+            break
+        program = program_view(buffers, buffers.known, segments + contacts)
+        multipliers = buffers.trial_multipliers[: segments + contacts]
+        copy_points(buffers.velocities, u)
+        for r in range(len(multipliers)):
+            multipliers[r] = buffers.multipliers[r]
+        word, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+        if not max(found) <= model.tolerance:
+            u[:] = 0.0
+            multipliers[:] = 0.0
+            _, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+            if not max(found) <= model.tolerance:
+                break
+            word = banded.RESTARTED
+        accept_step(buffers, workspace, u, multipliers, given.interval)
+        primal, dual, complementarity = max(primal, found[0]), max(dual, found[1]), max(complementarity, found[2])
         status, solves = status if status != 0 else word, solves + 1
+    return StepProgress(code, contacts, solves, off, status, (primal, dual, complementarity))
 
 
-@compiled
+@compiled_uncounted
 def accept_step(
-    buffers: StepBuffers,
-    workspace: WorkspaceData,
-    motion: MotionBuffers,
-    velocities: Points,
-    multipliers: Vector,
-    interval: float,
+    buffers: StepBuffers, workspace: WorkspaceData, velocities: Points, multipliers: Vector, interval: float
 ) -> None:
     """Accept a solution: velocities, end positions, and multipliers as the guess for the next step."""
     keep_multipliers(buffers, multipliers, len(velocities) - 1)
     if knows_friction(workspace):
         keep_grips(buffers, multipliers, len(velocities) - 1, workspace)
-    moved = motion.start[0] - motion.before[0]
-    keep_internal_forces(buffers, motion.known, moved, velocities, multipliers, interval)
-    motion.velocities[:] = velocities
-    motion.about[:] = motion.start + interval * velocities  # known nodes have moved, and have no velocity
+    keep_internal_forces(buffers, velocities, multipliers, interval)
+    for i in range(len(velocities)):
+        for a in range(velocities.shape[1]):
+            buffers.velocities[i, a] = velocities[i, a]
+            # Known nodes have moved, and have no velocity.
+            buffers.about[i, a] = buffers.start[i, a] + interval * velocities[i, a]

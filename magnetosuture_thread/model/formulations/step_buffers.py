@@ -1,126 +1,175 @@
-"""Memory of one step of the thread, shared by all formulations: its program, contacts and forces."""
+"""Memory of a step of the thread, shared by all formulations: the step under way, its program, contacts and forces."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.program import SPAN, ChainProgram, Vector
+from magnetosuture_thread.model.program import SPAN, ChainProgram, Indices, Mask, Table, Vector, no_far_rows
 
+CONTACTS_PER_NODE = 64  # for which there is room; a smooth outline has dozens of corners beside one segment
 GRIPS = 3  # shapes at most that a node or a chord has friction with at once
 NO_SHAPE = -2  # in place of a shape
 
 
-class StepBuffers(NamedTuple):
-    """Memory for a step's program and its contacts, kept from step to step so that no step pays for it.
+class ContactBuffers(NamedTuple):
+    """Where contacts are written, as by `find_contacts`.
 
     Attributes:
-        blocks: see `ChainProgram`, as are the following; n + 1 nodes.
+        node: shape (c,).
+        obstacle: shape (c,).
+        distance: shape (c,) [m].
+        normal: shape (c, d).
+        nearest: shape (c,).
+        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
+    """
+
+    node: Indices
+    obstacle: Indices
+    distance: Vector
+    normal: Points
+    nearest: Mask
+    place: Vector
+
+    @classmethod
+    def of(cls, nodes: int, dimension: int) -> ContactBuffers:
+        """Return room for the contacts of a thread."""
+        count = CONTACTS_PER_NODE * nodes
+        node, obstacle = np.zeros((2, count), np.int64)
+        return cls(
+            node, obstacle, np.zeros(count), np.zeros((count, dimension)), np.zeros(count, np.bool_), np.zeros(count)
+        )
+
+
+class StepBuffers(NamedTuple):
+    """Memory for the steps of a thread with n + 1 nodes, kept from step to step so that no step pays for it.
+
+    Lengths are in units of the segment length, and forces in those of the program.
+
+    Attributes:
+        before: where the nodes are, shape (n + 1, d).
+        start: the same with the prescribed nodes moved.
+        last: velocities over the last step.
+        velocities: those of this step, better with each solve.
+        about: where they lead.
+        last_about: where the program was written about.
+        trial: velocities of a solve, shape (n + 1, d).
+        trial_multipliers: of the same, shape (r,).
+        known: the prescribed nodes, shape (n + 1,).
+        blocks: see `ChainProgram`, as are the following.
         couplings: shape (3, n + 1).
         linear: shape (n + 1, d).
-        first: rows: those of the formulation, then those of the contacts, shape (r,).
+        first: rows: those of the formulation, then those of contacts and friction, shape (r,).
         gradient: shape (r, 3, d).
         lower: shape (r,).
         upper: shape (r,).
         compliance: shape (r,).
         limit: shape (r,).
+        far_nodes: none.
+        far_gradient: none.
         value: h of each row, shape (r,).
         multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
         chords: length of each segment, shape (n,).
         work: shape (2, n + 1, d).
-        node: contacts: as `find_contacts` writes them, shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,).
-        normal: shape (c, d).
-        nearest: shape (c,).
+        contacts: those with rows, then those of friction.
         clearance: distance of each node from the nearest of all that is solid, at most the reach, shape (n + 1,) [m].
-        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
         push: what contacts last pushed each node and each segment with, shape (2, n + 1).
-        contact_force: the same as vectors, with friction, of all contacts of a node, shape (n + 1, d).
         grip_shape: the shapes with friction that last pushed each node, and each chord between its nodes, `NO_SHAPE`
             for none, shape (2, n + 1, GRIPS).
         grip: of these, the force (2), the multiplier of friction, its limit, and the place on the chord, shape
             (2, n + 1, GRIPS, 5).
+        grip_contact: of these, the contact that is now in its place, -1 for none, shape (2, n + 1, GRIPS).
+        drag: the medium's part of `blocks`.
+        drag_linear: the medium's part of `linear`.
+        internal: what the segments push each node with, shape (n + 1, d).
+        contact_force: what contacts push each node with, with friction, shape (n + 1, d).
+        tail_load: what medium and contacts do at the needle's tail, shape (d,).
     """
 
-    blocks: NDArray[np.float64]
-    couplings: NDArray[np.float64]
-    linear: NDArray[np.float64]
-    first: NDArray[np.int64]
-    gradient: NDArray[np.float64]
+    before: Points
+    start: Points
+    last: Points
+    velocities: Points
+    about: Points
+    last_about: Points
+    trial: Points
+    trial_multipliers: Vector
+    known: Mask
+    blocks: Table
+    couplings: Table
+    linear: Points
+    first: Indices
+    gradient: Table
     lower: Vector
     upper: Vector
     compliance: Vector
     limit: Vector
+    far_nodes: Indices
+    far_gradient: Table
     value: Vector
     multipliers: Vector
     chords: Vector
-    work: NDArray[np.float64]
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: Vector
-    normal: Points
-    nearest: NDArray[np.bool_]
+    work: Table
+    contacts: ContactBuffers
     clearance: Vector
-    place: Vector
-    push: NDArray[np.float64]
-    contact_force: Points
-    grip_shape: NDArray[np.int64]
-    grip: NDArray[np.float64]
-    drag: NDArray[np.float64]
+    push: Table
+    grip_shape: Indices
+    grip: Table
+    grip_contact: Indices
+    drag: Table
     drag_linear: Points
     internal: Points
+    contact_force: Points
     tail_load: Vector
 
     @classmethod
-    def of(cls, nodes: int, dimension: int, rows: int, contacts: int) -> StepBuffers:
-        """Return buffers for a number of rows, and of contacts besides."""
-        total = rows + contacts
+    def of(cls, nodes: int, dimension: int, rows: int) -> StepBuffers:
+        """Return buffers for a number of rows besides those of contacts and friction."""
+        total, square = rows + CONTACTS_PER_NODE * nodes, (nodes, dimension, dimension)
+        before, start, last, velocities, about, last_about, trial = np.zeros((7, nodes, dimension))
+        linear, drag_linear, internal, contact_force = np.zeros((4, nodes, dimension))
+        lower, upper, compliance, value, multipliers, trial_multipliers = np.zeros((6, total))
+        far_nodes, far_gradient = no_far_rows(dimension)
         return cls(
-            np.zeros((nodes, dimension, dimension)),
-            np.zeros((SPAN, nodes)),
-            np.zeros((nodes, dimension)),
-            np.zeros(total, dtype=np.int64),
-            np.zeros((total, SPAN, dimension)),
-            np.zeros(total),
-            np.zeros(total),
-            np.zeros(total),
-            np.full(total, np.inf),
-            np.zeros(total),
-            np.zeros(total),
-            np.zeros(nodes - 1),
-            np.zeros((2, nodes, dimension)),
-            np.zeros(contacts, dtype=np.int64),
-            np.zeros(contacts, dtype=np.int64),
-            np.zeros(contacts),
-            np.zeros((contacts, dimension)),
-            np.zeros(contacts, dtype=np.bool_),
-            np.zeros(nodes),
-            np.zeros(contacts),
-            np.zeros((2, nodes)),
-            np.zeros((nodes, dimension)),
-            np.full((2, nodes, GRIPS), NO_SHAPE),
-            np.zeros((2, nodes, GRIPS, 5)),
-            np.zeros((nodes, dimension, dimension)),
-            np.zeros((nodes, dimension)),
-            np.zeros((nodes, dimension)),
-            np.zeros(dimension),
+            before=before,
+            start=start,
+            last=last,
+            velocities=velocities,
+            about=about,
+            last_about=last_about,
+            trial=trial,
+            trial_multipliers=trial_multipliers,
+            known=np.zeros(nodes, np.bool_),
+            blocks=np.zeros(square),
+            couplings=np.zeros((SPAN, nodes)),
+            linear=linear,
+            first=np.zeros(total, np.int64),
+            gradient=np.zeros((total, SPAN, dimension)),
+            lower=lower,
+            upper=upper,
+            compliance=compliance,
+            limit=np.full(total, np.inf),
+            far_nodes=far_nodes,
+            far_gradient=far_gradient,
+            value=value,
+            multipliers=multipliers,
+            chords=np.zeros(nodes - 1),
+            work=np.zeros((2, nodes, dimension)),
+            contacts=ContactBuffers.of(nodes, dimension),
+            clearance=np.zeros(nodes),
+            push=np.zeros((2, nodes)),
+            grip_shape=np.full((2, nodes, GRIPS), NO_SHAPE),
+            grip=np.zeros((2, nodes, GRIPS, 5)),
+            grip_contact=np.full((2, nodes, GRIPS), -1),
+            drag=np.zeros(square),
+            drag_linear=drag_linear,
+            internal=internal,
+            contact_force=contact_force,
+            tail_load=np.zeros(dimension),
         )
-
-    def enlarged(self) -> StepBuffers:
-        """Return buffers for twice as many contacts, with the same chords and multipliers."""
-        nodes, dimension = self.linear.shape
-        rows = len(self.first) - len(self.node)
-        larger = StepBuffers.of(nodes, dimension, rows, 2 * len(self.node))
-        larger.multipliers[:rows] = self.multipliers[:rows]
-        larger.chords[:] = self.chords
-        larger.push[:] = self.push
-        larger.grip_shape[:], larger.grip[:] = self.grip_shape, self.grip
-        return larger
 
     def forget(self) -> None:
         """Forget the last solve: the next step starts without tension and contacts."""
@@ -128,9 +177,13 @@ class StepBuffers(NamedTuple):
         self.push[:] = 0.0
         self.grip_shape[:], self.grip[:] = NO_SHAPE, 0.0
 
+    def restore(self, warm_start: tuple[Vector, Table, Indices, Table]) -> None:
+        """Restore multipliers, pushes and friction of a step; see `Formulation.warm_start`."""
+        self.multipliers[: len(warm_start[0])] = warm_start[0]
+        self.push[:], self.grip_shape[:], self.grip[:] = warm_start[1:]
 
-@compiled
-def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> ChainProgram:
+
+def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     """Return the program of the first rows."""
     return ChainProgram(
         buffers.blocks,
@@ -143,4 +196,11 @@ def program_of(buffers: StepBuffers, known: NDArray[np.bool_], rows: int) -> Cha
         buffers.upper[:rows],
         buffers.compliance[:rows],
         buffers.limit[:rows],
+        buffers.far_nodes,
+        buffers.far_gradient,
     )
+
+
+program_of = compiled(_program_of)
+program_view = compiled_inline(_program_of)
+"""The same for kernels that do not count references to arrays."""

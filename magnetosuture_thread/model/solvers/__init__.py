@@ -1,4 +1,4 @@
-"""Solvers of the step's program: the structured one, general ones, and how one falls back on the others."""
+"""Solvers of the step's program: the structured one, OSQP, and how one falls back on the other."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector, WideRows
+from magnetosuture_thread.model.program import ChainProgram, Solution, Solver, Vector
 from magnetosuture_thread.model.solvers.banded import BandedSolver
-from magnetosuture_thread.model.solvers.general import OsqpSolver, QpsolversSolver
-from magnetosuture_thread.model.solvers.low_rank import LowRankSolver
+from magnetosuture_thread.model.solvers.osqp import OsqpSolver
 
-__all__ = ["SOLVERS", "BandedSolver", "FallbackSolver", "LowRankSolver", "OsqpSolver", "QpsolversSolver", "make_solver"]
+__all__ = ["SOLVERS", "BandedSolver", "FallbackSolver", "OsqpSolver", "make_solver"]
 
 SOLVERS = (BandedSolver.name, OsqpSolver.name)
-"""Those that need no other package; besides, any that qpsolvers knows."""
 
 
 class FallbackSolver:
@@ -29,33 +28,24 @@ class FallbackSolver:
 
     Attributes:
         first: of the solvers.
-        tolerance: as given.
     """
 
     def __init__(self, solvers: Sequence[Solver], tolerance: float) -> None:
-        self._solvers, self.tolerance = tuple(solvers), tolerance
+        self._solvers, self._tolerance = tuple(solvers), tolerance
         self.first = self._solvers[0]
         self.name = self.first.name
 
-    def solve(
-        self, program: ChainProgram, velocities: Points, multipliers: Vector, wide: WideRows | None = None
-    ) -> Solution:
-        """Return the first solution that passes, else the best; see `Solver`.
-
-        Wide rows are nothing for the banded solver, and without them there is nothing of low rank.
-        """
-        apart = LowRankSolver if wide is None else BandedSolver
-        solvers = [solver for solver in self._solvers if not isinstance(solver, apart)]
-        solution = solvers[0].solve(program, velocities, multipliers, wide)
-        if solution.residuals.largest <= self.tolerance:
+    def solve(self, program: ChainProgram, velocities: Points, multipliers: Vector) -> Solution:
+        """Return the first solution that passes, else the best; see `Solver`."""
+        solution = self.first.solve(program, velocities, multipliers)
+        if solution.residuals.largest <= self._tolerance:
             return solution
         tried, best = [f"{solution.solver}: {solution.status}"], solution
-        still, free = np.zeros_like(program.linear), np.zeros_like(multipliers)
-        for solver in solvers:
-            solution = solver.solve(program, still, free, wide)
+        for solver in self._solvers:
+            solution = solver.solve(program, np.zeros_like(program.linear), np.zeros_like(multipliers))
             if solution.residuals.largest < best.residuals.largest:
                 best = solution
-            if solution.residuals.largest <= self.tolerance:
+            if solution.residuals.largest <= self._tolerance:
                 break
             tried.append(f"{solution.solver} from a cold start: {solution.status}")
         return best._replace(status=f"{best.status}, after {', '.join(tried)}")
@@ -64,11 +54,8 @@ class FallbackSolver:
 def make_solver(name: str, tolerance: float) -> Solver:
     """Return a solver by name; `banded` falls back on a cold start and on OSQP, OSQP on a cold start alone.
 
-    Any other name is that of a solver of the package qpsolvers, where that is installed.
-
     Raises:
         ConfigurationError: there is no solver of this name.
     """
-    if name == BandedSolver.name:
-        return FallbackSolver((BandedSolver(), LowRankSolver(), OsqpSolver()), tolerance)
-    return FallbackSolver((OsqpSolver() if name == OsqpSolver.name else QpsolversSolver(name),), tolerance)
+    Quantity("", choices=SOLVERS).checked("solver", name, str)
+    return FallbackSolver((BandedSolver(), OsqpSolver()) if name == BandedSolver.name else (OsqpSolver(),), tolerance)

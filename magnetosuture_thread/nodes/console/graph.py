@@ -1,17 +1,22 @@
-"""The running graph as the operator page sees it: states in, jog commands and bridge services out."""
+"""The running graph as the operator page sees it: states in, jog commands and services out.
+
+No executor runs: waiting for hundreds of messages a second in rclpy would cost as much as the nodes that send them.
+Messages are queued in the middleware, which keeps the latest and their time of arrival, and polled.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from magnetosuture_msgs.srv import PlanProcedure
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
@@ -31,33 +36,34 @@ from magnetosuture_thread.interface import (
     RESUME_PROCEDURE,
 )
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.packing import packed_header, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.console import messages
-from magnetosuture_thread.nodes.console.inbox import Inbox, Latest
-from magnetosuture_thread.nodes.messages import MESSAGES
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
-from magnetosuture_thread.rig.camera.dish_camera import encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.vision.images import unpack_image
 
 TIMEOUT = 10.0  # s for a service to be found and to answer
-RETRY_PERIOD = 0.5  # s without an answer, after which it is called again
+PLAN_TIMEOUT = 60.0  # s; a long way takes some seconds, and is planned once
+RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
 POLL_PERIOD = 0.005  # s between two checks for an answer
 
-PLAN_TIMEOUT = 60.0  # s; a long way takes some seconds, and is planned once
+NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
+DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
+LONG_PERIOD, SCENE_PERIOD = 0.1, 0.5  # s; paths and forecasts take a millisecond to read, a large scene more
+PACKAGE_NODES = (*ALL_NODES, "console")
+MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
+MAX_NODES = 32  # shown
+MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
+JPEG_QUALITY = 80
 
-_TYPES = {
-    ARM: SetBool,
-    EMERGENCY_STOP: Trigger,
-    RESET: Trigger,
-    PAUSE_REPLAY: SetBool,
-    PAUSE_RIG: SetBool,
+SERVICES: dict[str, Any] = {
+    **dict.fromkeys((ARM, PAUSE_REPLAY, PAUSE_RIG), SetBool),
+    **dict.fromkeys((EMERGENCY_STOP, RESET, RESUME_PROCEDURE, PAUSE_PROCEDURE, ABORT_PROCEDURE), Trigger),
     PLAN_PROCEDURE: PlanProcedure,
-    RESUME_PROCEDURE: Trigger,
-    PAUSE_PROCEDURE: Trigger,
-    ABORT_PROCEDURE: Trigger,
 }
 PROCEDURE_ACTIONS = {"resume": RESUME_PROCEDURE, "pause": PAUSE_PROCEDURE, "abort": ABORT_PROCEDURE}
 ACTIONS: dict[str, tuple[str, Any]] = {
@@ -66,6 +72,139 @@ ACTIONS: dict[str, tuple[str, Any]] = {
     "stop": (EMERGENCY_STOP, Trigger.Request()),
     "reset": (RESET, Trigger.Request()),
 }
+READERS = {
+    "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
+    "needle": (topics.NEEDLE_POSE, messages.needle, 0.0),
+    "measured": (topics.MEASURED_THREAD, messages.measured_thread, LONG_PERIOD),
+    "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
+    "estimated": (topics.ESTIMATED_THREAD, messages.estimated, 0.0),
+    "forecast": (topics.FORECAST, messages.forecast, LONG_PERIOD),
+    "margins": (topics.MARGINS, messages.margins, 0.0),
+    "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
+    "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
+    "bridge": (topics.BRIDGE_STATE, messages.bridge, 0.0),
+    "procedure": (topics.PROCEDURE_STATE, messages.procedure, 0.0),
+    "plan": (topics.PROCEDURE_PLAN, messages.plan, 0.0),
+}
+REST = {"commanded": [0.0, 0.0], "filtered": [0.0, 0.0], "applied": [0.0, 0.0]}
+BLOCKED_FILTER = {"source": "", **REST, "slowdown": 1.0, "active": [], "overridden": "", "age": 0.0}
+LISTED_PARTS = ("measured", "plan")
+AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "forecast", "filter", "bridge")
+_RECORDED = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS, topics.PROCEDURES)
+RECORDED_TOPICS = tuple({topic.name: topic for kind in _RECORDED for topic in kind}.values())
+
+
+class Inbox:
+    """Queue of the messages of a topic since the last poll.
+
+    Args:
+        node: that subscribes.
+        topic: to subscribe.
+        depth: of the queue; beyond it, the oldest messages are lost.
+    """
+
+    def __init__(self, node: Node, topic: topics.Topic, depth: int) -> None:
+        self.topic = topic
+        quality = QoSProfile(
+            depth=depth,
+            reliability=topic.qos.reliability or ReliabilityPolicy.RELIABLE,
+            durability=topic.qos.durability,
+        )
+        self._node, self._depth = node, depth
+        self._subscription = node.create_subscription(topic.message, topic.name, _never, quality, raw=True)
+
+    def take(self) -> Iterator[tuple[bytes, int]]:
+        """Yield the queued messages, no more than the queue holds: CDR bytes, and time of arrival [ns].
+
+        In a flood there would always be one more.
+        """
+        subscription = self._subscription
+        with subscription.handle:
+            for _ in range(self._depth):
+                found = subscription.handle.take_message(subscription.msg_type, True)
+                if found is None:
+                    return
+                data, info = found
+                yield bytes(data), info["received_timestamp"]
+
+    def read(self) -> Iterator[tuple[Any, int]]:
+        """Yield the queued messages, and their time of arrival [ns]; invalid ones are skipped."""
+        for data, arrived in self.take():
+            try:
+                yield self.topic.decode(data), arrived
+            except InvalidInputError:
+                continue
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+
+class Latest:
+    """Content of the latest message of a topic.
+
+    Args:
+        node: that subscribes.
+        topic: to subscribe.
+        read: converts a message; where it fails, the previous value stays.
+        period: minimum between two messages that are read [s].
+        max_bytes: of a message that is read; the topic's own bound if None.
+
+    Attributes:
+        value: content of the latest message that was read; None before the first.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: topics.Topic,
+        read: Callable[[Any], Any],
+        period: float = 0.0,
+        *,
+        max_bytes: int | None = None,
+    ) -> None:
+        self._inbox = Inbox(node, topic, 1)
+        self._max_bytes = topic.max_bytes if max_bytes is None else max_bytes
+        self._read = read
+        self._period = period
+        self._next_read = 0.0
+        self._arrived = 0
+        self.value: Any = None
+
+    def poll(self) -> bool:
+        """Read the latest message, if there is one; return whether there is a new value."""
+        now = time.monotonic()
+        if now < self._next_read:
+            return False
+        waiting = list(self._inbox.take())
+        if not waiting:
+            return False
+        data, arrived = waiting[-1]
+        if len(data) > self._max_bytes:
+            return False
+        try:
+            self.value = self._read(self._inbox.topic.decode(data))
+        except Exception:  # whatever is wrong with a message, the page goes on with the one before
+            return False
+        self._arrived, self._next_read = arrived, now + self._period
+        return True
+
+    @property
+    def age(self) -> float:
+        """Return the age of the message [s]."""
+        return max(0.0, time.time() - self._arrived * 1e-9)
+
+    def aged(self) -> dict[str, Any] | None:
+        """Return a copy of the latest content, with its age."""
+        return None if self.value is None else {**self.value, "age": self.age}
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._inbox.close()
+
+
+def _never(data: bytes) -> None:
+    """Unused callback: there is no executor."""
 
 
 class ConsoleServices:
@@ -78,8 +217,8 @@ class ConsoleServices:
     """
 
     def __init__(self, node: Node) -> None:
-        self._clients = {name: node.create_client(kind, name) for name, kind in _TYPES.items()}
-        self._answers: dict[str, dict[int, Any]] = {name: {} for name in _TYPES}
+        self._clients = {name: node.create_client(kind, name) for name, kind in SERVICES.items()}
+        self._answers: dict[str, dict[int, Any]] = {name: {} for name in SERVICES}
         self._turn = 0
 
     def ready(self, name: str) -> bool:
@@ -144,44 +283,6 @@ class ConsoleServices:
                 self._answers[name][header.request_id.sequence_number] = answer
 
 
-NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
-MEASURED_PERIOD = 0.1  # s; a path of a hundred poses takes a millisecond to read
-FORECAST_PERIOD = 0.1  # s; 400 points take a millisecond to read
-SCENE_PERIOD = 0.5  # s; a large scene takes a tenth of that
-PACKAGE_NODES = (*ALL_NODES, "console")
-MAX_DIAGNOSTICS = 50  # queued messages of /diagnostics
-MAX_NODES = 32  # shown
-MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
-DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
-JPEG_QUALITY = 80
-READERS = {
-    "tracker": (topics.TRACKER_STATE, messages.tracker, 0.0),
-    "needle": (topics.NEEDLE_POSE, messages.needle, 0.0),
-    "measured": (topics.MEASURED_THREAD, messages.measured_thread, MEASURED_PERIOD),
-    "predicted": (topics.PREDICTED_THREAD, messages.predicted, 0.0),
-    "estimated": (topics.ESTIMATED_THREAD, messages.estimated, 0.0),
-    "forecast": (topics.FORECAST, messages.forecast, FORECAST_PERIOD),
-    "margins": (topics.MARGINS, messages.margins, 0.0),
-    "scene": (topics.SCENE, messages.scene, SCENE_PERIOD),
-    "filter": (topics.FILTER_STATE, messages.filter_state, 0.0),
-    "bridge": (topics.BRIDGE_STATE, messages.bridge, 0.0),
-    "procedure": (topics.PROCEDURE_STATE, messages.procedure, 0.0),
-    "plan": (topics.PROCEDURE_PLAN, messages.plan, 0.0),
-}
-ZERO_FILTER_STATE = {
-    "source": "",
-    "commanded": [0.0, 0.0],
-    "filtered": [0.0, 0.0],
-    "applied": [0.0, 0.0],
-    "slowdown": 1.0,
-    "active": [],
-    "overridden": "",
-    "age": 0.0,
-}
-LISTED_PARTS = ("measured", "plan")
-AGED_PARTS = ("tracker", "needle", "predicted", "estimated", "forecast", "filter", "bridge")
-
-
 class ConsoleGraph:
     """Implementation of `console.graph.Graph` over ROS.
 
@@ -227,12 +328,12 @@ class ConsoleGraph:
     def publish_velocity(self, velocity: tuple[float, float]) -> None:
         """Publish an operator velocity command; nothing while commands are blocked."""
         if not self.blocked:
-            self._commands.publish(MESSAGES.twist_message(self.now().to_msg(), np.asarray(velocity, dtype=float)))
+            self._commands.publish(packed_twist(self.now().to_msg(), np.asarray(velocity, dtype=float)))
 
     def publish_hold(self) -> None:
         """Publish that the page is held; nothing while commands are blocked."""
         if not self.blocked:
-            self._holds.publish(MESSAGES.header(self.now().to_msg()))
+            self._holds.publish(packed_header(self.now().to_msg()))
 
     async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
         """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
@@ -259,7 +360,7 @@ class ConsoleGraph:
             for name, latest in self._latest.items()
         }
         if self.blocked:
-            parts["filter"] = {**ZERO_FILTER_STATE, "reason": self.blocked}
+            parts["filter"] = {**BLOCKED_FILTER, "reason": self.blocked}
         shown_scene = parts["scene"] or self._scene
         shapes = {shape["name"] for shape in shown_scene["shapes"]} if shown_scene else set()
         return {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.geometry.orientation import heading_angle
-from magnetosuture_thread.messages.forecasts import forecast_events
+from magnetosuture_thread.messages.markers import forecast_events
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.estimator.disturbance import disturbance_text
@@ -37,33 +37,6 @@ MAX_REASON_CHARS = 400
 MAX_GHOSTS = 3  # instants of a forecast that are sent to the page
 MAX_PLAN_POINTS = 400  # that are sent to the page
 DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
-
-TRACKER = {
-    TrackerState.STATE_SEARCHING: "searching",
-    TrackerState.STATE_TRACKED: "tracked",
-    TrackerState.STATE_LOST: "lost",
-}
-BRIDGE = {
-    CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
-    CoilBridgeState.STATE_INACTIVE: "inactive",
-    CoilBridgeState.STATE_ACTIVE: "active",
-    CoilBridgeState.STATE_FAULT: "fault",
-}
-FRICTION = {
-    SafetyMargins.FRICTION_UNKNOWN: "unknown",
-    SafetyMargins.FRICTION_FREE: "free",
-    SafetyMargins.FRICTION_SLIDING: "sliding",
-    SafetyMargins.FRICTION_STUCK: "stuck",
-}
-PROCEDURE = {
-    ProcedureState.STATE_IDLE: "idle",
-    ProcedureState.STATE_READY: "ready",
-    ProcedureState.STATE_RUNNING: "running",
-    ProcedureState.STATE_PAUSED: "paused",
-    ProcedureState.STATE_DONE: "done",
-    ProcedureState.STATE_FAILED: "failed",
-}
-SOURCES = {SafetyMargins.OF_PREDICTION: "prediction", SafetyMargins.OF_ESTIMATE: "estimate"}
 LEVELS = {
     DiagnosticStatus.OK: "ok",
     DiagnosticStatus.WARN: "warn",
@@ -86,19 +59,18 @@ def tracker(message: TrackerState) -> dict[str, Any]:
     """Return the tracker's state, and the dish's place in the image if known."""
     view = None
     if len(message.dish_centre) == 2 and message.metres_per_pixel > 0.0:
-        view = {
-            "centre": list(message.dish_centre),
-            "scale": message.metres_per_pixel,
-            "rotation": message.camera_rotation,
-        }
-    state = TRACKER.get(message.state, "searching")
-    return {"state": state, "reason": shortened(message.reason), "confidence": message.confidence, "view": view}
+        scale, rotation = message.metres_per_pixel, message.camera_rotation
+        view = {"centre": list(message.dish_centre), "scale": scale, "rotation": rotation}
+    return {
+        "state": _constant(message, message.state, "STATE_"),
+        **_plain(message, "reason", "confidence"),
+        "view": view,
+    }
 
 
 def measured_thread(message: Path) -> list[list[float]]:
     """Return the vertices of the measured centreline [m]."""
-    places = (placed.pose.position for placed in message.poses)
-    return [[place.x, place.y] for place in places]
+    return _points(placed.pose.position for placed in message.poses)
 
 
 def predicted(message: PredictedThread) -> dict[str, Any]:
@@ -107,16 +79,15 @@ def predicted(message: PredictedThread) -> dict[str, Any]:
     Raises:
         InvalidInputError: the tensions are not those of the segments between the vertices.
     """
-    tension, pull = list(message.tension), message.needle_force
+    tension = list(message.tension)
     if tension and len(tension) + 1 != len(message.positions):
         found = f"{len(message.positions)} positions and {len(tension)} tensions"
         raise InvalidInputError("thread/predicted", found, "a tension for each segment, or none")
     return {
         "tension": tension,
-        "needle_force": [pull.x, pull.y] if tension else None,
-        "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
-        "residual": message.residual,
-        "step_time": message.step_time,
+        "needle_force": _plain(message, "needle_force")["needle_force"] if tension else None,
+        "vertices": _points(message.positions),
+        **_plain(message, "residual", "step_time"),
         "status": shortened(message.solver_status),
     }
 
@@ -131,11 +102,9 @@ def estimated(message: EstimatedThread) -> dict[str, Any]:
         found = f"{len(message.positions)} positions and {len(message.deviation)} deviations"
         raise InvalidInputError("thread/estimated", found, "a deviation for each position")
     return {
-        "vertices": [[vertex.x, vertex.y] for vertex in message.positions],
+        "vertices": _points(message.positions),
         "deviation": list(message.deviation),
-        "prediction_only": message.prediction_only,
-        "unmeasured_for": message.unmeasured_for,
-        "hidden": message.hidden,
+        **_plain(message, "prediction_only", "unmeasured_for", "hidden"),
         "disturbances": [_disturbance(found) for found in message.disturbances[:MAX_LISTED]],
     }
 
@@ -158,34 +127,28 @@ def forecast(message: ThreadForecast) -> dict[str, Any]:
         raise InvalidInputError("thread/forecast", found, "as many positions at each instant")
     nodes = count // instants
     shown = sorted({round(index) for index in np.linspace(0, instants - 1, MAX_GHOSTS + 1)[1:]})
-    return {
-        "horizon": message.horizon,
-        "ghosts": [
-            {
-                "time": message.time[at],
-                "vertices": [[place.x, place.y] for place in message.positions[at * nodes : (at + 1) * nodes]],
-            }
-            for at in shown
-        ],
-        "events": forecast_events(
-            message.contact_time, shortened(message.contact_shape), message.friction_time, message.rest_time
-        ),
-        "problem": shortened(message.problem),
-    }
+    ghosts = [
+        {"time": message.time[at], "vertices": _points(message.positions[at * nodes : (at + 1) * nodes])}
+        for at in shown
+    ]
+    shape = shortened(message.contact_shape)
+    events = forecast_events(message.contact_time, shape, message.friction_time, message.rest_time)
+    return {"horizon": message.horizon, "ghosts": ghosts, "events": events, "problem": shortened(message.problem)}
 
 
 def margins(message: SafetyMargins) -> dict[str, Any]:
     """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
+    bounds = [each.clearance_bound for each in message.minimum if np.isfinite(each.clearance_bound)]
     return {
         "valid": message.valid,
-        "of": SOURCES.get(message.source, "nothing"),
+        "of": _constant(message, message.source, "OF_", "nothing"),
         "reason": shortened(message.reason),
         "clearance": clearances(message) if message.valid else [],
-        "least": {shortened(least.barrier): least.clearance for least in message.minimum[:MAX_LISTED]},
-        "bound": min((b for b in (least.clearance_bound for least in message.minimum) if np.isfinite(b)), default=None),
+        "least": {shortened(each.barrier): each.clearance for each in message.minimum[:MAX_LISTED]},
+        "bound": min(bounds, default=None),
         "contact": list(message.contact_nodes),
         "friction": {
-            "state": FRICTION.get(message.friction_state, "unknown"),
+            "state": _constant(message, message.friction_state, "FRICTION_"),
             "nodes": list(message.friction_nodes),
             "slowdown": message.slowdown,
         },
@@ -201,8 +164,7 @@ def clearances(message: SafetyMargins) -> list[float | None]:
     count = max(message.node, default=-1) + 1
     if count > MAX_THREAD_NODES:
         raise InvalidInputError("thread/margins.node", count - 1, f"less than {MAX_THREAD_NODES}")
-    least = node_clearance(margins_of(message), count)
-    return [value if value < np.inf else None for value in least.tolist()]
+    return [value if value < np.inf else None for value in node_clearance(margins_of(message), count).tolist()]
 
 
 def scene(message: SceneMessage) -> dict[str, Any]:
@@ -237,50 +199,24 @@ def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
 
 def filter_state(message: FilterState) -> dict[str, Any]:
     """Return what the bridge made of the last velocity command [m/s]."""
-    return {
-        "source": shortened(message.source),
-        "commanded": _plane(message.commanded),
-        "filtered": _plane(message.filtered),
-        "applied": _plane(message.applied),
-        "slowdown": message.slowdown,
-        "active": _texts(message.active),
-        "overridden": shortened(message.overridden),
-        "reason": shortened(message.reason),
-    }
+    velocities = ("commanded", "filtered", "applied")
+    return _plain(message, "source", *velocities, "slowdown", "active", "overridden", "reason")
 
 
 def bridge(message: CoilBridgeState) -> dict[str, Any]:
     """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
-    return {
-        "state": BRIDGE.get(message.state, "fault"),
-        "armed": message.armed,
-        "emergency_stopped": message.emergency_stopped,
-        "reasons": _texts(message.reasons),
-        "commanded": _plane(message.commanded),
-        "filtered": _plane(message.filtered),
-        "applied": _plane(message.applied),
-        "saturated": message.saturated,
-        "driver": shortened(message.driver),
-        "driver_ready": message.driver_ready,
-        "driver_warnings": _texts(message.driver_warnings),
-        "current": list(message.current[:MAX_LISTED]),
-        "measured_current": list(message.measured_current[:MAX_LISTED]),
-        "refused": message.refused,
-    }
+    shown = ("armed", "emergency_stopped", "reasons", "commanded", "filtered", "applied", "saturated", "driver")
+    shown += ("driver_ready", "driver_warnings", "current", "measured_current", "refused")
+    return {"state": _constant(message, message.state, "STATE_", "fault"), **_plain(message, *shown)}
 
 
 def procedure(message: ProcedureState) -> dict[str, Any]:
     """Return what the needle planner does."""
     return {
-        "state": PROCEDURE.get(message.state, "failed"),
+        "state": _constant(message, message.state, "STATE_", "failed"),
         "name": shortened(message.procedure),
-        "goals": _texts(message.goals),
-        "goal": message.goal,
-        "goals_met": message.goals_met,
-        "progress": message.progress,
+        **_plain(message, "goals", "goal", "goals_met", "progress", "resumes", "hold_to_run"),
         "reason": shortened(message.reason, MAX_REASON_CHARS),
-        "resumes": message.resumes,
-        "hold_to_run": message.hold_to_run,
         "clearance": message.clearance if np.isfinite(message.clearance) else None,
     }
 
@@ -300,9 +236,29 @@ def node_state(status: DiagnosticStatus) -> dict[str, Any]:
     }
 
 
-def _plane(velocity: Vector3) -> list[float]:
-    return [velocity.x, velocity.y]
+def _constant(message: Any, value: int, prefix: str, other: str = "") -> str:
+    """Return the name of a message's constant in lower case; of an unknown value `other`, or that of 0."""
+    names = _names(type(message), prefix)
+    return names.get(value, other or names[0])
 
 
-def _texts(given: Sequence[str]) -> list[str]:
-    return [shortened(text) for text in given[:MAX_LISTED]]
+@cache
+def _names(kind: Any, prefix: str) -> dict[int, str]:
+    return {getattr(kind, name): name.removeprefix(prefix).lower() for name in dir(kind) if name.startswith(prefix)}
+
+
+def _plain(message: Any, *names: str) -> dict[str, Any]:
+    """Return fields of a message as plain values: texts and lists shortened, vectors in the plane."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, str):
+            return shortened(value)
+        if isinstance(value, Vector3):
+            return [value.x, value.y]
+        return value if isinstance(value, (bool, int, float)) else [plain(entry) for entry in value[:MAX_LISTED]]
+
+    return {name: plain(getattr(message, name)) for name in names}
+
+
+def _points(positions: Any) -> list[list[float]]:
+    return [[place.x, place.y] for place in positions]

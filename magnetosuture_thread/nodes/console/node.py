@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from types import FrameType
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import rclpy
@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from magnetosuture_thread import MagnetosutureError
-from magnetosuture_thread.console.server import ConsoleServer
+from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.interface import PAUSE_REPLAY, PAUSE_RIG
 from magnetosuture_thread.nodes.console.graph import ConsoleGraph
@@ -71,13 +71,13 @@ class GraphHost:
 
     def state(self) -> dict[str, Any]:
         """Return what is running and which requests are possible; see `console.graph`."""
-        if self.paused and not self._pause_service():
-            self.paused = False
+        can_pause = bool(self._pause_service())
+        self.paused = self.paused and can_pause
         return {
             "mode": self.mode,
             "setup": "",
             "setups": [],
-            "can_pause": bool(self._pause_service()),
+            "can_pause": can_pause,
             "paused": self.paused,
             "can_record": False,
             "recording": "",
@@ -105,35 +105,7 @@ class GraphHost:
 
     def _pause_service(self) -> str:
         """Return the service that pauses time; empty if there is none."""
-        ready = (name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.services.ready(name))
-        return next(ready, "")
-
-
-class _Termination:
-    """Whether the process was asked to end, at any time; asyncio would give signals their default action back."""
-
-    def __init__(self) -> None:
-        self._asked = False
-        self._notify: Callable[[], object] = bool
-        for which in end_signals():
-            signal.signal(which, self._on_signal)
-
-    def event(self) -> asyncio.Event:
-        """Return what is set from then on, for the running loop."""
-        loop, event = asyncio.get_running_loop(), asyncio.Event()
-
-        def set_event() -> None:
-            with suppress(RuntimeError):  # the loop is closed already
-                loop.call_soon_threadsafe(event.set)
-
-        self._notify = set_event
-        if self._asked:
-            event.set()
-        return event
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._asked = True
-        self._notify()
+        return next((name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.services.ready(name)), "")
 
 
 def answer_requests(node: Node) -> None:
@@ -145,45 +117,37 @@ def answer_requests(node: Node) -> None:
                 service.send_response(service.callback(request, service.srv_type.Response()), header)
 
 
-async def _keep_answering(node: Node) -> None:
-    while True:
-        answer_requests(node)
-        await asyncio.sleep(REQUEST_PERIOD)
-
-
-async def serve(node: Node, settings: ConsoleSettings, termination: _Termination) -> None:
-    """Serve the page until the process is terminated; the needle is stopped first."""
-    terminated = termination.event()
-    graph = ConsoleGraph(node, settings)
-    server = ConsoleServer(settings, graph, GraphHost(graph))
-    url = await server.start()
-    print(f"the operator's page: {url}", flush=True)
-    health = Health(node)
+async def _serve(node: Node, settings: ConsoleSettings) -> None:
+    """Serve the page until the process is asked to end; answer the node's services and publish its health."""
+    graph, health = ConsoleGraph(node, settings), Health(node)
     health.ok(f"serving on {settings.address}")
-    answering = asyncio.create_task(_keep_answering(node))
-    try:
-        while not terminated.is_set() and not answering.done():
+    due = time.monotonic()
+
+    async def watch() -> None:
+        nonlocal due
+        answer_requests(node)
+        if time.monotonic() >= due:
+            due = time.monotonic() + PERIOD
             graph.now()  # sets the clock for the stamp
             health.publish()
-            try:
-                await asyncio.wait_for(terminated.wait(), PERIOD)
-            except asyncio.TimeoutError:
-                continue
-    finally:
-        answering.cancel()
-        await server.stop()
-    with suppress(asyncio.CancelledError):
-        await answering  # raises what ended it
+
+    def report(url: str) -> None:
+        print(f"the operator's page: {url}", flush=True)
+
+    await serve_until(end_signals(), ConsoleServer(settings, graph, GraphHost(graph)), watch, REQUEST_PERIOD, report)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the node as a program; return 0 when it was terminated, 1 when it could not start."""
     node = None
-    termination = _Termination()
+    for which in end_signals():  # also amid the start
+        signal.signal(which, signal.default_int_handler)
     try:
         init(arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = GuardedNode(NAME, **node_options(NAME, {"parameter_overrides": NO_SERVICE}))
-        asyncio.run(serve(node, declare(node, ConsoleSettings), termination))
+        asyncio.run(_serve(node, declare(node, ConsoleSettings)))
+    except KeyboardInterrupt:
+        return 0
     except (MagnetosutureError, ParameterException, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1

@@ -15,13 +15,23 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc
-from magnetosuture_thread.rig.mechanics.contact_grid import Bins, bin_boxes, cells_around
+from magnetosuture_thread.geometry.obstacles import Disc
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
 MAX_CLEARANCE = 8.0  # cells; clearances are not found beyond
-RUN = 12  # edges of a polygon that share a box: what is far from the box is not compared with each
+
+
+class Bins(NamedTuple):
+    """What is in each cell of a grid.
+
+    Attributes:
+        starts: where the content of each cell begins in `content`, and the end, shape (h w + 1,).
+        content: indices.
+    """
+
+    starts: NDArray[np.int64]
+    content: NDArray[np.int64]
 
 
 class Shapes(NamedTuple):
@@ -32,12 +42,9 @@ class Shapes(NamedTuple):
         corners: of all polygons, the solid to the left of every edge, shape (c, 2) [m].
         starts: where each polygon begins in `corners`, and the end, shape (p + 1,).
         boxes: least x, least y, greatest x, greatest y of each polygon, shape (p, 4) [m].
-        runs: the same of every `RUN` edges of a polygon, shape (r, 4) [m].
-        first_runs: where each polygon begins in `runs`, and the end, shape (p + 1,).
         grid: least x and y of the cells of `clearances`, and their side, shape (3,) [m].
         clearances: at the least, of all points of a cell, rows along y, shape (h, w) [m].
         convex: 1 at corners that stick out of the solid, else 0, shape (c,).
-        free: distance of each corner from the edges of its polygon that do not end there, shape (c,) [m].
         owners: polygon of each corner, and of the edge that ends there, shape (c,).
         edges: of each cell the edges that may pass through it, cells by row.
         sharp: of each cell the corners in it that stick out of the solid.
@@ -51,12 +58,9 @@ class Shapes(NamedTuple):
     corners: NDArray[np.float64]
     starts: NDArray[np.int64]
     boxes: NDArray[np.float64]
-    runs: NDArray[np.float64]
-    first_runs: NDArray[np.int64]
     grid: NDArray[np.float64]
     clearances: NDArray[np.float64]
     convex: NDArray[np.float64]
-    free: NDArray[np.float64]
     owners: NDArray[np.int64]
     edges: Bins
     sharp: Bins
@@ -79,9 +83,6 @@ class Surface:
             contact without it costs more: nodes that slide then leave and meet the surface at every step.
         friction: Coulomb's coefficient of the thread on all of it; the needle has no friction.
         self_contact: whether the thread touches itself, with the same friction; else it passes over itself.
-
-    Raises:
-        ConfigurationError: a value is not finite, or out of bounds.
     """
 
     discs: tuple[Disc, ...] = ()
@@ -93,47 +94,44 @@ class Surface:
     self_contact: bool = False
 
     def packed(self) -> Shapes:
-        """Return the arrays that kernels read."""
+        """Return the arrays that kernels read.
+
+        Raises:
+            ConfigurationError: a polygon bounds no area.
+        """
         wall = math.inf if self.wall_radius is None else self.wall_radius
-        if not wall > 0.0:
-            raise ConfigurationError("surface.wall_radius", self.wall_radius, "a positive number [m]")
-        if not (math.isfinite(self.stiffness) and self.stiffness > 0.0):
-            raise ConfigurationError("surface.stiffness", self.stiffness, "a positive number [N/m]")
-        if not 0.0 <= self.skin < 1e-3:
-            raise ConfigurationError("surface.skin", self.skin, "from 0 to less than 1e-3 m")
-        if not 0.0 <= self.friction <= MAX_FRICTION:
-            raise ConfigurationError("surface.friction", self.friction, f"a coefficient from 0 to {MAX_FRICTION:g}")
         discs = np.array([(*disc.centre[:2], disc.radius) for disc in self.discs], dtype=np.float64).reshape(-1, 3)
         rings = [_directed(ring) for ring in self.polygons]
         corners = np.concatenate([np.zeros((0, 2)), *rings])
+        befores = np.concatenate([np.zeros((0, 2)), *(np.roll(ring, 1, axis=0) for ring in rings)])
         starts = np.cumsum([0, *(len(ring) for ring in rings)]).astype(np.int64)
-        # An edge ends at the corner of its number, and begins at the one before.
-        runs = [
-            [np.take(ring, range(i - 1, min(i + RUN, len(ring))), axis=0) for i in range(0, len(ring), RUN)]
-            for ring in rings
-        ]
-        first_runs = np.cumsum([0, *(len(run) for run in runs)]).astype(np.int64)
         convex = np.concatenate([np.zeros(0), *(_convex(ring) for ring in rings)])
-        boxes, edges = _boxes(rings), _boxes([points for run in runs for points in run])
+        boxes = np.array([(*ring.min(axis=0), *ring.max(axis=0)) for ring in rings], dtype=np.float64).reshape(-1, 4)
         reached = [*boxes, *((x - r, y - r, x + r, y + r) for x, y, r in [*discs, (0.0, 0.0, wall)] if r < math.inf)]
         grid, cells = np.array([0.0, 0.0, 1.0]), np.full((1, 1), np.inf)
         if reached:
             low, high = np.min(reached, axis=0)[:2], np.max(reached, axis=0)[2:]
             grid = np.array([*low, float(max(high - low)) / GRID])
             cells = np.full(np.ceil((high - low)[::-1] / grid[2]).astype(int), np.inf)
-        befores = np.concatenate([np.zeros((0, 2)), *(np.roll(ring, 1, axis=0) for ring in rings)])
-        owners = np.repeat(np.arange(len(rings)), np.diff(starts))
-        edge_bins = bin_boxes(np.minimum(corners, befores), np.maximum(corners, befores), grid, cells.shape)
-        sharp_bins = bin_boxes(*(np.where(convex[:, None] > 0.0, corners, np.nan),) * 2, grid, cells.shape)
-        polygons = corners, starts, boxes, edges, first_runs, grid, cells, convex, _free(rings), owners
-        numbers = float(wall), float(self.stiffness), float(self.friction)
-        shapes = Shapes(discs, *polygons, edge_bins, sharp_bins, *numbers, bool(self.self_contact))
+        sharp = np.where(convex[:, None] > 0.0, corners, np.nan)
+        shapes = Shapes(
+            discs=discs,
+            corners=corners,
+            starts=starts,
+            boxes=boxes,
+            grid=grid,
+            clearances=cells,
+            convex=convex,
+            owners=np.repeat(np.arange(len(rings)), np.diff(starts)),
+            edges=_bin_boxes(np.minimum(corners, befores), np.maximum(corners, befores), grid, cells.shape),
+            sharp=_bin_boxes(sharp, sharp, grid, cells.shape),
+            wall=float(wall),
+            stiffness=float(self.stiffness),
+            friction=float(self.friction),
+            self_contact=bool(self.self_contact),
+        )
         _find_clearances(shapes)
         return shapes
-
-
-def _boxes(parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.array([(*part.min(axis=0), *part.max(axis=0)) for part in parts], dtype=np.float64).reshape(-1, 4)
 
 
 def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -154,37 +152,60 @@ def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
 
 
-def _free(rings: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return how far each corner is from the edges that do not end there [m]."""
-    found = [np.zeros(0)]
-    for ring in rings:
-        count = len(ring)
-        begin, along = np.roll(ring, 1, axis=0), ring - np.roll(ring, 1, axis=0)
-        off = ring[:, None, :] - begin
-        part = np.clip(np.sum(off * along, axis=2) / np.sum(along * along, axis=1), 0.0, 1.0)
-        distance = np.linalg.norm(off - part[..., None] * along, axis=2)
-        corner = np.arange(count)
-        distance[corner, corner] = distance[corner, (corner + 1) % count] = np.inf
-        found.append(distance.min(axis=1))
-    return np.concatenate(found)
+def _bin_boxes(
+    low: NDArray[np.float64], high: NDArray[np.float64], grid: NDArray[np.float64], shape: tuple[int, ...]
+) -> Bins:
+    """Return which boxes reach into each cell; those that are not finite reach into none."""
+    cells: list[list[int]] = [[] for _ in range(shape[0] * shape[1])]
+    for index, ends in enumerate(np.stack([low, high], axis=1)):
+        if np.isfinite(ends).all():
+            # Rounded as `cells_around` does, so that a point is in one cell, and boxes that meet share one.
+            first, last = np.clip(((ends - grid[:2]) / grid[2]).astype(int), 0, (shape[1] - 1, shape[0] - 1))
+            for row in range(first[1], last[1] + 1):
+                for column in range(first[0], last[0] + 1):
+                    cells[row * shape[1] + column].append(index)
+    counts = [len(cell) for cell in cells]
+    return Bins(np.cumsum([0, *counts]), np.array([index for cell in cells for index in cell], dtype=np.int64))
+
+
+@compiled_inline
+def _cells_around(
+    low_x: float, low_y: float, high_x: float, high_y: float, grid: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Return the first and last row, and the first and last column, of the cells that a box reaches into."""
+    x, y, side = grid[0], grid[1], grid[2]
+    rows, columns = shape[0] - 1.0, shape[1] - 1.0
+    return (
+        int(min(max((low_y - y) / side, 0.0), rows)),
+        int(min(max((high_y - y) / side, 0.0), rows)),
+        int(min(max((low_x - x) / side, 0.0), columns)),
+        int(min(max((high_x - x) / side, 0.0), columns)),
+    )
+
+
+@compiled_inline
+def clear(x: float, y: float, reach: float, grid: NDArray[np.float64], clearances: NDArray[np.float64]) -> bool:
+    """Return whether nothing is within reach, as far as the grid tells; from beyond the grid all is as far or farther.
+
+    All but the wall, that is, which is in the cells at the border already.
+    """
+    rows, columns = clearances.shape
+    i = int(min(max((y - grid[1]) / grid[2], 0.0), rows - 1.0))
+    j = int(min(max((x - grid[0]) / grid[2], 0.0), columns - 1.0))
+    return bool(clearances[i, j] > reach)
 
 
 @compiled_inline
 def inside(x: float, y: float, shapes: Shapes, p: int) -> bool:
     """Return whether a point is in polygon p: a ray from it crosses the outline an odd number of times."""
     corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
-    within = False
-    for run in range(shapes.first_runs[p], shapes.first_runs[p + 1]):
-        first = start + RUN * (run - shapes.first_runs[p])
-        if not shapes.runs[run, 1] <= y < shapes.runs[run, 3] or x > shapes.runs[run, 2]:
-            continue
-        j = first - 1 if first > start else end - 1
-        for i in range(first, min(first + RUN, end)):
-            if (corners[i, 1] > y) != (corners[j, 1] > y):
-                part = (y - corners[i, 1]) / (corners[j, 1] - corners[i, 1])
-                if x < corners[i, 0] + part * (corners[j, 0] - corners[i, 0]):
-                    within = not within
-            j = i
+    within, j = False, end - 1
+    for i in range(start, end):
+        if (corners[i, 1] > y) != (corners[j, 1] > y):
+            part = (y - corners[i, 1]) / (corners[j, 1] - corners[i, 1])
+            if x < corners[i, 0] + part * (corners[j, 0] - corners[i, 0]):
+                within = not within
+        j = i
     return within
 
 
@@ -197,7 +218,7 @@ def polygon_gap(x: float, y: float, shapes: Shapes, p: int, reach: float) -> tup
     corners, start, end = shapes.corners, shapes.starts[p], shapes.starts[p + 1]
     starts, content, owners, shape = shapes.edges.starts, shapes.edges.content, shapes.owners, shapes.clearances.shape
     least, nearest = reach * reach, -1
-    first_row, last_row, first, last = cells_around(x - reach, y - reach, x + reach, y + reach, shapes.grid, shape)
+    first_row, last_row, first, last = _cells_around(x - reach, y - reach, x + reach, y + reach, shapes.grid, shape)
     columns = shape[1]
     for row in range(first_row, last_row + 1):
         for column in range(first, last + 1):
@@ -348,7 +369,7 @@ def segment_contacts(
             count += 1
     # A chord this deep behind a corner passes beside it, not over it.
     deepest = max(radius, 0.25 * size)
-    first_row, last_row, first, last = cells_around(
+    first_row, last_row, first, last = _cells_around(
         min(ax, bx) - deepest,
         min(ay, by) - deepest,
         max(ax, bx) + deepest,
@@ -369,24 +390,10 @@ def segment_contacts(
                 if not 0.0 < dx * ex + dy * ey < square or abs(dx * ey - dy * ex) >= deepest * size:
                     continue
                 gap, nx, ny, s = _segment_gap(ax, ay, bx, by, corners[i, 0], corners[i, 1])
-                if _is_behind(ax + s * (bx - ax), ay + s * (by - ay), gap, shapes, i):
+                if inside(ax + s * (bx - ax), ay + s * (by - ay), shapes, shapes.owners[i]):
                     gap, nx, ny = -gap, -nx, -ny
                 if gap < radius and count < rows.shape[0]:
                     rows[count, 0], rows[count, 1], rows[count, 2] = radius - gap, nx, ny
                     rows[count, 3], rows[count, 4] = gap, s
                     count += 1
     return count
-
-
-@compiled_inline
-def _is_behind(x: float, y: float, distance: float, shapes: Shapes, i: int) -> bool:
-    """Return whether a point at a distance from a corner that sticks out is in the corner's polygon."""
-    p, corners = shapes.owners[i], shapes.corners
-    if distance >= shapes.free[i]:
-        return inside(x, y, shapes, p)
-    start, end = shapes.starts[p], shapes.starts[p + 1]
-    j, k = i - 1 if i > start else end - 1, i + 1 if i + 1 < end else start
-    dx, dy = x - corners[i, 0], y - corners[i, 1]
-    before = (corners[i, 0] - corners[j, 0]) * dy - (corners[i, 1] - corners[j, 1]) * dx
-    after = (corners[k, 0] - corners[i, 0]) * dy - (corners[k, 1] - corners[i, 1]) * dx
-    return bool(before > 0.0 and after > 0.0)

@@ -13,27 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import ConfigurationError
 
 MU_0 = 4e-7 * math.pi  # T m/A
 MIN_MEAN = 1e-8  # of c_n: the next one is its square
 MAX_MEANS = 40
+LOOPS = 6  # of current that stand for a coil
 
 
 @dataclass(frozen=True)
 class Coil:
-    """A circular coil of uniform winding.
+    """A circular coil of one uniform layer.
 
     Attributes:
         centre: (x, y, z) [m].
-        axis: the direction of its field at the centre for a positive current; made a unit vector.
+        axis: unit vector along its field at the centre for a positive current.
         radius: mean radius of the winding [m].
         length: along the axis, 0 for a flat coil [m].
         turns: their number.
-        thickness: of the winding along the radius, 0 for a single layer [m].
-
-    Raises:
-        ConfigurationError: a value is not finite, or out of bounds.
     """
 
     centre: tuple[float, float, float]
@@ -41,50 +37,27 @@ class Coil:
     radius: float
     length: float
     turns: float
-    thickness: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check what was given."""
-        for name in ("centre", "axis"):
-            given = getattr(self, name)
-            if len(given) != 3 or not all(math.isfinite(value) for value in given):
-                raise ConfigurationError(f"coil.{name}", given, "three finite numbers")
-        size = math.hypot(*self.axis)
-        if size == 0.0:
-            raise ConfigurationError("coil.axis", self.axis, "a direction")
-        x, y, z = self.axis
-        object.__setattr__(self, "axis", (x / size, y / size, z / size))
-        for name in ("radius", "turns"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ConfigurationError(f"coil.{name}", getattr(self, name), "a positive number")
-        if not (math.isfinite(self.length) and self.length >= 0.0):
-            raise ConfigurationError("coil.length", self.length, "0 or more [m]")
-        if not 0.0 <= self.thickness < 2.0 * self.radius:
-            raise ConfigurationError("coil.thickness", self.thickness, "from 0 to less than the diameter [m]")
 
 
 class CoilField:
     """The field of several coils.
 
-    A coil is a sheet or block of current, integrated by Gauss and Legendre: loops at the nodes, and turns
-    by the weights. With the numbers below the field is right to 1e-6 from half a radius off a coil as long
-    as its radius.
+    A coil is a sheet of current, integrated by Gauss and Legendre: loops at the nodes, and turns by the weights. With
+    `LOOPS` of them the field is right to 1e-6 from half a radius off a coil as long as its radius.
 
     Args:
         coils: at least one.
-        along: loops along the length of a coil.
-        across: loops across its thickness.
+        loops: along the length of a coil.
     """
 
-    def __init__(self, coils: Sequence[Coil], *, along: int = 6, across: int = 3) -> None:
-        if not coils:
-            raise ConfigurationError("coils", "none", "at least one coil")
+    def __init__(self, coils: Sequence[Coil], *, loops: int = LOOPS) -> None:
         self.coils = tuple(coils)
-        rows = [
-            (index, *(np.array(coil.centre) + place * np.array(coil.axis)), *coil.axis, radius, turns)
-            for index, coil in enumerate(coils)
-            for radius, place, turns in _loops(coil, along, across)
-        ]
+        rows = []
+        for index, coil in enumerate(coils):
+            nodes, weights = np.polynomial.legendre.leggauss(loops if coil.length > 0.0 else 1)
+            for node, weight in zip(nodes, weights, strict=True):
+                centre = np.array(coil.centre) + 0.5 * coil.length * node * np.array(coil.axis)
+                rows.append((index, *centre, *coil.axis, coil.radius, 0.5 * weight * coil.turns))
         self._loops = np.array(rows, dtype=np.float64)
 
     def per_current(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -108,25 +81,6 @@ class CoilField:
         field = np.zeros((len(self.coils), len(points), 3))
         _add_loops(np.ascontiguousarray(points, dtype=np.float64), self._loops, field)
         return field
-
-
-def _loops(coil: Coil, along: int, across: int) -> NDArray[np.float64]:
-    """Return radius, place along the axis and turns of the loops that stand for a coil, shape (l, 3)."""
-    places, shares = _gauss(along if coil.length > 0.0 else 1)
-    radii, parts = _gauss(across if coil.thickness > 0.0 else 1)
-    return np.array(
-        [
-            (coil.radius + 0.5 * coil.thickness * r, 0.5 * coil.length * z, coil.turns * wr * wz)
-            for z, wz in zip(places, shares, strict=True)
-            for r, wr in zip(radii, parts, strict=True)
-        ]
-    )
-
-
-def _gauss(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return nodes on [-1, 1], and weights that add up to one."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return nodes, 0.5 * weights
 
 
 @compiled

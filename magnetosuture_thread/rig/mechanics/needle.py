@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts
-from magnetosuture_thread.rig.mechanics.contact_grid import clear
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
 
 NODES = 16  # of the integration along the body
 
@@ -31,9 +29,6 @@ class NeedleBody:
         curvature: 0 when straight, positive when it bends to the left on the way from tail to tip [1/m].
         magnetisation: along the body, from tail to tip [A/m].
         viscosity: of the liquid [Pa s].
-
-    Raises:
-        ConfigurationError: a value is not finite, or out of bounds.
     """
 
     length: float
@@ -41,18 +36,6 @@ class NeedleBody:
     curvature: float
     magnetisation: float
     viscosity: float
-
-    def __post_init__(self) -> None:
-        """Check what was given."""
-        for name in ("length", "diameter", "viscosity"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise ConfigurationError(f"needle.{name}", getattr(self, name), "a positive number")
-        if not math.isfinite(self.magnetisation):
-            raise ConfigurationError("needle.magnetisation", self.magnetisation, "a finite number [A/m]")
-        if not self.length >= 2.0 * self.diameter:
-            raise ConfigurationError("needle.length", self.length, "at least two diameters [m]")
-        if not abs(self.curvature) * self.length < 2.0 * math.pi:
-            raise ConfigurationError("needle.curvature", self.curvature, "less than a full turn over the length [1/m]")
 
     @property
     def pole(self) -> float:
@@ -123,25 +106,6 @@ class NeedleBody:
         total[2, 2] += turn - across * self.length**2 / 12.0
         return np.asarray(total)
 
-    def wrench(
-        self, field_tail: NDArray[np.float64], field_tip: NDArray[np.float64], heading: float
-    ) -> tuple[NDArray[np.float64], float]:
-        """Return force and torque about the tail of the field on the poles.
-
-            F = q (B_tip - B_tail),    T = q (x_tip - x_tail) x B_tip
-
-        Args:
-            field_tail: flux density at the tail in the plane, shape (2,) [T].
-            field_tip: the same at the tip.
-            heading: [rad].
-
-        Returns:
-            Force, shape (2,) [N]; torque, positive to the left [N m].
-        """
-        c, s = math.cos(heading), math.sin(heading)
-        x, y = c * self.tip[0] - s * self.tip[1], s * self.tip[0] + c * self.tip[1]
-        return self.pole * (field_tip - field_tail), float(self.pole * (x * field_tip[1] - y * field_tip[0]))
-
 
 class Needle(NamedTuple):
     """A needle as kernels read it.
@@ -152,7 +116,7 @@ class Needle(NamedTuple):
         pole: at the tip [A m].
         outline: points that touch, in the needle's frame, shape (m, 2) [m].
         radius: of these [m].
-        clamp: (d, c) of the stiffness d |x_1 - x_0 + R (D, c)|^2 of a clamped thread, d = 0 when pinned [N/m, m].
+        clamp: stiffness d of a clamped thread's d |x_1 - x_0 + R (D, 0)|^2, 0 when pinned [N/m].
     """
 
     resistance: NDArray[np.float64]
@@ -160,7 +124,7 @@ class Needle(NamedTuple):
     pole: float
     outline: NDArray[np.float64]
     radius: float
-    clamp: tuple[float, float]
+    clamp: float
 
 
 @compiled
@@ -272,16 +236,15 @@ def add_clamp(
     band: NDArray[np.float64],
     convex: bool,
 ) -> float:
-    """Add d |x_1 - x_0 + R (D, c)|^2, the half cell of bending at a clamped tail.
+    """Add d |x_1 - x_0 + R (D, 0)|^2, the half cell of bending at a clamped tail.
 
-    With d = EI / D^3 and c = D^2 rest_curvature / 2 that is EI D / 4 (curvature - rest)^2, the curvature from a
-    mirrored node before the tail: of second order in D.
+    With d = EI / D^3 that is EI D / 4 curvature^2, the curvature from a mirrored node before the tail: of second order
+    in D.
     """
-    d = needle.clamp[0]
+    d = needle.clamp
     if d == 0.0:
         return 0.0
-    c, s = math.cos(q[0]), math.sin(q[0])
-    hx, hy = c * segment - s * needle.clamp[1], s * segment + c * needle.clamp[1]
+    hx, hy = math.cos(q[0]) * segment, math.sin(q[0]) * segment
     ux, uy = q[3] - q[1] + hx, q[4] - q[2] + hy
     along = ux * hx + uy * hy
     if convex:

@@ -8,16 +8,50 @@ are kept as B[i, k] = d2E / dq_i dq_{i-k}, shape (2n + 3, 6).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, point_contacts, segment_contacts
-from magnetosuture_thread.rig.mechanics.contact_grid import clear
+from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
 
+SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 WIDTH = 6  # of the band: half-width and diagonal
+
+
+class NeedleJoint(str, Enum):
+    """How the thread is tied to the needle's tail."""
+
+    PINNED = "pinned"
+    CLAMPED = "clamped"
+
+
+@dataclass(frozen=True)
+class ThreadProperties:
+    """The thread in its liquid.
+
+    Attributes:
+        length: L [m].
+        segments: n.
+        bending_stiffness: EI, 0 for a chain [N m^2].
+        stretching_stiffness: EA [N].
+        drag_across: per length, across the thread [Pa s].
+        drag_along: the same along it.
+        attachment: pinned, it turns freely at the needle's tail, or clamped, it leaves against the heading.
+        diameter: for contact [m].
+    """
+
+    length: float
+    segments: int
+    bending_stiffness: float
+    stretching_stiffness: float
+    drag_across: float
+    drag_along: float
+    attachment: NeedleJoint
+    diameter: float = 0.0
 
 
 class Rod(NamedTuple):
@@ -29,7 +63,6 @@ class Rod(NamedTuple):
         bending: EI [N m^2].
         across: drag per length across the thread [Pa s].
         along: the same along it.
-        rest_turn: angle between two segments at rest, positive to the left from node 0 on [rad].
         radius: half the diameter [m].
     """
 
@@ -38,7 +71,6 @@ class Rod(NamedTuple):
     bending: float
     across: float
     along: float
-    rest_turn: float
     radius: float
 
 
@@ -128,45 +160,28 @@ def add_stretching(
 
 
 @compiled
-def add_bending(
-    q: NDArray[np.float64],
-    rod: Rod,
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
-    """Add sum EI / D (1 - cos(phi_i - rest)) at inner nodes, phi_i the turn from segment to segment.
+def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64], band: NDArray[np.float64]) -> float:
+    """Add sum EI / D (1 - cos(phi_i)) at inner nodes, phi_i the turn from segment to segment.
 
-        = EI / D^3 sum (cos(rest) |x_{i+1} - 2 x_i + x_{i-1}|^2 / 2 - sin(rest) e_i x e_{i+1}) + const
+        = EI / (2 D^3) sum |x_{i+1} - 2 x_i + x_{i-1}|^2
 
-    at the length D, which stretching holds: quadratic, and EI (curvature - rest curvature)^2 D / 2 to second order.
+    at the length D, which stretching holds: quadratic, and EI curvature^2 D / 2 to second order.
     """
     energy = 0.0
     k = rod.bending / rod.segment**3
-    c, s = k * math.cos(rod.rest_turn), k * math.sin(rod.rest_turn)
     for a in range(1, q.shape[0] - 4, 2):
-        ax, ay, bx, by = q[a + 2] - q[a], q[a + 3] - q[a + 1], q[a + 4] - q[a + 2], q[a + 5] - q[a + 3]
-        ux, uy = bx - ax, by - ay
-        energy += 0.5 * c * (ux * ux + uy * uy) - s * (ax * by - ay * bx)
-        gradient[a] += c * ux + s * by
-        gradient[a + 1] += c * uy - s * bx
-        gradient[a + 2] -= 2.0 * c * ux + s * (by + ay)
-        gradient[a + 3] -= 2.0 * c * uy - s * (bx + ax)
-        gradient[a + 4] += c * ux + s * ay
-        gradient[a + 5] += c * uy - s * ax
-        for r in range(2):
-            band[a + r, 0] += c
-            band[a + 2 + r, 0] += 4.0 * c
-            band[a + 4 + r, 0] += c
-            band[a + 2 + r, 2] -= 2.0 * c
-            band[a + 4 + r, 2] -= 2.0 * c
-            band[a + 4 + r, 4] += c
-        if s != 0.0 and not convex:
-            for b in (a + 2, a + 4):
-                band[b + 1, 3] -= s
-                band[b, 1] += s
-            band[a + 5, 5] += s
-            band[a + 4, 3] -= s
+        for r in range(a, a + 2):
+            u = (q[r + 4] - q[r + 2]) - (q[r + 2] - q[r])
+            energy += 0.5 * k * u * u
+            gradient[r] += k * u
+            gradient[r + 2] -= 2.0 * k * u
+            gradient[r + 4] += k * u
+            band[r, 0] += k
+            band[r + 2, 0] += 4.0 * k
+            band[r + 4, 0] += k
+            band[r + 2, 2] -= 2.0 * k
+            band[r + 4, 2] -= 2.0 * k
+            band[r + 4, 4] += k
     return energy
 
 
@@ -222,6 +237,84 @@ def add_contact(
                 for c in range(r + 1):
                     second = turn * (z[r] * v[c] + v[r] * z[c] + bend * v[r] * v[c])
                     band[a + r, r - c] += k * (w[r] * w[c] + depth * second)
+    return energy
+
+
+@compiled
+def find_friction(
+    q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArray[np.float64], friction: NDArray[np.float64]
+) -> None:
+    """Write where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
+
+    A contact that pushes with the force N at the start of a step adds, for its slip s = t . (x - x_start) along it,
+
+        mu N (sqrt(s^2 + e^2) - e),    e = SLIP_SPEED dt
+
+    to the energy of the step: a force of mu N s / sqrt(s^2 + e^2) against the slip.
+
+    Args:
+        q: state at the start, shape (N,) [rad, m].
+        rod: the thread.
+        shapes: what can be touched, with its friction.
+        rows: to work in, see `point_contacts`.
+        friction: gets the index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N]; a last
+            row without a force ends it.
+    """
+    count, most, limit = 0, friction.shape[0] - 1, shapes.friction * shapes.stiffness
+    if limit > 0.0:
+        for a in range(3, q.shape[0] - 1, 2):
+            if clear(q[a], q[a + 1], rod.radius, shapes.grid, shapes.clearances):
+                continue
+            for row in range(point_contacts(q[a], q[a + 1], rod.radius, shapes, rows)):
+                if count < most:
+                    _write_row(friction[count], a, 0.0, rows[row], limit * rows[row, 0])
+                    count += 1
+        for a in range(1, q.shape[0] - 2, 2):
+            x, y = 0.5 * (q[a] + q[a + 2]), 0.5 * (q[a + 1] + q[a + 3])
+            size = math.sqrt((q[a + 2] - q[a]) ** 2 + (q[a + 3] - q[a + 1]) ** 2)
+            if clear(x, y, rod.radius + 0.75 * size, shapes.grid, shapes.clearances):
+                continue
+            found = segment_contacts(q[a], q[a + 1], q[a + 2], q[a + 3], rod.segment, rod.radius, shapes, rows)
+            for row in range(found):
+                if count < most:
+                    _write_row(friction[count], a, rows[row, 4], rows[row], limit * rows[row, 0])
+                    count += 1
+    friction[count, 4] = 0.0
+
+
+@compiled
+def _write_row(friction: NDArray[np.float64], a: int, place: float, row: NDArray[np.float64], limit: float) -> None:
+    friction[0], friction[1], friction[2], friction[3], friction[4] = a, place, -row[2], row[1], limit
+
+
+@compiled
+def add_friction(
+    q: NDArray[np.float64],
+    start: NDArray[np.float64],
+    slip: float,
+    friction: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    band: NDArray[np.float64],
+) -> float:
+    """Add the friction of a step from `start` to q; `slip` is e [m]."""
+    energy = 0.0
+    for row in range(friction.shape[0]):
+        limit = friction[row, 4]
+        if limit == 0.0:
+            break
+        a, s, tx, ty = int(friction[row, 0]), friction[row, 1], friction[row, 2], friction[row, 3]
+        w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
+        count = 2 if s == 0.0 else 4
+        along = 0.0
+        for r in range(count):
+            along += w[r] * (q[a + r] - start[a + r])
+        root = math.sqrt(along * along + slip * slip)
+        energy += limit * (root - slip)
+        force, second = limit * along / root, limit * slip * slip / root**3
+        for r in range(count):
+            gradient[a + r] += force * w[r]
+            for c in range(r + 1):
+                band[a + r, r - c] += second * w[r] * w[c]
     return energy
 
 

@@ -1,4 +1,7 @@
-"""A simulated RoboClaw board and the two coils on it: bytes in, bytes out."""
+"""A simulated RoboClaw board and the two coils on it: packets in, answers out.
+
+Nothing here knows the maker's library.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,34 @@ import math
 import struct
 from collections import deque
 
-from magnetosuture_thread.rig.power import packets
-from magnetosuture_thread.rig.power.packets import Parser
+ACKNOWLEDGED = b"\xff"
+ADDRESSES = range(0x80, 0x88)
+PACKET_GAP = 0.01  # s between two bytes, after which a packet that is not complete is forgotten
+
+SET_TIMEOUT, GET_TIMEOUT, GET_VERSION = 14, 15, 21
+GET_MAIN_VOLTAGE, GET_LOGIC_VOLTAGE, GET_VOLTAGES = 24, 25, 100
+SET_DUTY_1, SET_DUTY_2, SET_DUTIES = 32, 33, 34
+GET_DUTIES, GET_CURRENTS, GET_TEMPERATURE, GET_STATUS = 48, 49, 82, 90
+SET_LIMIT_1, SET_LIMIT_2, GET_LIMIT_1, GET_LIMIT_2 = 133, 134, 135, 136
+RESET_STOP = 200
+
+# What each command that changes something carries, between command and checksum.
+ARGUMENTS = {
+    SET_TIMEOUT: ">B",
+    SET_DUTY_1: ">h",
+    SET_DUTY_2: ">h",
+    SET_DUTIES: ">hh",
+    SET_LIMIT_1: ">II",
+    SET_LIMIT_2: ">II",
+    RESET_STOP: ">",
+}
+# Those that only ask come without a checksum.
+QUESTIONS = frozenset(
+    {
+        *(GET_TIMEOUT, GET_VERSION, GET_MAIN_VOLTAGE, GET_LOGIC_VOLTAGE, GET_VOLTAGES, GET_DUTIES, GET_CURRENTS),
+        *(GET_TEMPERATURE, GET_STATUS, GET_LIMIT_1, GET_LIMIT_2),
+    }
+)
 
 FULL = 32767  # duty of the whole supply voltage
 VERSION = b"RoboClaw simulated 2x15A v4.2.4\n\x00"
@@ -63,7 +92,7 @@ class RoboClawBoard:
         self.broken: set[int] = set()
         self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=KEPT)
         self.heard = -math.inf
-        self._parser = Parser()
+        self._parser = _Parser()
         self._time = -math.inf
 
     def receive(self, data: bytes, time: float) -> bytes:
@@ -90,7 +119,7 @@ class RoboClawBoard:
         self._set((0, 0), self._time)
         self.timeout = FACTORY_TIMEOUT
         self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
-        self._parser = Parser()
+        self._parser = _Parser()
 
     @property
     def outputs(self) -> tuple[int, int]:
@@ -124,48 +153,48 @@ class RoboClawBoard:
 
     def _handle(self, packet: bytes) -> bytes:
         command = packet[1]
-        if command in packets.QUESTIONS:
+        if command in QUESTIONS:
             self.heard = self._time
-            return packets.answer(self.address, command, self._data(command))
-        if packets.checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
+            return answer(self.address, command, self._data(command))
+        if checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
             return b""
         self.heard = self._time
         if command not in self.ignored:
-            self._obey(command, struct.unpack(packets.ARGUMENTS[command], packet[2:-2]))
-        return packets.ACKNOWLEDGED
+            self._obey(command, struct.unpack(ARGUMENTS[command], packet[2:-2]))
+        return ACKNOWLEDGED
 
     def _obey(self, command: int, values: tuple[int, ...]) -> None:
-        if command == packets.SET_TIMEOUT:
+        if command == SET_TIMEOUT:
             self.timeout = values[0]
-        elif command in (packets.SET_LIMIT_1, packets.SET_LIMIT_2):
-            self.limits[command - packets.SET_LIMIT_1] = values[0]
-        elif command == packets.RESET_STOP:
+        elif command in (SET_LIMIT_1, SET_LIMIT_2):
+            self.limits[command - SET_LIMIT_1] = values[0]
+        elif command == RESET_STOP:
             self.errors &= ~EMERGENCY_STOP
         elif not self.errors:
-            first = values[0] if command != packets.SET_DUTY_2 else self.duties[0]
-            second = values[-1] if command != packets.SET_DUTY_1 else self.duties[1]
+            first = values[0] if command != SET_DUTY_2 else self.duties[0]
+            second = values[-1] if command != SET_DUTY_1 else self.duties[1]
             self._set((first, second), self._time)
 
     def _data(self, command: int) -> bytes:
         """Return what the answer to a question says."""
-        if command == packets.GET_VERSION:
+        if command == GET_VERSION:
             return VERSION
-        if command == packets.GET_TIMEOUT:
+        if command == GET_TIMEOUT:
             return bytes((self.timeout,))
-        if command == packets.GET_STATUS:
+        if command == GET_STATUS:
             return struct.pack(">I", self.warnings << 16 | self.errors)
-        if command in (packets.GET_LIMIT_1, packets.GET_LIMIT_2):
-            return struct.pack(">II", self.limits[command - packets.GET_LIMIT_1], 0)
-        if command == packets.GET_DUTIES:
+        if command in (GET_LIMIT_1, GET_LIMIT_2):
+            return struct.pack(">II", self.limits[command - GET_LIMIT_1], 0)
+        if command == GET_DUTIES:
             return struct.pack(">hh", *self.outputs)
-        if command == packets.GET_CURRENTS:
+        if command == GET_CURRENTS:
             return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
         volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
         return {
-            packets.GET_MAIN_VOLTAGE: volts,
-            packets.GET_LOGIC_VOLTAGE: logic,
-            packets.GET_VOLTAGES: volts + logic,
-            packets.GET_TEMPERATURE: struct.pack(">H", 250),
+            GET_MAIN_VOLTAGE: volts,
+            GET_LOGIC_VOLTAGE: logic,
+            GET_VOLTAGES: volts + logic,
+            GET_TEMPERATURE: struct.pack(">H", 250),
         }[command]
 
     def _reported(self, channel: int) -> int:
@@ -173,3 +202,60 @@ class RoboClawBoard:
         current, duty = self.currents[channel], self.duties[channel]
         driven = math.copysign(current, current * duty) if duty else abs(current)
         return max(-0x8000, min(0x7FFF, round(100.0 * (driven + self.mismeasured))))
+
+
+def checksum(data: bytes) -> int:
+    """Return the CRC-16 of a packet, of the polynomial x^16 + x^12 + x^5 + 1, from zero and not reflected.
+
+    Source: Basicmicro, "RoboClaw Series User Manual", packet serial. Deviation: none.
+
+    >>> hex(checksum(b"123456789"))
+    '0x31c3'
+    """
+    crc = 0
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return crc
+
+
+def _length(command: int) -> int | None:
+    """Return the number of bytes of a packet with a command, None if it is unknown."""
+    if command in QUESTIONS:
+        return 2
+    return 4 + struct.calcsize(ARGUMENTS[command]) if command in ARGUMENTS else None
+
+
+def answer(address: int, command: int, data: bytes) -> bytes:
+    """Return the answer to a question: data, and the checksum over the question and the data."""
+    return data + struct.pack(">H", checksum(bytes((address, command)) + data))
+
+
+class _Parser:
+    """Cuts a stream of bytes into packets."""
+
+    def __init__(self) -> None:
+        self._bytes = b""
+        self._heard = 0.0
+
+    def feed(self, data: bytes, time: float) -> list[bytes]:
+        """Receive bytes at a time [s] and return the packets that they complete, checksums not yet verified."""
+        if time - self._heard > PACKET_GAP:
+            self._bytes = b""
+        self._heard = time
+        self._bytes += data
+        packets: list[bytes] = []
+        while True:
+            while self._bytes and self._bytes[0] not in ADDRESSES:
+                self._bytes = self._bytes[1:]
+            if len(self._bytes) < 2:
+                return packets
+            size = _length(self._bytes[1])
+            if size is None:  # nobody can tell where it ends
+                self._bytes = b""
+                return packets
+            if len(self._bytes) < size:
+                return packets
+            packets.append(self._bytes[:size])
+            self._bytes = self._bytes[size:]

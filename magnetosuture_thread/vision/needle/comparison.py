@@ -1,11 +1,22 @@
-"""Compares an image with a drawn needle: what is missing, what is too much, and how blunt its ends look."""
+"""Compares an image with a drawn needle: what is missing, what is too much, and what goes on from its ends."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.needle.template import BESIDE_PX, STEP_PX, TAPER, THIN, draw_needle, sample_along
+from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.needle.steel_map import SteelMap
+from magnetosuture_thread.vision.needle.template import (
+    BESIDE_PX,
+    STEP_PX,
+    TAPER,
+    THIN,
+    TemplateFit,
+    draw_needle,
+    sample_along,
+)
+from magnetosuture_thread.vision.sampling import middle, straighten
 
 
 @compiled
@@ -164,3 +175,62 @@ def _fade(along, share):
             high = index
             break
     return along[last if high < 0 else high] - along[last if low < 0 else low]
+
+
+def thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
+    """Return how far off the middle of the beginning and the end of an axis a thread goes on there; None: none does.
+
+    A thread that leaves an end goes through its middle. One that lies over or under the needle passes beside it.
+    """
+    beyond = -np.arange(1.5, 6.0, 0.5)
+    aside = np.arange(-0.5 * fit.width - 3.0, 0.5 * fit.width + 3.1, 0.5)
+    result: list[float | None] = []
+    for arc in (fit.arc, fit.reversed()):
+        dark = _darkness(steel.perhaps, arc, beyond, aside)
+        widths = 0.5 * dark.sum(axis=1)
+        if middle(widths) < 0.25:
+            result.append(None)
+            continue
+        centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)
+        result.append(abs(float(np.polyfit(beyond, centres, 1, w=np.minimum(widths, 1.0))[1])))
+    return result[0], result[1]
+
+
+def leaves_sideways(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether something wide and dark lies beside a tail, whose edge may be taken for the tail's."""
+    side = 0.5 * fit.width + 1.7
+    dark = _darkness(steel.surely, fit.arc, np.arange(-1.0, 3.1), np.array([-side, side]))
+    return bool(dark.mean(axis=0).max() > 0.6)
+
+
+def lies_over_tail(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether a line lies over the needle at its tail: it makes one side, or the middle, another colour than steel.
+
+    A thread that is as dark as steel there does not lie over it, or hides nothing.
+    """
+    aside = 0.35 * fit.width
+    across = np.array([-aside, -0.75, 0.0, 0.75, aside])
+    left, beside, centre, other, right = np.median(_darkness(steel.dark, fit.arc, np.arange(2.0, 12.0), across), axis=0)
+    most = max(abs(left - right), abs(beside - other), 0.5 * (beside + other) - centre)
+    return bool(most > 0.12 * steel.depth)
+
+
+def ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread.
+
+    Half of the width of a thread that leaves sideways lies beyond the tail too.
+    """
+    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
+    dark = _darkness(steel.surely, fit.arc, -np.arange(1.0, 0.2 * fit.length + 4.0), aside)
+    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
+    if len(light) and light[0] < fit.width and leaves_sideways(steel, fit):
+        return False
+    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)
+
+
+def _darkness(dark: np.ndarray, arc: Arc, along: np.ndarray, aside: np.ndarray) -> np.ndarray:
+    """Return an image along and aside of an axis, shape (m, n)."""
+    values = np.empty((len(along), len(aside)))
+    axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
+    straighten(dark, axis, along, aside, values)
+    return values

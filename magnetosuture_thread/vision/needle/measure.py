@@ -5,53 +5,36 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.axis_guesses import axis_guesses
-from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fading, steel_rows
-from magnetosuture_thread.vision.needle.ends import ends_beyond, leaves_sideways, leaves_tail, thread_offsets
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.needle.size import NeedleSize
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
+from magnetosuture_thread.vision.needle.comparison import (
+    bluntness,
+    ends_beyond,
+    excess,
+    fading,
+    leaves_sideways,
+    lies_over_tail,
+    steel_rows,
+    thread_offsets,
+)
 from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.tail_edge import tail_shift
 from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
-from magnetosuture_thread.vision.sampling import straighten
+from magnetosuture_thread.vision.sampling import middle, straighten
 
-FAINTEST = 0.3  # of the floor's brightness: a needle is darker than it by at least this
-LEVELS = (0.5, 0.7)  # share of steel that is dark: more of a thread over the needle is, less of one beside it
-MAX_FITS = 3
-MAX_OFF = 1.2  # times the tolerance of the length, that a measured one may be off
-GOES_ON = 0.35  # of the body's width beyond an end that is dark where the needle may go on
-MIN_CHANGE = 0.4  # of the tolerance, by which what is dark is longer or shorter where another length is tried too
-GLARE_PX = 4.0  # beyond an end, that the lamp may not be reflected at
-ROUGH, MORE_PX = 0.08, 3.0  # of the length, that a first guess may be off; more than is dark, to begin a fit with
-SAME_PX = 1.5  # that both ends of two guesses may differ by
-MAX_COST = 0.11  # of the length, in squared pixels
-MAX_MISSING, MISSING_ROWS = 0.13, 5  # of the steel of so many rows, that the image may lack
-MAX_MISSING_TAIL, TAIL_ROWS = 0.15, 3  # of these, next to the tail
-MAX_MISSING_TIP, TIP = 0.2, 0.2  # of the steel of this last part of the length
-SURE, SURE_ROWS = 0.75, 0.97  # share of steel that some place of a row has, and of the rows that have one
-MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-MAX_BOTH = 0.2  # of it beyond both ends, which a thread leaves or passes at one only
-SHARP = 0.2  # bluntness of both sides of a tip if the thread is so thick
-AXIS_POINTS, MAX_HIDDEN = 100, 0.02  # along the axis, and the share of them that wall and shapes may hide
-MAX_BESIDE = 0.1  # of the rows with something as dark as steel off the body's side
-BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
-NEARLY_POINTED = 0.45  # bluntness of a tip at most, of a needle that can only point this way
-NOT_BLUNT, NOT_POINTED = 0.5, 0.6  # bluntness of what is no tail at most, and of what is no tip at least
+CLEAR_COST, MAX_COST = 0.03, 0.11  # of the length, in squared pixels: nothing else is better; it is no needle
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
-CLEAR_COST = 0.03  # of the length, in squared pixels: a needle that nothing else can be better than
 CLEARLY, DEARER = 1.25, 1.15  # times the cost that the other way has if both could be; if one end speaks against it
-ROD = 0.87  # bluntness of both ends of a rod
-ROD_GAIN = 0.003  # of the body's area, by which a rod costs less; corners of a small tip tell less
 SAME_LENGTH = 0.015  # share of the length, that need no proof
-LENGTH_GAIN = 0.1  # px; times the width, that the fit of another length must cost less by
-FADES_PX = 0.7  # over which a tail may fade more than the sides do
-PULL_PX = 1.5  # that a thread as wide as the needle draws a measured tail outwards by, one deviation
-PASSES, PASSES_PX = 0.3, 0.3  # of the width, and more, off an end's middle: a thread passes, and does not leave
-ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
+MAX_MISSING, MAX_MISSING_END, END_ROWS = 0.13, 0.15, 3  # share of steel that the image may lack; at an end, in rows
+MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
+BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
 TOWARD = 0.8  # cosine between a needle and where it must point
+CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
+ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
 
 
 def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None = None) -> MeasuredNeedle | str:
@@ -68,23 +51,23 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     Returns:
         The needle, in the picture's pixels, or in words why there is none.
     """
-    if steel.depth < FAINTEST:
+    if steel.depth < 0.3:  # of the floor's brightness
         return "too faint"
     length, width = size.length_px, size.width_px
     ends = np.array([0.0, length])
     guesses: list[np.ndarray] = []  # both ends of each
     fits: list[TemplateFit] = []
-    for level in LEVELS:
+    for level in (0.5, 0.7):  # share of steel: more of a thread over the needle is dark, less of one beside it
         for guess in axis_guesses(steel.surely > level, length, width):
             at = guess.at(ends)
-            if not any(np.abs(at - other).max() < SAME_PX for other in guesses):
+            if not any(np.abs(at - other).max() < 1.5 for other in guesses):
                 guesses.append(at)
                 fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
         fits.sort(key=lambda fit: fit.cost)
         if fits and fits[0].cost < CLEAR_COST * length:
             break
     found: MeasuredNeedle | str = NO_SHAPE if fits else "no arc"
-    for rough in fits[:MAX_FITS]:
+    for rough in fits[:3]:
         if rough.cost > HOPELESS * MAX_COST * length:
             break
         found = _checked(steel, rough, size, toward)
@@ -99,12 +82,7 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     return found
 
 
-def _checked(
-    steel: SteelMap,
-    rough: TemplateFit,
-    size: NeedleSize,
-    toward: np.ndarray | None,
-) -> MeasuredNeedle | str:
+def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.ndarray | None) -> MeasuredNeedle | str:
     """Fit to the end, in both directions; return the needle if all looks like one, in one direction."""
     width = size.width_px
     one, other, rod = _fits(steel, rough, size, size.tolerance)
@@ -124,35 +102,33 @@ def _checked(
     length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
     if reason := _what_covers(steel, shown, best, width):
         return reason
-    if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, AXIS_POINTS))) > MAX_HIDDEN:
+    if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, 100))) > 0.02:
         return "hidden"
     if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
         return "bent beyond a half circle"
     around = _excess(steel.surely, best, width)
-    if max(around[4], around[5]) > MAX_BESIDE:
+    if max(around[4], around[5]) > 0.1:  # of the rows
         return "something dark against it"
     is_known = True
     pointed = min((one, other), key=lambda each: each.cost)
-    is_rod = rod.cost < pointed.cost - ROD_GAIN * rod.length * rod.width and _is_rod(steel, rod)
+    is_rod = rod.cost < pointed.cost - 0.003 * rod.length * rod.width and _is_rod(steel, rod)
     fit = None if is_rod else _pointed_way(steel, one, other)
     is_clear = is_rod or max(one.cost, other.cost) > CLEARLY * pointed.cost
     if fit is None:
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
-        settled = _settled(steel, rod if is_rod else pointed, rod, size, toward, is_rod=is_rod)
+        settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
         if settled is None:
             return ALIKE
         fit, is_known = settled
-    if steel.is_bridged:  # What lies over it may hide the shape of an end, or look like a thread that leaves one.
-        is_known = toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD
-        fit = _pointing(fit, toward) if toward is not None and is_known else fit
     if reason := _what_prolongs(steel, fit, width, is_known):
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
-    pull = PULL_PX * max(0.0, float(_excess(steel.surely, fit, width)[3]))
+    # A thread as wide as the needle draws a measured tail outwards by 1.5 px, one deviation.
+    pull = 1.5 * max(0.0, float(_excess(steel.surely, fit, width)[3]))
     if not is_measured:
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
@@ -185,7 +161,7 @@ def _fits(
     starts = [(rough.arc, length)]
     if tolerance:
         part = _dark_part(steel, rough.arc, size)
-        if abs(part[1] - length) > MIN_CHANGE * tolerance * length:
+        if abs(part[1] - length) > 0.4 * tolerance * length:
             starts.append(part)
     ones = [fit_template(steel, arc, length, width, tolerance=tolerance, start=start) for arc, start in starts]
     one = min(ones, key=lambda each: each.cost)
@@ -204,12 +180,12 @@ def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
         return True
     is_rod = fit.thin == 1.0
     known = fit_template(steel, fit.arc, size.length_px, size.width_px, rod=is_rod)
-    return known.cost - fit.cost > LENGTH_GAIN * size.width_px
+    return known.cost - fit.cost > 0.1 * size.width_px
 
 
 def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
     """Return the part of an axis that is dark, with a little more: what a fit lacks draws it in from farther away."""
-    length, slack = size.length_px, (size.tolerance + ROUGH) * size.length_px
+    length, slack = size.length_px, (size.tolerance + 0.08) * size.length_px
     along = np.arange(-slack, length + slack)
     dark = np.empty((len(along), 3))
     axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
@@ -220,7 +196,7 @@ def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]
     last = along[light[light >= half].min(initial=len(along)) - 1]
     if last - first > (1.0 + size.tolerance) * length:
         return arc, length
-    return arc.moved(float(first), 0.0, 0.0, 0.0), min(float(last - first) + MORE_PX, (1.0 + size.tolerance) * length)
+    return arc.moved(float(first), 0.0, 0.0, 0.0), min(float(last - first) + 3.0, (1.0 + size.tolerance) * length)
 
 
 def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
@@ -228,12 +204,12 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
 
     Something as wide and dark that goes on from an end, or leaves the tail sideways, and the lamp's reflection hide it.
     """
-    if abs(fit.length - size.length_px) > MAX_OFF * size.tolerance * size.length_px:
+    if abs(fit.length - size.length_px) > 1.2 * size.tolerance * size.length_px:
         return False
     beyond, state = _excess(steel.perhaps, fit, size.width_px)[2:4], _state(fit.arc, fit.width)
-    if beyond.max() > GOES_ON or fading(steel.surely, state, fit.length, fit.width) > FADES_PX:
+    if beyond.max() > 0.35 or fading(steel.surely, state, fit.length, fit.width) > 0.7:
         return False
-    ends = fit.arc.at(np.array([-GLARE_PX, 0.0, fit.length, fit.length + GLARE_PX]))
+    ends = fit.arc.at(np.array([-4.0, 0.0, fit.length, fit.length + 4.0]))
     return not leaves_sideways(steel, fit) and not steel.is_glaring(ends)
 
 
@@ -246,10 +222,10 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
         if fit.cost > CLEARLY * against.cost:
             continue
         tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
-        if tail < BLUNT or tip > NEARLY_POINTED:
+        if tail < BLUNT or tip > 0.45:
             continue
         their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
-        signs = (their_tail < NOT_BLUNT) + (their_tip > NOT_POINTED)
+        signs = (their_tail < 0.5) + (their_tip > 0.6)
         needed = (CLEARLY, DEARER, 0.0)[signs]  # times the cost, for as many signs against the other way
         if tip > POINTED:  # as the wall blunts a tip
             needed = HOPELESS if signs == 2 else math.inf
@@ -259,9 +235,9 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
 
 
 def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[float, float]:
-    """Return how blunt tail and tip may be, what is below something coloured counted as steel; see `bluntness`."""
+    """Return how blunt tail and tip may be, where a coloured thread may hide steel; see `bluntness`."""
     result = np.empty((2, 2))
-    bluntness(steel.below, _state(arc, width), length, 0.5 * width, result)
+    bluntness(steel.perhaps, _state(arc, width), length, 0.5 * width, result)
     return float(result[0].min()), float(result[1].min())
 
 
@@ -270,17 +246,17 @@ def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit, width: floa
     if fit.cost > MAX_COST * fit.length:
         return NO_SHAPE
     rows, state = np.empty((int(fit.length), 3)), _state(fit.arc, fit.width)
-    tip = int((1.0 - TIP) * len(rows))
+    tip = int(0.8 * len(rows))
     steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
     at_tip = rows[tip:].copy()
     steel_rows(shown.surely, shown.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
     share, greatest = rows[:, 0], rows[:, 2]
-    even = np.convolve(share[:tip], np.full(MISSING_ROWS, 1.0 / MISSING_ROWS), "valid")
-    if even.max() > MAX_MISSING or share[:TAIL_ROWS].mean() > MAX_MISSING_TAIL:
+    even = np.convolve(share[:tip], np.full(5, 0.2), "valid")
+    if even.max() > MAX_MISSING or share[:END_ROWS].mean() > MAX_MISSING_END:
         return "something over it or against it"
-    if np.mean(greatest[:tip] > SURE) < SURE_ROWS:
+    if np.mean(greatest[:tip] > 0.75) < 0.97:
         return "no needle's darkness"
-    if at_tip[:, 0] @ at_tip[:, 1] > MAX_MISSING_TIP * at_tip[:, 1].sum():
+    if at_tip[:, 0] @ at_tip[:, 1] > 0.2 * at_tip[:, 1].sum():
         return "something over it or against it"
     return ""
 
@@ -288,14 +264,14 @@ def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit, width: floa
 def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bool) -> str:
     """Say at which end something goes on that is too wide for a thread; empty if nothing does."""
     beyond_tip, beyond_tail = _excess(steel.surely, fit, width)[2:4]
-    if min(beyond_tip, beyond_tail) > MAX_BOTH:
+    if min(beyond_tip, beyond_tail) > 0.2:  # A thread leaves or passes at one only.
         return "something at both ends"
     if beyond_tip > MAX_BEYOND:
         return "something at its tip"
     if beyond_tail > MAX_BEYOND:
         blunt = np.empty((2, 2))
         bluntness(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, blunt)
-        if not is_known or blunt[1].max() > SHARP or ends_beyond(steel, fit):
+        if not is_known or blunt[1].max() > 0.2 or ends_beyond(steel, fit):
             return "something at its tail"
     return ""
 
@@ -313,7 +289,7 @@ def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> np.ndarray:
 
 
 def _settled(
-    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize, toward: np.ndarray | None, *, is_rod: bool
+    steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
 ) -> tuple[TemplateFit, bool] | None:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
@@ -328,29 +304,18 @@ def _settled(
         return (rod, False) if is_blunt else None
     blunt = np.empty((2, 2))
     bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
-    bound = PASSES * rod.width + PASSES_PX
-    is_pointed = _is_pointed(steel, fit, rod, size)
+    bound = 0.3 * rod.width + 0.3
+    is_pointed = rod.cost > CLEARLY * fit.cost
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
-        leaves = leaves and leaves_tail(steel, replace(rod, arc=tail_first))
+        leaves = leaves and not lies_over_tail(steel, replace(rod, arc=tail_first))
         passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
             return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
     if toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD:
         return _pointing(fit, toward), True
     return fit, False
-
-
-def _is_pointed(steel: SteelMap, fit: TemplateFit, rod: TemplateFit, size: NeedleSize) -> bool:
-    """Say whether a needle is no rod that something beside or over it makes look pointed, however pale that is.
-
-    Of the set length, which may be wrong, a rod could look like a worse fit than a needle that tapers.
-    """
-    if rod.cost <= CLEARLY * fit.cost:
-        return False
-    one, other, blunt = _fits(replace(steel, perhaps=steel.below), rod, size, size.tolerance)
-    return blunt.cost > CLEARLY * min(one.cost, other.cost)
 
 
 def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
@@ -363,10 +328,133 @@ def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     blunt = np.empty((2, 2))
     state = _state(fit.arc, fit.width)
     bluntness(steel.surely, state, fit.length, 0.5 * fit.width, blunt)
-    if blunt.min() < ROD:
+    if blunt.min() < 0.87:
         return False
     around = _excess(steel.surely, fit, fit.width)
     rows = np.empty((int(fit.length), 3))
     steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, 1.0, rows)
-    ends = max(rows[:TAIL_ROWS, 0].mean(), rows[-TAIL_ROWS:, 0].mean())
-    return bool(ends < MAX_MISSING_TAIL and max(around[2], around[3]) < MAX_BEYOND)
+    ends = max(rows[:END_ROWS, 0].mean(), rows[-END_ROWS:, 0].mean())
+    return bool(ends < MAX_MISSING_END and max(around[2], around[3]) < MAX_BEYOND)
+
+
+def axis_guesses(dark: np.ndarray, length: float, width: float) -> list[Arc]:
+    """Return axes, from the tail on, that a needle may have in a dark component.
+
+    What lies as deep in the dark as the middle of the body is followed: it is either about as long as the needle, which
+    then lies along it, or holds a thread too, and the needle begins or ends at one of its ends.
+
+    Args:
+        dark: where the image is dark, shape (rows, columns), bool.
+        length: of the needle [px].
+        width: of its body [px].
+    """
+    deep = cv2.distanceTransform(dark.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    if deep.max() > 0.5 * 2.6 * width + 1.0:
+        return []
+    inset = CORE * width
+    core = (deep > inset).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(core, connectivity=8)
+    result: list[Arc] = []
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    for label in 1 + np.argsort(-areas)[:3]:
+        if stats[label, cv2.CC_STAT_AREA] < 0.25 * (1.0 - 2.0 * CORE) * length * width:
+            continue
+        own = (labels == label).astype(np.uint8)
+        rows, columns = np.nonzero(own)
+        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
+        if guess is None:
+            continue
+        arc, first, last = guess
+        if last - first < 0.5 * length:
+            continue
+        if last - first < 1.35 * length:
+            result += _both(arc, first - inset, last + inset, length)
+        else:
+            result += _from_ends(own, length, width)
+    return result
+
+
+def _both(arc: Arc, first: float, last: float, length: float) -> list[Arc]:
+    """Return an axis in both directions, its tail where the dark begins, and if that goes on for too long, its tip."""
+    forward, backward = arc.moved(first, 0.0, 0.0, 0.0), arc.reversed_at(last)
+    if last - first < length:
+        return [forward, backward]
+    return [forward, backward, forward.reversed_at(length), backward.reversed_at(length)]
+
+
+def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
+    """Return axes that begin or end at the ends of a long, winding core."""
+    result: list[Arc] = []
+    rows, columns = np.nonzero(own)
+    steps = np.empty(own.shape, np.int32)
+    _walk(own, _pixel(own, rows[0], columns[0]), steps)
+    last = int(np.argmax(steps))
+    _walk(own, _pixel(own, last // own.shape[1], last % own.shape[1]), steps)
+    size = 2 * int(0.5 * width + 2.0) + 1
+    highest = cv2.dilate(steps.astype(np.float32), np.ones((size, size), np.uint8))
+    at = np.argwhere((steps == highest) & (own > 0))
+    ends = [np.array([last // own.shape[1], last % own.shape[1]])]
+    for place in at[np.argsort(-steps[at[:, 0], at[:, 1]])]:
+        if len(ends) < 5 and min(np.abs(place - other).max() for other in ends) > size:
+            ends.append(place)
+    for row, column in ends:
+        _walk(own, _pixel(own, row, column), steps)
+        rows, columns = np.nonzero((steps >= 0) & (steps < 0.8 * length))
+        guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
+        if guess is None:
+            continue
+        arc, first, final = guess
+        end = float(arc.coordinates(np.array([[column, row]], float))[0][0])
+        # From the end inwards; a point reaches farther than its core, by the part that is too thin for it.
+        inwards = arc.moved(first, 0.0, 0.0, 0.0) if end - first < final - end else arc.reversed_at(final)
+        for beyond in (0.1 * length, 0.03 * length):
+            result.append(inwards.moved(-beyond, 0.0, 0.0, 0.0).reversed_at(length))
+        result.append(inwards.moved(-CORE * width, 0.0, 0.0, 0.0))
+    return result
+
+
+def _pixel(own: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Return an image of one pixel."""
+    result = np.zeros_like(own)
+    result[row, column] = 1
+    return result
+
+
+def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | None:
+    """Return an arc through most of the points, and the lengths along it between which these lie."""
+    kept = points
+    for _ in range(4):
+        if len(kept) < 8:
+            return None
+        arc = fit_arc(kept)
+        along, aside = arc.coordinates(points)
+        near = np.abs(aside) < max(0.5 * width, 1.5 * middle(np.abs(aside)))
+        if near.sum() == len(kept):
+            break
+        kept = points[near]
+    return arc, float(along[near].min()), float(along[near].max())
+
+
+@compiled
+def _walk(own, start, steps):
+    """Fill in how many steps from the nearest pixel of a start each pixel of its components is, -1 elsewhere."""
+    steps[:] = -1
+    rows, columns = own.shape
+    queue = np.empty((rows * columns, 2), np.int32)
+    head, tail = 0, 0
+    for y in range(rows):
+        for x in range(columns):
+            if start[y, x] != 0:
+                steps[y, x] = 0
+                queue[tail, 0], queue[tail, 1] = y, x
+                tail += 1
+    while head < tail:
+        r, c = queue[head]
+        head += 1
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                y, x = r + i, c + j
+                if 0 <= y < rows and 0 <= x < columns and own[y, x] != 0 and steps[y, x] < 0:
+                    steps[y, x] = steps[r, c] + 1
+                    queue[tail, 0], queue[tail, 1] = y, x
+                    tail += 1

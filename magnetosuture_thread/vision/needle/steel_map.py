@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.vision.images import Layer, Wall
 
 AROUND_PX = 12.0  # around a dark thing, that is measured on
-DARKEST = 0.9  # quantile of its darkness that steel has
-LIGHT_PX = 3  # that the light is averaged over
 GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
 GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
-COLOURED = 0.1  # share of the floor's light by which the colours of what is coloured differ
-LINE_WAYS = 16  # directions of lines along which gaps are filled
 SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
 
 
@@ -27,52 +23,32 @@ class SteelMap:
     Attributes:
         surely: by the brightest of the three colours, in which steel alone is dark, shape (rows, columns), 0 to 1.
         perhaps: by the darkest of them, in which a coloured thread is dark too; the same without colours.
-        below: as `perhaps`, and anything below what is coloured, however pale: an opaque line may hide an end's shape.
         dark: darkness of the brightest of the three colours, as a share of the floor's brightness.
         depth: darkness of steel, 0 to 1.
         light: how much brighter than the floor, as a share of it, the brightest colour is around each pixel,
             shape (rows, columns).
-        pixels: the darkest colour, shape (rows, columns), uint8.
         origin: (u, v) of the first pixel in the picture.
         size: width and height of the picture [px].
         hidden: where nothing is known; None: nowhere.
-        is_bridged: whether steel was filled in below a coloured line; see `bridged`.
     """
 
     surely: NDArray[np.float32]
     perhaps: NDArray[np.float32]
-    below: NDArray[np.float32]
     dark: NDArray[np.float32]
     depth: float
     light: NDArray[np.float32]
-    pixels: NDArray[np.uint8]
     origin: tuple[float, float]
     size: tuple[int, int]
     hidden: NDArray[np.bool_] | None = None
-    is_bridged: bool = False
 
     def hidden_where(self, hidden: NDArray[np.bool_]) -> SteelMap:
         """Return the map with nothing known where something hides the needle, shape (rows, columns)."""
         if not hidden.any():
             return self
-        surely, perhaps, below = self.surely.copy(), self.perhaps.copy(), self.below.copy()
-        surely[hidden], perhaps[hidden], below[hidden] = 0.0, 1.0, 1.0
+        surely, perhaps = self.surely.copy(), self.perhaps.copy()
+        surely[hidden], perhaps[hidden] = 0.0, 1.0
         hidden = hidden if self.hidden is None else self.hidden | hidden
-        return replace(self, surely=surely, perhaps=perhaps, below=below, hidden=hidden)
-
-    def bridged(self, coloured: NDArray[np.bool_], gap_px: float) -> SteelMap:
-        """Return the map with steel below what is coloured wherever there is steel on both of its sides.
-
-        An opaque line across a needle, as a program draws it into frames, cuts the needle in two. Below it is what
-        `closed_along_lines` fills; elsewhere below it anything may be.
-
-        Args:
-            coloured: where the image has a colour that neither steel nor floor has, shape (rows, columns).
-            gap_px: greatest length of such a gap along a needle [px].
-        """
-        closed = np.asarray(closed_along_lines(self.surely, gap_px), dtype=np.float32)
-        perhaps = np.where(coloured, np.float32(1.0), self.perhaps)
-        return replace(self, surely=np.where(coloured, closed, self.surely), perhaps=perhaps, is_bridged=True)
+        return replace(self, surely=surely, perhaps=perhaps, hidden=hidden)
 
     def share_hidden(self, points: np.ndarray) -> float:
         """Return which share of some points, in the map's own pixels, is hidden."""
@@ -105,13 +81,7 @@ class SteelMap:
         return slice(top, top + rows), slice(left, left + columns)
 
     @staticmethod
-    def around(
-        points: np.ndarray,
-        brightest: Layer,
-        darkest: Layer,
-        factor: int,
-        wall: Wall,
-    ) -> SteelMap:
+    def around(points: np.ndarray, brightest: Layer, darkest: Layer, factor: int, wall: Wall) -> SteelMap:
         """Return the map around some points.
 
         Args:
@@ -128,34 +98,12 @@ class SteelMap:
         dark = _darkness(brightest, box, factor, wall)
         u, v = np.round(points - (left, top)).astype(int).T
         own = dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)]
-        rank = round(DARKEST * (len(own) - 1))
+        rank = round(0.9 * (len(own) - 1))
         depth = float(np.partition(own, rank)[rank])
         surely = _share(dark, depth)
-        perhaps = below = surely
-        if darkest is not brightest:
-            darkest_dark = _darkness(darkest, box, factor, wall)
-            perhaps = _share(darkest_dark, depth)
-            coloured = cv2.dilate((darkest_dark - dark > COLOURED).astype(np.uint8), np.ones((3, 3), np.uint8))
-            below = np.where(coloured > 0, np.float32(1.0), perhaps)
-        pixels = np.ascontiguousarray(darkest.pixels[box])
-        light = np.asarray(cv2.blur(-dark, (LIGHT_PX, LIGHT_PX)), dtype=np.float32)
-        return SteelMap(surely, perhaps, below, dark, depth, light, pixels, (float(left), float(top)), (columns, rows))
-
-
-def closed_along_lines(dark: np.ndarray, gap_px: float) -> np.ndarray:
-    """Return an image in which gaps between bright parts are filled up to a length, in any direction.
-
-    It is the greatest of the closings by straight lines: unlike that by a disc it fills a gap between two narrow ends
-    in all of their width.
-    """
-    reach = int(0.5 * gap_px) + 1
-    result = dark
-    for way in np.arange(LINE_WAYS) * np.pi / LINE_WAYS:
-        line = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
-        end = round(reach * np.cos(way)), round(reach * np.sin(way))
-        cv2.line(line, (reach - end[0], reach - end[1]), (reach + end[0], reach + end[1]), 1)
-        result = cv2.max(result, cv2.morphologyEx(dark, cv2.MORPH_CLOSE, line))
-    return np.asarray(result)
+        perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
+        light = np.asarray(cv2.blur(-dark, (3, 3)), dtype=np.float32)
+        return SteelMap(surely, perhaps, dark, depth, light, (float(left), float(top)), (columns, rows))
 
 
 def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:

@@ -1,178 +1,319 @@
-"""Finds the thread's centreline: a walk along its ridge, dark or pale, that starts at the needle's tail."""
+"""Follows the thread's centreline: a walk along its dark ridge that starts at the needle's tail."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.vision.images import Picture
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
-from magnetosuture_thread.vision.thread.search import (
-    ENOUGH,
-    FAINT,
-    MIN_CENTRED,
-    SCALES,
-    SURE_SHARE,
-    WALL_PX,
-    WIDER_SHARE,
-    ThreadSearch,
-    Walk,
-    is_strong,
-    only_tail,
-)
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, without_wall
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
+from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, TAPER, THIN, edge
+from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.scene_mask import SceneMask
+from magnetosuture_thread.vision.thread.crossings import Crossing, resolve_crossings
+from magnetosuture_thread.vision.thread.walk import Ridge, black_hat, follow, refine, worth
 
-WIDENESS = 1.2  # of a walk along the edge, the shadow or the texture of something far wider than itself
-PALE_WIDENESS = 1.0  # the same where that is as bright as the floor but for its edges
-LEAVES = 0.3  # of the mean evidence, that a wide thread has where it comes out; less, and bare floor lies before it
-WIDE_SHOWN = 0.4  # of what a walk along its edge shows, that one along the middle of what is wide must show
+WALL_PX = 4.0  # before which the walk ends
+AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
+MARGIN_PX = 7  # around the dish, that its rim and the window of the ridge need
+SHADE, SHADE_PX = 0.12, 10.0  # of steel's darkness, that its shadow has, and how far beside it that lies
+ENOUGH = 0.85  # of the greatest length: so much thread needs no other search
+STRONG, STRONG_SHARE = 25.0, 0.068  # grey levels, and share of the length, of a thread that is dark beyond doubt
 MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
-FAINT_SHARE = 0.5  # of enough, that a faint or pale thread must show: less may be another thread, or glare
-MIN_BEGINNING, MIN_EVIDENCE = 2.5, 5.0  # mean evidence where a thread comes out and of all of it: more than noise shows
-CLEAR_EVIDENCE = 10.0  # mean evidence of a line as long as the thread, that may be fainter where it comes out
-MIN_EDGE = 0.15  # share of the evidence, that a thread's fainter edge has: less, and it is the border of something else
+BESIDE_PX = 2.0 * BLUR_PX  # of the drawn outline, up to which light of the needle is mixed in
 
 
 @dataclass(frozen=True)
-class FollowedThread:
-    """A thread's centreline, and how sure it is that it is one thread's.
+class Walk:
+    """A walk along a ridge.
 
     Attributes:
-        points: vertices from the tail on, shape (m, 2) [px], m = 1 if no thread is seen.
-        confidence: least of all its crossings, 0 to 1; 1 if it crosses nothing, 0 if nothing is seen.
-        doubtful_px: where it is least, shape (2,) [px]; None if it crosses nothing.
+        points: vertices in pixels of the picture, shape (m, 2); m = 1 if no thread leaves the tail.
+        shown: how much thread they show [px].
+        ridge: that was followed.
+        path: the walk in the ridge's pixels; see `walk_on`.
+        strong: whether the thread is visible at each vertex of the path.
+        crossings: where it could have gone on along another strand.
     """
 
-    points: np.ndarray
-    confidence: float
-    doubtful_px: np.ndarray | None
+    points: Points
+    shown: float
+    ridge: Ridge
+    path: NDArray[np.float64]
+    strong: NDArray[np.bool_]
+    crossings: tuple[Crossing, ...] = ()
+
+    @property
+    def certain_points(self) -> Points:
+        """The vertices up to the first crossing where it is in doubt how the thread goes on."""
+        for crossing in self.crossings:
+            if crossing.confidence < MIN_CONFIDENCE:
+                at = arc_lengths(self.points)
+                share = self.path[min(crossing.first, len(self.path) - 1), 5] / self.path[-1, 5]
+                return self.points[: max(2, int(np.searchsorted(at, share * at[-1])))]
+        return self.points
 
 
-def find_centreline(
-    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
-) -> np.ndarray:
+def find_centreline(picture: Picture, needle: MeasuredNeedle, max_length: float, wall: Wall) -> Points:
     """Follow the thread from the needle's tail to its end.
 
-    The ridge strength of a dark thread is the black-hat transform, how much darker a pixel is than the brightest
-    background within a few pixels, of the image without the needle. Where that shows too little, the thread is faint or
-    pale, and a signed difference is taken, whose noise has no mean; see `ridge`. The walk leaves the tail along
-    the arc that shows most of the thread, below the needle where it must, and goes by steps along arcs that look some
-    way ahead, a change of curvature having a price: so it goes straight over gaps. At crossings the smoothest of all
-    pairings of the strands that meet decides. Where the
-    needle or the lamp's reflection hides the thread, nothing counts for or against a way. A thread wider than the
-    window is looked for at half the size.
+    The ridge strength is the black-hat transform of the darkest colour without the needle: how much darker a pixel is
+    than the brightest background within a few pixels. The walk leaves the tail along the arc that shows most of the
+    thread, below the needle where it must, and goes by steps along arcs that look some way ahead, a change of curvature
+    having a price: so it goes straight over gaps. At crossings the smoothest of all pairings of the strands that meet
+    decides. Where the needle or the lamp's reflection hides the thread, nothing counts for or against a way. A thread
+    wider than the transform's window is followed at half the size.
 
     Args:
         picture: the frame or a part of it.
         needle: the needle, in the picture's pixels.
         max_length: the walk stops at this length [px].
-        centre: the dish's centre [px].
-        wall: the dish's radius; the walk stops before it [px].
+        wall: of the dish, before which the walk stops.
 
     Returns:
         Vertices from the tail on, up to the first crossing where it is in doubt how the thread goes on, shape (m, 2)
-        [px], m = 1 if no thread is seen.
+        [px]; m = 1 if no thread is visible.
     """
-    return certain_points(walk_from(picture, needle, max_length, centre, wall))
+    search = _Search(picture, needle, max_length, wall)
+    return search.resolved(search.best_walk()).certain_points
 
 
-def certain_points(walk: Walk) -> np.ndarray:
-    """Return the vertices of a walk up to the first crossing where it is in doubt how the thread goes on."""
-    doubtful = [crossing for crossing in walk.crossings if crossing.confidence < MIN_CONFIDENCE]
-    if not doubtful:
-        return walk.points
-    at = arc_lengths(walk.points)
-    last = int(np.searchsorted(at, _share(walk, doubtful[0].first) * at[-1]))
-    return walk.points[: max(2, last)]
+class _Search:
+    """Walks along one frame's ridges from the needle's tail on; see `find_centreline`."""
+
+    def __init__(self, picture: Picture, needle: MeasuredNeedle, max_length: float, wall: Wall) -> None:
+        self._picture, self._needle, self._max_length, self._wall = picture, needle, max_length, wall
+        self._reach = wall.radius - WALL_PX
+        self._at_wall = bool(np.hypot(*(needle.tail_px - wall.centre)) > self._reach - AT_WALL_PX)
+        rows, columns = picture.shape
+        left, top = (max(0, int(c - self._reach - MARGIN_PX)) for c in wall.centre)
+        right, bottom = (int(c + self._reach + MARGIN_PX) + 1 for c in wall.centre)
+        left, top = min(left, columns - 1), min(top, rows - 1)
+        right, bottom = max(1, min(right, columns)), max(1, min(bottom, rows))
+        factor = picture.factor
+        left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
+        self._origin, self._box = (left, top), (slice(top, bottom), slice(left, right))
+        hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
+        self._hidden = np.ascontiguousarray(hidden)
+        _cover_needle(self._hidden, factor, needle, self._origin)
+
+    def best_walk(self) -> Walk:
+        """Return the walk along the black-hat at full size, or at half of it where that shows more."""
+        darkest, factor = self._picture.darkest, self._picture.factor
+        pixels, smooth = without_needle(darkest, factor, self._needle), None
+        if self._at_wall:  # else the walk would leave along the rim
+            tail, wall = self._needle.tail_px, Wall(self._wall.centre, self._wall.radius - RIM_PX)
+            pixels = without_wall(darkest.replaced(pixels), factor, wall, tail - AT_WALL_PX, tail + AT_WALL_PX)
+        else:
+            smooth = smooth_without_needle(darkest, factor, self._needle)[self._box]
+        window, enough = pixels[self._box], ENOUGH * self._max_length
+        thin = self._walked(black_hat(window, self._hidden, factor, 1, smooth))
+        strength = float(np.median(thin.path[1:, 4])) if len(thin.path) > 1 else 0.0
+        is_strong = strength > STRONG and thin.shown > STRONG_SHARE * self._max_length  # the rest may be covered
+        if thin.shown > enough or is_strong or self._at_wall:  # The rim is wide.
+            return thin
+        wide = self._walked(black_hat(window, self._hidden, factor, 2))
+        return wide if wide.shown > max(1.3 * thin.shown, 0.5 * enough) else thin
+
+    def resolved(self, walk: Walk) -> Walk:
+        """Return a walk that takes the most probable way at its crossings; see `resolve_crossings`."""
+        ridge, count = walk.ridge, len(walk.path)
+        if count < 4:
+            return walk
+        path, strong = self._buffers(ridge)
+        path[:count], strong[:count] = walk.path, walk.strong
+        max_length = self._max_length / ridge.scale
+        count, crossings = resolve_crossings(ridge, self._dish(ridge), max_length, path, strong, count)
+        if count == len(walk.path) and np.array_equal(path[:count], walk.path):
+            return replace(walk, crossings=crossings)
+        found = self._ended(ridge, path, strong, count, float(worth(path, strong, count)))
+        return replace(found, crossings=tuple(each for each in crossings if each.first < len(found.path)))
+
+    def _walked(self, ridge: Ridge) -> Walk:
+        """Walk along a ridge, from which the needle's shadow is taken."""
+        self._clear_shade(ridge)
+        scale, needle = ridge.scale, self._needle
+        path, strong = self._buffers(ridge)
+        path[0] = 0.0  # all that there is where nothing leaves the tail
+        tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
+        start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
+        max_hidden = (needle.length_px + 12.0) / scale  # by the needle and what is next to it
+        lengths = self._max_length / scale, max_hidden
+        count, shown = follow(ridge, start, self._dish(ridge), *lengths, self._at_wall, path, strong)
+        return self._ended(ridge, path, strong, count, shown)
+
+    def _buffers(self, ridge: Ridge) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return room for a path along a ridge; see `walk_on`."""
+        max_steps = int(self._max_length / ridge.scale) + 16  # steps are longer than a pixel
+        return np.empty((max_steps, 6)), np.empty(max_steps, np.bool_)
+
+    def _dish(self, ridge: Ridge) -> tuple[float, float, float]:
+        """Return the dish's centre and how far from it a walk may go, in a ridge's pixels."""
+        u, v = (np.subtract(self._wall.centre, self._origin) - 0.5 * (ridge.scale - 1)) / ridge.scale
+        return float(u), float(v), self._reach / ridge.scale
+
+    def _ended(
+        self, ridge: Ridge, path: NDArray[np.float64], strong: NDArray[np.bool_], count: int, shown: float
+    ) -> Walk:
+        """Return the walk along a path up to where it shows the thread."""
+        scale, shift = ridge.scale, 0.5 * (ridge.scale - 1)
+        points, kept = path[:count, :2].copy(), count
+        if self._picture.mask is not None:
+            full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
+            above = cv2.subtract(full, ridge.noise)
+            at = points * scale + shift
+            kept = count_off_outline(at, above, self._picture.mask, self._origin, ridge.faintest)
+        shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
+        points = points[:kept]
+        refine(ridge, points, strong[:kept])
+        points = points * scale + shift + self._origin
+        return Walk(points, shown * scale, ridge, path[:kept].copy(), strong[:kept].copy())
+
+    def _clear_shade(self, ridge: Ridge) -> None:
+        """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
+        shade = SHADE * self._needle.contrast * middle(self._picture.darkest.floor)
+        axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
+        axis = (axis - 0.5 * (ridge.scale - 1)) / ridge.scale
+        thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / ridge.scale)
+        left, top = np.maximum(axis.min(axis=0) - thickness, 0.0).astype(int)
+        right, bottom = np.maximum(axis.max(axis=0) + thickness, 0.0).astype(int)
+        near = ridge.strength[top:bottom, left:right]
+        if near.size:
+            zone = np.zeros_like(near)
+            at = np.round((axis - (left, top)) * 16.0).astype(np.int32)
+            cv2.polylines(zone, [at], False, 255, thickness, cv2.LINE_8, 4)
+            near[(zone > 0) & (near < shade)] = 0
 
 
-def follow_thread(
-    picture: Picture, needle: MeasuredNeedle, max_length: float, centre: tuple[float, float], wall: float
-) -> FollowedThread:
-    """Follow the thread as `find_centreline` does, but beyond doubtful crossings too, with a confidence.
+def count_off_outline(
+    points: Points, ridge: NDArray[np.uint8], mask: SceneMask, origin: tuple[int, int], faintest: float
+) -> int:
+    """Return how many vertices of a walk show the thread, where it may have gone on along a bare outline.
 
-    At each crossing with another thread, or of the thread with itself, the confidence is how probable the way is that
-    was taken: the least of all crossings counts. See `arms`.
+    A walk ends before it enters a shape. A ridge along an outline is the thread's or the shape's own edge. The last
+    vertices along an outline count only as long as their ridge is stronger than that of the same outline away from
+    the walk, or that one shows none.
 
     Args:
-        picture: see `find_centreline`.
-        needle: see there.
-        max_length: see there.
-        centre: see there.
-        wall: see there.
+        points: vertices of the walk in the ridge's pixels, shape (m, 2) [px].
+        ridge: ridge strength in grey levels, uint8.
+        mask: of the picture.
+        origin: (u, v) of the ridge's first pixel in the picture [px].
+        faintest: a strength that is no noise.
     """
-    walk = walk_from(picture, needle, max_length, centre, wall)
-    if not walk.crossings:
-        return FollowedThread(walk.points, 1.0 if len(walk.points) > 1 else 0.0, None)
-    least = min(walk.crossings, key=lambda crossing: crossing.confidence)
-    at = _share(walk, (least.first + least.last) // 2) * arc_lengths(walk.points)[-1]
-    return FollowedThread(walk.points, least.confidence, points_at(walk.points, np.array([at]))[0])
+    depths = mask.depths(points + origin)
+    inside = depths > mask.tolerance_px
+    if inside.any():  # Whatever was followed from here on, it is no thread.
+        first = max(1, int(np.argmax(inside)))
+        points, depths = points[:first], depths[:first]
+    near = np.abs(depths) <= mask.band_px
+    run = len(near) if near.all() else int(np.argmin(near[::-1]))
+    if run < 5 or not len(mask.rim):  # vertices along an outline
+        return len(points)
+    rim = mask.rim[:, :2] - origin
+    last = mask.rim[np.argmin(((rim - points[-1]) ** 2).sum(axis=1)), 2]
+    rim = rim[mask.rim[:, 2] == last]
+    apart = ((rim[:, None] - points[None, ::3]) ** 2).sum(axis=2).min(axis=1)
+    rows, columns = ridge.shape
+    reach = int(mask.band_px) + 1
+    bare = (apart > (2.0 * mask.band_px) ** 2) & (rim.min(axis=1) > reach)
+    bare &= (rim < (columns - 1 - reach, rows - 1 - reach)).all(axis=1)
+    if bare.sum() < 8:
+        return len(points)
+    usual = middle(_strongest(ridge, rim[bare], reach))
+    if usual < faintest:
+        return len(points)
+    # The thread ends where the sum of what speaks for it and against it is greatest: single strong pixels count little.
+    surplus = np.cumsum(np.minimum(_strongest(ridge, points[-run:], 1) / (1.3 * usual) - 1.0, 0.5))
+    shown = int(np.argmax(surplus)) + 1 if surplus.max() > 0.0 else 0
+    return max(1, len(points) - run + shown)
 
 
-def _share(walk: Walk, vertex: int) -> float:
-    """Return at which share of its length a walk passes a vertex of its path."""
-    return float(walk.path[min(vertex, len(walk.path) - 1), 5] / walk.path[-1, 5])
+def _strongest(ridge: NDArray[np.uint8], points: Points, reach: int) -> NDArray[np.uint8]:
+    """Return the strongest ridge in a square around each point, shape (m,)."""
+    step = np.arange(-reach, reach + 1)
+    at = np.round(points).astype(np.intp)
+    rows = np.clip(at[:, 1, None] + step, 0, ridge.shape[0] - 1)
+    columns = np.clip(at[:, 0, None] + step, 0, ridge.shape[1] - 1)
+    return np.asarray(ridge[rows[:, :, None], columns[:, None, :]].max(axis=(1, 2)), dtype=np.uint8)
 
 
-def walk_from(
-    picture: Picture,
-    needle: MeasuredNeedle,
-    max_length: float,
-    centre: tuple[float, float],
-    wall: float,
-    *,
-    doubted: bool = False,
-) -> Walk:
-    """Return the walk that shows the thread best; see `find_centreline`.
+def _cover_needle(hidden: NDArray[np.uint8], factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
+    """Mark where a needle hides the thread, in a mask `factor` times smaller than the picture from `origin` on.
 
-    Where it is doubted that the needle carries the thread, a line that passes its tail is none of its own.
+    At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
     """
-    reach = wall - WALL_PX
-    search = ThreadSearch(picture, needle, max_length, centre, reach)
-    dark = search.dark()
-    enough = ENOUGH * max_length
-    best = dark if is_strong(dark, enough) else _best_centred(search, dark, enough)
-    wideness = search.wideness(best) if len(best.points) >= MIN_CENTRED else 0.0
-    edge = search.between_edges(best) if wideness > PALE_WIDENESS and not best.ridge.signed else None
-    passes = False
-    if wideness > WIDENESS:
-        wide = search.wide()
-        if wide.shown > max(WIDE_SHOWN * best.shown, SURE_SHARE * enough):
-            centred, section = search.centred(wide)
-            has_edges = centred.shown > SURE_SHARE * wide.shown  # else they are too far apart, as a rope's
-            best, passes = centred if has_edges else wide, has_edges and section.beginning < LEAVES * section.mean
-        elif edge is not None:
-            best = edge
-        elif best is dark and dark.shown > SURE_SHARE * enough:
-            best = only_tail(dark)  # Its middle is not visible; a short one may be covered.
-    elif edge is not None:
-        best = edge
-    if doubted:
-        own = replace(only_tail(best), passes=True) if passes else search.without_passing_line(best)
-        # A faint line that passes, as the border of tissue, does not speak against a thread that is dark beyond doubt.
-        instead = own.passes and best is not dark and dark.strength > FAINT
-        best = search.without_passing_line(dark) if instead else own
-    return best if best is edge else search.resolved(best)  # An edge's own crossings are with other edges.
+    axis = needle.arc.at(np.linspace(1.5, needle.length_px + 3.0, 24)) - origin
+    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
+    cv2.polylines(hidden, [small], False, 255, max(1, round((needle.width_px + 3.0) / factor)), cv2.LINE_8, 4)
 
 
-def _best_centred(search: ThreadSearch, dark: Walk, enough: float) -> Walk:
-    """Return the walk with the greatest evidence for a thread that leaves the needle, at first at full size."""
-    best, greatest, weakest = dark, 0.0, 0.0
-    for scale in SCALES:
-        for walk in search.faint(scale) + ([dark] if scale == 1 else []):
-            if walk.shown < FAINT_SHARE * enough:
+def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> NDArray[np.uint8]:
+    """Return a channel's pixels in which a needle has the floor's brightness.
+
+        I' = min(I + F c share, F)
+
+    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers. It is kept with
+    the channel, as the walk and the pieces need the same: it must not be changed.
+
+    Args:
+        channel: of the picture.
+        factor: how much smaller its floor is.
+        needle: in the picture's pixels.
+    """
+    if channel.cleared.get("needle") is needle:
+        return np.asarray(channel.cleared["pixels"])
+    half, arc = 0.5 * needle.width_px + BLOOM_PX, needle.arc
+    outline = arc.at(np.linspace(0.0, needle.length_px, 24))
+    rows, columns = channel.pixels.shape
+    left, top = np.maximum(outline.min(axis=0) - half - 2.0 * BESIDE_PX, 0.0).astype(int)
+    right, bottom = np.minimum(outline.max(axis=0) + half + 2.0 * BESIDE_PX, (columns - 1, rows - 1)).astype(int)
+    result = channel.pixels.copy()
+    start = np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature])
+    shape = np.array([needle.length_px, half, needle.contrast])
+    _erase(result, np.ascontiguousarray(channel.floor), factor, start, shape, (left, top, right, bottom))
+    channel.cleared.clear()
+    channel.cleared.update(needle=needle, pixels=result)
+    return result
+
+
+def smooth_without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> NDArray[np.uint8]:
+    """Return `without_needle`, smoothed as wide as the thinnest thread looks; kept like it."""
+    pixels = without_needle(channel, factor, needle)
+    if "smooth" not in channel.cleared:
+        channel.cleared["smooth"] = cv2.GaussianBlur(pixels, (5, 5), 0.7)
+    return np.asarray(channel.cleared["smooth"])
+
+
+@compiled
+def _erase(pixels, floor, factor, start, shape, box):
+    """Brighten the pixels of a box by what a drawn needle takes of the floor's light."""
+    length, half, contrast = shape[0], shape[1], shape[2]
+    cosine, sine, curvature = math.cos(start[2]), math.sin(start[2]), start[3]
+    # Off the tangent by more than the arc itself is, nothing is near the needle.
+    farthest = half + BESIDE_PX + 0.5 * abs(curvature) * (length + BESIDE_PX + half) ** 2
+    for row in range(box[1], box[3] + 1):
+        for column in range(box[0], box[2] + 1):
+            u, v = column - start[0], row - start[1]
+            s, d = u * cosine + v * sine, v * cosine - u * sine
+            if abs(d) > farthest:
                 continue
-            centred, section = search.centred(walk)
-            is_clear = section.mean > CLEAR_EVIDENCE and centred.shown > enough
-            begins = section.beginning > MIN_BEGINNING or is_clear
-            if not begins or section.mean < MIN_EVIDENCE or section.fainter_edge < MIN_EDGE:
-                continue
-            # At half the size a thread and its shadow are one: what is as clear at full size is taken from there.
-            total = section.mean * centred.shown
-            clearer = total > (WIDER_SHARE if scale > 1 else 1.0) * greatest
-            if clearer and centred.shown > FAINT_SHARE * enough:
-                best, greatest, weakest = centred, total, section.weakest
-        if best.shown > enough and weakest > MIN_BEGINNING:
-            break
-    return best
+            if abs(curvature) > 1e-6:
+                turned = math.atan2(curvature * s, 1.0 - curvature * d)
+                d = (1.0 - math.hypot(curvature * s, 1.0 - curvature * d)) / curvature
+                s = turned / curvature
+            if abs(d) > half + BESIDE_PX or not -BESIDE_PX < s < length + BESIDE_PX:
+                continue  # Four edges for each pixel of the box would take longer than all else.
+            part = min(max((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0), 1.0)
+            own = half * (1.0 - (1.0 - THIN) * part)
+            share = (edge(own - d) - edge(-own - d)) * edge(s) * edge(length - s)
+            if share > 0.01:
+                ground = float(floor[min(row // factor, len(floor) - 1), min(column // factor, floor.shape[1] - 1)])
+                value = pixels[row, column] + ground * contrast * share
+                pixels[row, column] = max(pixels[row, column], int(min(value, ground)))

@@ -19,27 +19,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Picture, Wall, glare_mask
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.thread.appearance import NEEDLE_PX
 
 SHRUNK = 3  # how much smaller the image is in which objects are looked for
-SLENDER_CELLS = 5  # side of the median window there: wider than twice a needle, narrower than an object
-FIT_CELL_PX = 8  # the floor's light is fitted to means of cells of this size
-COVERED_PX = 1.5  # beside and beyond the needle, that is not seen: its outline is not known better
-BEYOND_PX = 3.0  # its tip, that is not seen either
-BEHIND_TAIL_PX = 1.5  # of the needle that is not covered, so that the walk can leave
-ROUNDS, TUKEY = 8, 4.0  # of the robust fit, and standard deviations beyond which a cell counts nothing
-SETTLED = 0.1  # grey levels; weights that change by less in a round are the fit's
 MIN_CONTRAST, MIN_COLOUR = 0.05, 0.03  # of the floor's light, by which an object differs in brightness, in colour
-CONTRAST_DEVIATIONS = 3.5  # and in both by so many standard deviations of the floor
 MIN_AREA = 1e-6  # m^2; of an object
 WALL_PX = 6.0  # before which nothing is told
-NEEDLE_PX = 2.5  # beside and beyond the needle, where its blurred edge and what is next to it hide a thread
-OUTLINE_TOLERANCE_PX = 1.0  # of published outlines, which keeps them short
-MAX_OUTLINES = 64
 
 Mask = NDArray[np.uint8]
 
@@ -75,8 +64,8 @@ class Hiding:
     def outlines(self) -> list[Points]:
         """Return the outlines of the largest areas, each of shape (m, 2) [px]."""
         found, _ = cv2.findContours(self.solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        found = sorted(found, key=cv2.contourArea, reverse=True)[:MAX_OUTLINES]
-        simple = [cv2.approxPolyDP(outline, OUTLINE_TOLERANCE_PX, True)[:, 0].astype(float) for outline in found]
+        found = sorted(found, key=cv2.contourArea, reverse=True)[:64]
+        simple = [cv2.approxPolyDP(outline, 1.0, True)[:, 0].astype(float) for outline in found]
         return [outline for outline in simple if len(outline) > 2]
 
 
@@ -112,25 +101,25 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Mask, NDArr
     """Return where objects are, and the floor's brightness in the darkest colour."""
     rows, columns = picture.shape
     size = (-(-columns // SHRUNK), -(-rows // SHRUNK))
-    small = cv2.medianBlur(cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA), SLENDER_CELLS)
-    cells = (max(4, columns // FIT_CELL_PX), max(4, rows // FIT_CELL_PX))
+    small = cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.medianBlur(small, 5)  # wider than twice a needle, narrower than an object
+    cells = (max(4, columns // 8), max(4, rows // 8))  # to whose means the light is fitted
     near = Wall(wall.centre, wall.radius - WALL_PX)
     places = _places(cells, picture.shape, near)
     means = np.atleast_3d(cv2.resize(small, cells, interpolation=cv2.INTER_AREA)).reshape(len(places), -1)
     inside = np.hypot(places[:, 1], places[:, 2]) < 1.0
     if inside.sum() < 4 * places.shape[1]:
         return np.zeros((rows, columns), np.uint8), np.full((rows, columns), 1.0, np.float32)
-    weights = np.zeros((places.shape[1], means.shape[1]))
-    fitted = inside & _every_second(cells)
-    _fit_light(places[fitted], means[fitted].astype(float), weights)
-    light = np.maximum(places @ weights, 1.0)
+    some = np.zeros(cells[::-1], np.bool_)
+    some[::2, ::2] = True  # far more than enough for so few weights
+    fitted = inside & some.ravel()
+    light = np.maximum(places @ _fit_light(places[fitted], means[fitted].astype(float)), 1.0)
     ratios = np.ascontiguousarray((means[inside] / light[inside] - 1.0).T)  # numpy is slow along a short last axis
     bounds = _bound(ratios.mean(axis=0), MIN_CONTRAST), _bound(np.ptp(ratios, axis=0), MIN_COLOUR)
     light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
-    found = np.zeros(small.shape[:2], np.uint8)
-    at_small = cv2.resize(light, size).reshape(*found.shape, -1)
-    _mark_unlike(small.reshape(at_small.shape), at_small, bounds, (*near.centre, near.radius), found)
-    opened = cv2.morphologyEx(found, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    at_small = cv2.resize(light, size).reshape(size[1], size[0], -1)
+    found = _unlike(small.reshape(at_small.shape), at_small, bounds, near)
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] * SHRUNK**2 >= min_area
     large[0] = False
@@ -150,86 +139,50 @@ def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArra
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, far, far * far])
 
 
-def _every_second(size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return every second row and column of a grid, shape (cells,): far more than enough for the sum's few weights."""
-    chosen = np.zeros(size[::-1], np.bool_)
-    chosen[::2, ::2] = True
-    return chosen.ravel()
-
-
-@compiled
-def _fit_light(basis, values, weights):
-    """Fill in for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
+def _fit_light(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
 
     Args:
         basis: the functions, shape (cells, functions).
         values: of the colours, shape (cells, colours) [grey levels].
-        weights: filled, shape (functions, colours).
+
+    Returns:
+        Weights, shape (functions, colours).
     """
-    count, size = basis.shape
-    normal, right, residuals = np.empty((size, size)), np.empty(size), np.empty(count)
-    for colour in range(values.shape[1]):
-        own = np.zeros(size)
-        own[0] = np.median(values[:, colour])
-        for _ in range(ROUNDS):
-            for cell in range(count):
-                residuals[cell] = values[cell, colour]
-                for i in range(size):
-                    residuals[cell] -= basis[cell, i] * own[i]
-            bound = TUKEY * max(0.5, 1.4826 * np.median(np.abs(residuals)))
-            normal[:], right[:] = 1e-6 * np.eye(size), 0.0
-            for cell in range(count):
-                share = max(1.0 - (residuals[cell] / bound) ** 2, 0.0) ** 2
-                if share == 0.0:
-                    continue
-                for i in range(size):
-                    weighted = share * basis[cell, i]
-                    right[i] += weighted * values[cell, colour]
-                    for j in range(i + 1):
-                        normal[i, j] += weighted * basis[cell, j]
-            for i in range(size):
-                for j in range(i):
-                    normal[j, i] = normal[i, j]
+    weights = np.zeros((basis.shape[1], values.shape[1]))
+    for colour, light in enumerate(values.T):
+        own = np.zeros(basis.shape[1])
+        own[0] = np.median(light)
+        for _ in range(8):
+            residuals = light - basis @ own
+            bound = 4.0 * max(0.5, 1.4826 * float(np.median(np.abs(residuals))))
+            weighted = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2 * basis
             before = own
-            own = np.linalg.solve(normal, right)
-            if np.abs(own - before).max() < SETTLED:
+            own = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(len(own)), weighted.T @ light)
+            if np.abs(own - before).max() < 0.1:  # grey levels
                 break
         weights[:, colour] = own
+    return weights
 
 
-@compiled
-def _mark_unlike(small, light, bounds, dish, found):
-    """Mark where the mean of q_c, or the greatest less the least, is beyond its bound, within a dish.
+def _unlike(small: Mask, light: NDArray[np.float32], bounds: tuple[float, float], dish: Wall) -> NDArray[np.bool_]:
+    """Return where the mean of q_c, or the greatest less the least, is beyond its bound, within a dish.
 
     Args:
         small: the shrunk image, shape (rows, columns, colours), uint8.
         light: of the floor there, of the same shape [grey levels].
         bounds: of the mean and of the range.
-        dish: u, v and radius in the image that is not shrunk [px].
-        found: set to 1 there, shape (rows, columns).
+        dish: in pixels of the image that is not shrunk.
     """
-    rows, columns, colours = small.shape
-    for row in range(rows):
-        for column in range(columns):
-            u, v = SHRUNK * column - dish[0], SHRUNK * row - dish[1]
-            if u * u + v * v >= dish[2] * dish[2]:
-                continue
-            total, least, most = 0.0, np.inf, -np.inf
-            for colour in range(colours):
-                ratio = small[row, column, colour] / light[row, column, colour] - 1.0
-                total, least, most = total + ratio, min(least, ratio), max(most, ratio)
-            found[row, column] = abs(total) > bounds[0] * colours or most - least > bounds[1]
+    rows, columns = small.shape[:2]
+    v, u = SHRUNK * np.arange(rows)[:, None] - dish.centre[1], SHRUNK * np.arange(columns) - dish.centre[0]
+    ratios = [small[..., colour] / light[..., colour] - np.float32(1.0) for colour in range(small.shape[2])]
+    apart = reduce(np.maximum, ratios) - reduce(np.minimum, ratios)
+    beyond = (np.abs(sum(ratios)) > bounds[0] * len(ratios)) | (apart > bounds[1])
+    return np.asarray(beyond & (u * u + v * v < dish.radius**2))
 
 
 def _bound(values: NDArray[np.float64], minimum: float) -> float:
     """Return beyond what a value is not the floor's, by the spread of those of cells."""
     usual = middle(values)
-    return max(minimum, abs(usual) + CONTRAST_DEVIATIONS * 1.4826 * middle(np.abs(values - usual)))
-
-
-def cover_needle(hidden: NDArray[np.uint8], factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
-    """Mark where a needle hides the thread, in a mask `factor` times smaller than the picture from `origin` on."""
-    axis = needle.arc.at(np.linspace(BEHIND_TAIL_PX, needle.length_px + BEYOND_PX, 24)) - origin
-    small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
-    thickness = needle.width_px + 2.0 * COVERED_PX
-    cv2.polylines(hidden, [small], False, 255, max(1, round(thickness / factor)), cv2.LINE_8, 4)
+    return max(minimum, abs(usual) + 3.5 * 1.4826 * middle(np.abs(values - usual)))

@@ -1,39 +1,82 @@
-"""The walk along a dark ridge, in compiled code: hundreds of steps, each along the best of many arcs."""
+"""The walk along a dark ridge, in compiled code.
+
+A walk leaves the needle's tail along the best of many arcs, and goes on by steps, each along the best of many arcs that
+look some steps ahead. Where it sees much less of the thread than there is, it tries other ways at its forks.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.sampling import sample
+from magnetosuture_thread.vision.images import shrunk
+from magnetosuture_thread.vision.sampling import middle, sample
 
-STEP_PX = 2.0
+STEP_PX = 2.0  # of the walk
+AHEAD, NEAR_STEPS, FAR_WEIGHT = 9, 5, 0.6  # steps looked ahead; those that count in full; weight of the others
+BENDS, SHARPEST = 31, 0.21  # curvatures tried at each step, up to this [1/px]
+WEAK, STRONGEST = 0.3, 1.25  # of the usual strength: below, there is no thread; above, it counts no more
+ACROSS, ASIDE_PX = 9, 0.5  # samples across a ridge, and the distance between them
 GAP_PX = 13.0  # the walk goes on over a gap of this length
-HIDDEN_GAP = 0.25  # as much a hidden pixel counts as a gap
-WEAK = 0.3  # of the ridge's usual strength: below, there is no thread
-STRONGEST = 1.25  # of the usual strength: a stronger ridge counts no more
-UNKNOWN = 0.45  # of the usual strength, as which a hidden pixel counts
-AHEAD = 9  # steps looked ahead
-NEAR_POINTS = 5  # of these that count in full; the others by FAR
-FAR_WEIGHT = 0.6
-BENDS = 31  # curvatures tried at each step ...
-SHARPEST = 0.21  # ... up to this over the root of the stiffness [1/px], closer around the present one's
-BEND_COST = 1.1  # of the usual strength, for a change of curvature by 1 / px, along the way looked ahead
-NOISE_COST = 2.0  # so much higher is that price where the thread is as faint as noise
-SMOOTHING = 0.05  # weight of the newest strength in the usual one
-ASIDE_PX, ACROSS = 0.5, 9  # between samples across a ridge, and how many
-APART = 0.05  # curvatures of two ways at a fork differ by [1/px]
-FORK = 0.75  # of the usual strength, at least, along the other way; a stiff thread's other ways look fainter
-STIFF_FORK = 0.5
-FORCED = 4  # steps that a walk is held to the other way
+WAYS_AHEAD = 8  # steps of an arc out of the tail, of which at least five must show the thread
+MIN_GAIN_PX = 8.0  # that another way must show more of the thread
+
+
+class Ridge(NamedTuple):
+    """How much darker each pixel is than what is near it.
+
+    Attributes:
+        strength: shape (rows, columns), uint8 [grey levels].
+        hidden: where nothing can be seen, not 0 there, `factor` times smaller, uint8.
+        factor: see `hidden`.
+        noise: strength where nothing is.
+        faintest: a strength above noise that is no noise.
+        scale: how much smaller the ridge is than the picture.
+    """
+
+    strength: np.ndarray
+    hidden: np.ndarray
+    factor: int
+    noise: float
+    faintest: float
+    scale: int = 1
+
+
+def black_hat(
+    window: np.ndarray, hidden: np.ndarray, factor: int, scale: int, smooth: np.ndarray | None = None
+) -> Ridge:
+    """Return how much darker a window is than the brightest background within a few pixels.
+
+    An edge has no black-hat, so that shadows, covers and the rim are no thread.
+
+    Args:
+        window: shape (rows, columns), uint8.
+        hidden: see `Ridge`.
+        factor: see `Ridge`.
+        scale: by which the window is shrunk first.
+        smooth: the window smoothed, if it is known and not shrunk.
+    """
+    window = shrunk(window, scale)
+    if scale > 1:
+        hidden, factor = cv2.resize(hidden, window.shape[::-1], interpolation=cv2.INTER_NEAREST), 1
+    if smooth is None or scale > 1:
+        smooth = cv2.GaussianBlur(window, (5, 5), 0.7)  # as wide as the thinnest thread looks
+    strength = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    noise = middle(strength[::5, ::5])
+    return Ridge(strength, hidden, factor, noise, max(3.0, 3.0 * noise), scale)
 
 
 @compiled
-def is_hidden(hidden, factor, u, v):
-    """Say whether a point is hidden."""
-    scale = 1.0 / factor  # Dividing whole numbers for each point would take longer than all else.
+def is_hidden(ridge, u, v):
+    """Say whether a point of a ridge is hidden."""
+    hidden, scale = (
+        ridge.hidden,
+        1.0 / ridge.factor,
+    )  # Dividing whole numbers for each point would take longer than all else.
     x, y = (u + 0.5) * scale, (v + 0.5) * scale
     c, r = int(x), int(y)
     if x < 0.0 or y < 0.0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
@@ -42,8 +85,9 @@ def is_hidden(hidden, factor, u, v):
 
 
 @compiled
-def arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores):
+def arc_scores(ridge, usual, bend_cost, state, bends, scores):
     """Fill in the strength of the ridge along each of many arcs ahead, as a share of the usual, less its price."""
+    strength, noise = ridge.strength, ridge.noise
     u, v, angle, bend = state
     ahead, beside = STEP_PX * math.cos(angle), STEP_PX * math.sin(angle)
     for index in range(len(bends)):
@@ -57,112 +101,104 @@ def arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, sco
         for step in range(AHEAD):
             x, y = x + across, y + down
             across, down = across * cosine - down * sine, across * sine + down * cosine
-            value = min((sample(ridge, x, y) - noise) / usual, STRONGEST)
-            if value < UNKNOWN and is_hidden(hidden, factor, x, y):
-                value = UNKNOWN
-            share = 1.0 if step < NEAR_POINTS else FAR_WEIGHT
+            value = min((sample(strength, x, y) - noise) / usual, STRONGEST)
+            if value < 0.45 and is_hidden(ridge, x, y):
+                value = 0.45  # as a hidden pixel counts
+            share = 1.0 if step < NEAR_STEPS else FAR_WEIGHT
             score += share * value
             weight += share
         scores[index] = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
 
 
 @compiled
-def best_arcs(ridge, hidden, factor, noise, faintest, usual, stiffness, state, bends, scores):
+def best_arcs(ridge, usual, state, bends, scores):
     """Return the curvature of the arc ahead that follows the ridge best, and of another, with its score.
 
     The other's score is -1 if there is none: it must be the best of its neighbours, apart from the first, and
     lie on a ridge by itself.
     """
     bend = state[3]
-    bend_cost = stiffness * BEND_COST * (1.0 + NOISE_COST * (faintest / usual) ** 2)
-    sharpest = SHARPEST / math.sqrt(stiffness)
+    bend_cost = 1.1 * (1.0 + 2.0 * (ridge.faintest / usual) ** 2)  # for 1 / px; higher where the thread is faint
     for index in range(BENDS):
         part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
-        bends[index] = min(sharpest, max(-sharpest, bend + 1.6 * sharpest * part * abs(part)))
-    arc_scores(ridge, hidden, factor, noise, usual, bend_cost, state, bends, scores)
+        bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
+    arc_scores(ridge, usual, bend_cost, state, bends, scores)
     first = scores.argmax()
     second, score = first, -1.0
     for index in range(1, BENDS - 1):
         apart = abs(bends[index] - bends[first])
-        if apart > APART and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
+        if apart > 0.05 and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
             plain = scores[index] + bend_cost * abs(bends[index] - bend)
-            if plain > (STIFF_FORK if stiffness > 1.0 else FORK) and plain > score:
+            if plain > max(score, 0.75):  # of the usual strength, at least, along the other way
                 second, score = index, plain
     return bends[first], bends[second], score
 
 
 @compiled
-def centred(ridge, noise, u, v, angle, max_shift):
-    """Return how far aside the ridge's middle lies, at most `most`, and the strength there."""
+def centred(ridge, u, v, angle, max_shift):
+    """Return how far aside the ridge's middle lies, at most `max_shift`, and the strength there."""
+    strength, noise = ridge.strength, ridge.noise
     x, y = -math.sin(angle), math.cos(angle)
     peak = 0.0
     for index in range(-(ACROSS // 2), ACROSS // 2 + 1):
-        peak = max(peak, sample(ridge, u + index * ASIDE_PX * x, v + index * ASIDE_PX * y))
+        peak = max(peak, sample(strength, u + index * ASIDE_PX * x, v + index * ASIDE_PX * y))
     total, moment = 0.0, 0.0
     for index in range(-(ACROSS // 2), ACROSS // 2 + 1):
         aside = index * ASIDE_PX
-        weight = sample(ridge, u + aside * x, v + aside * y) - noise - 0.3 * (peak - noise)
+        weight = sample(strength, u + aside * x, v + aside * y) - noise - 0.3 * (peak - noise)
         if weight > 0.0:
             total += weight
             moment += weight * aside
     shift = 0.0 if total <= 0.0 else min(max_shift, max(-max_shift, moment / total))
-    return shift, sample(ridge, u + shift * x, v + shift * y) - noise
+    return shift, sample(strength, u + shift * x, v + shift * y) - noise
 
 
 @compiled
-def walk_on(
-    ridge, hidden, factor, noise, faintest, stiffness, dish, max_length, path, strong, count, bend_first, forks
-):
-    """Walk along the ridge from a path's last vertex to the ridge's end.
+def walk_on(ridge, dish, max_length, path, strong, count, bend_first, forks):
+    """Walk along a ridge from a path's last vertex to the ridge's end.
 
     Args:
-        ridge: ridge strength in grey levels, uint8.
-        hidden: where nothing can be seen, not 0 there, `factor` times smaller.
-        factor: see `hidden`.
-        noise: the ridge's strength where nothing is.
-        faintest: a strength above noise that is no noise.
-        stiffness: of the thread; so much higher is the price of a change of curvature.
+        ridge: see `Ridge`.
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk [px].
         path: u, v, angle, bend, usual strength and length at each vertex, shape (most, 6); filled in.
-        strong: whether the thread is seen at each, shape (most,); filled in.
+        strong: whether the thread is visible at each, shape (most,); filled in.
         count: vertices that there are.
-        bend_first: curvature to begin with; beyond 1 the best.
+        bend_first: curvature to begin with [1/px]; beyond 1 the best.
         forks: filled with where there was another way: index, curvature, score; shape (most forks, 3).
 
     Returns:
         The number of vertices, and of forks.
     """
+    faintest = ridge.faintest
     u, v, angle, bend, usual, length = path[count - 1]
     bends, scores = np.empty(BENDS), np.empty(BENDS)
     gap, last, fork_count, forced = 0.0, count, 0, 0
     if bend_first < 1.0:
-        forced = FORCED
+        forced = 4  # steps that a walk is held to the other way
     while length < max_length and gap < GAP_PX and count < len(path):
         if forced > 0:
             bend_ahead, forced = bend_first, forced - 1
         else:
-            bend_ahead, other, score = best_arcs(
-                ridge, hidden, factor, noise, faintest, usual, stiffness, (u, v, angle, bend), bends, scores
-            )
+            bend_ahead, other, score = best_arcs(ridge, usual, (u, v, angle, bend), bends, scores)
             if score > 0.0 and fork_count < len(forks):
                 forks[fork_count, 0], forks[fork_count, 1], forks[fork_count, 2] = count, other, score
                 fork_count += 1
         if gap > 0.0:
             bend_ahead = 0.5 * (bend_ahead + bend)
-        middle = angle + 0.5 * bend_ahead * STEP_PX
-        x, y = u + STEP_PX * math.cos(middle), v + STEP_PX * math.sin(middle)
+        halfway = angle + 0.5 * bend_ahead * STEP_PX
+        x, y = u + STEP_PX * math.cos(halfway), v + STEP_PX * math.sin(halfway)
         turned = angle + bend_ahead * STEP_PX
-        shift, strength = centred(ridge, noise, x, y, turned, 0.7)
+        shift, strength = centred(ridge, x, y, turned, 0.7)
         seen = strength > max(WEAK * usual, faintest)
         if seen:
             if forced == 0:
                 x, y = x - shift * math.sin(turned), y + shift * math.cos(turned)
                 turned += 0.25 * shift / STEP_PX
-            usual = max(faintest, (1.0 - SMOOTHING) * usual + SMOOTHING * min(strength, STRONGEST * usual))
+            usual = max(faintest, 0.95 * usual + 0.05 * min(strength, STRONGEST * usual))
             gap = 0.0
         else:
-            gap += STEP_PX * (HIDDEN_GAP if is_hidden(hidden, factor, x, y) else 1.0)
+            gap += STEP_PX * (0.25 if is_hidden(ridge, x, y) else 1.0)
         away = math.hypot(x - dish[0], y - dish[1])
         if away > dish[2] and away >= math.hypot(u - dish[0], v - dish[1]):  # a tail at the wall is beyond it
             break
@@ -179,36 +215,29 @@ def walk_on(
 
 
 @compiled
-def refine(ridge, noise, points, strong, half):
-    """Centre the vertices once more, now that their neighbours on both sides are known, and even them out.
-
-    The ridge across the thread is a mean over `half` vertices to both sides: of a faint thread each alone is noise.
-    """
-    count = len(points)
+def refine(ridge, points, strong):
+    """Centre the vertices once more, now that their neighbours on both sides are known, and even them out."""
+    strength, noise, count = ridge.strength, ridge.noise, len(points)
     if count < 4:
         return
-    normals, profiles = np.zeros((count, 2)), np.zeros((count, ACROSS))
+    normals, profile, shifts = np.zeros((count, 2)), np.zeros(ACROSS), np.zeros(count)
     for index in range(1, count):
         before, after = max(0, index - 2), min(count - 1, index + 2)
         x, y = points[after, 0] - points[before, 0], points[after, 1] - points[before, 1]
         length = max(1e-9, math.hypot(x, y))
         normals[index, 0], normals[index, 1] = -y / length, x / length
-        for place in range(ACROSS):
-            aside = (place - ACROSS // 2) * ASIDE_PX
-            u, v = points[index, 0] + aside * normals[index, 0], points[index, 1] + aside * normals[index, 1]
-            profiles[index, place] = sample(ridge, u, v) - noise
-    shifts, mean = np.zeros(count), np.zeros(ACROSS)
     for index in range(1, count):
         if not strong[index]:
             continue
-        mean[:] = 0.0
-        for other in range(max(1, index - half), min(count, index + half + 1)):
-            mean += profiles[other] * (half + 1 - abs(other - index))
-        bound, total, moment = 0.3 * max(0.0, mean.max()), 0.0, 0.0
         for place in range(ACROSS):
-            if mean[place] > bound:
-                total += mean[place] - bound
-                moment += (mean[place] - bound) * (place - ACROSS // 2) * ASIDE_PX
+            aside = (place - ACROSS // 2) * ASIDE_PX
+            u, v = points[index, 0] + aside * normals[index, 0], points[index, 1] + aside * normals[index, 1]
+            profile[place] = sample(strength, u, v) - noise
+        bound, total, moment = 0.3 * max(0.0, profile.max()), 0.0, 0.0
+        for place in range(ACROSS):
+            if profile[place] > bound:
+                total += profile[place] - bound
+                moment += (profile[place] - bound) * (place - ACROSS // 2) * ASIDE_PX
         if total > 0.0:
             shifts[index] = min(1.0, max(-1.0, moment / total))
     for index in range(1, count):
@@ -216,3 +245,228 @@ def refine(ridge, noise, points, strong, half):
         even = 0.5 * shifts[index] + 0.25 * (shifts[before] + shifts[after])
         points[index, 0] += even * normals[index, 0]
         points[index, 1] += even * normals[index, 1]
+
+
+@compiled
+def ways_out(ridge, tail, max_hidden, simple, ways):
+    """Find the arcs along which a thread may leave the tail.
+
+    Args:
+        ridge: see `Ridge`.
+        tail: u, v and the needle's direction there [px, px, rad].
+        max_hidden: of a way, at most [px].
+        simple: whether sharp bends and ways along the needle are not tried.
+        ways: filled with angle, curvature, length up to where it can be seen, strength, score and greatest turn, the
+            best first, shape (most, 6).
+
+    Returns:
+        How many there are.
+    """
+    count = 0
+    ends = [(0.0, 0.0)] * len(ways)
+    for index in range(90):
+        angle = 2.0 * math.pi * index / 90
+        if simple and math.cos(angle - tail[2]) > math.cos(math.radians(28.0)):
+            continue
+        for side in (-1.0, 1.0):
+            for bend in (0.0, 0.04, 0.08, 0.12):
+                if side * bend == 0.0 and side > 0.0:
+                    continue  # tried already
+                count = _try(ridge, tail, (angle, side * bend, math.pi), max_hidden, ways, ends, count)
+            for bend in (0.17, 0.23, 0.31, 0.42):  # after a sharp bend the thread goes straight on
+                for turn in (math.pi, 0.75 * math.pi):
+                    if not simple:
+                        count = _try(ridge, tail, (angle, side * bend, turn), max_hidden, ways, ends, count)
+    for index in range(0 if simple else 181):  # below the needle
+        for bend in (0.0, 0.005, -0.005):
+            arc = (tail[2] + math.radians(75.0) * (2.0 * index / 180 - 1.0), bend, math.pi)
+            count = _try(ridge, tail, arc, max_hidden, ways, ends, count)
+    return count
+
+
+@compiled
+def _try(ridge, tail, arc, max_hidden, ways, ends, count):
+    """Enter an arc among the best, in their order, unless a better one ends nearby; return how many there are."""
+    angle, bend, most = arc
+    faintest = ridge.faintest
+    u, v, s, visible, seen, total, below = tail[0], tail[1], 0.0, 0, 0, 0.0, 0.0
+    step, turned, first = 3.0, 0.0, 0.0
+    x, y, half, cosine, sine = math.cos(angle), math.sin(angle), 0.0, 1.0, 0.0
+    while visible < WAYS_AHEAD:
+        turn = bend * step
+        if abs(turned + turn) > most:
+            turn = 0.0
+        if half != 0.5 * turn:
+            half = 0.5 * turn
+            cosine, sine = math.cos(half), math.sin(half)
+        # The chord is turned by half of the step's turn, what follows it by the other half.
+        x, y = x * cosine - y * sine, x * sine + y * cosine
+        u, v = u + step * x, v + step * y
+        x, y = x * cosine - y * sine, x * sine + y * cosine
+        turned += turn
+        s += step
+        step = STEP_PX
+        if is_hidden(ridge, u, v):
+            below += STEP_PX
+            if below > max_hidden:
+                return count
+            continue
+        if visible == 0:
+            first = s
+        value = sample(ridge.strength, u, v) - ridge.noise
+        total += min(value, 80.0)
+        visible += 1
+        if value > faintest:
+            seen += 1
+        elif visible - seen > (3 if visible > 3 else 1):
+            return count  # At once if it does not begin at the tail, or where it comes out: that is another thread.
+    strength = total / WAYS_AHEAD
+    score = strength * (1.0 - 0.01 * below) * seen / WAYS_AHEAD  # a gap is no way out if there is another
+    if strength < faintest or score <= 0.0:
+        return count
+    place = 0
+    while place < count and ways[place, 4] >= score:
+        if math.hypot(ends[place][0] - u, ends[place][1] - v) < 8.0:
+            return count
+        place += 1
+    # A worse one that ends nearby makes room, else the last.
+    last = place
+    while last < count and math.hypot(ends[last][0] - u, ends[last][1] - v) >= 8.0:
+        last += 1
+    if last == count:
+        if count < len(ways):
+            count += 1
+        elif place == count:
+            return count
+        last = count - 1
+    for index in range(last, place, -1):
+        ways[index], ends[index] = ways[index - 1], ends[index - 1]
+    ways[place, 0], ways[place, 1], ways[place, 2] = angle, bend, first
+    ways[place, 3], ways[place, 4], ways[place, 5] = strength, score, most
+    ends[place] = (u, v)
+    return count
+
+
+@compiled
+def begin_path(ridge, tail, way, path, strong):
+    """Begin a path along a way out, up to where the thread can be seen; see `walk_on`.
+
+    Returns:
+        The number of vertices.
+    """
+    path[0, :] = 0.0
+    path[0, 0], path[0, 1], strong[0] = tail[0], tail[1], False
+    u, v, s, turned, step, count = tail[0], tail[1], 0.0, 0.0, 3.0, 1
+    until = max(way[2], 3.0)
+    if abs(way[1]) > 0.1:  # A small bend is laid as a whole: the walk does not turn as sharply.
+        until = max(until, way[5] / abs(way[1]))
+    while s < until - 1e-9 and count < len(path):
+        turn = way[1] * step
+        if abs(turned + turn) > way[5]:
+            turn = 0.0
+        halfway = way[0] + turned + 0.5 * turn
+        u, v = u + step * math.cos(halfway), v + step * math.sin(halfway)
+        turned += turn
+        s += step
+        path[count, 0], path[count, 1], path[count, 2], path[count, 3] = u, v, way[0] + turned, turn / step
+        path[count, 4], path[count, 5] = max(way[3], ridge.faintest), s
+        strong[count] = s >= way[2] and sample(ridge.strength, u, v) - ridge.noise > ridge.faintest
+        count += 1
+        step = STEP_PX
+    return count
+
+
+@compiled
+def worth(path, strong, count):
+    """Return how much thread a path shows, none of it twice [px], less its unsteadiness."""
+    value = 0.0
+    for index in range(1, count):
+        step = path[index, 5] - path[index - 1, 5]
+        fresh = strong[index]
+        if fresh:
+            for other in range(0, index - 6):
+                u, v = path[index, 0] - path[other, 0], path[index, 1] - path[other, 1]
+                if u * u + v * v < 1.6**2:
+                    fresh = False
+                    break
+        if fresh:
+            value += step
+        value -= 12.0 * abs(path[index, 3] - path[index - 1, 3])
+    return value
+
+
+@compiled
+def follow(ridge, start, dish, max_length, max_hidden, simple, path, strong):
+    """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
+
+    Args:
+        ridge: see `Ridge`.
+        start: the tail (u, v) and the needle's direction there [px, px, rad].
+        dish: centre and the farthest the walk may go from it [px].
+        max_length: of the walk, a little longer than the thread [px].
+        max_hidden: of the thread below the needle, at most [px].
+        simple: see `ways_out`.
+        path: filled; see `walk_on`.
+        strong: filled; see `walk_on`.
+
+    Returns:
+        The number of vertices, and how much thread they show [px]; see `worth`.
+    """
+    ways = np.empty((5, 6))
+    found = ways_out(ridge, start, max_hidden, simple, ways)
+    path[0, :2], strong[0] = start[:2], False
+    best, best_value, enough = 1, 0.0, 0.9 * max_length  # so much thread needs no other way
+    other, other_strong = np.empty_like(path), np.empty_like(strong)
+    for index in range(found):
+        count = begin_path(ridge, start, ways[index], other, other_strong)
+        count, value = _follow_forks(ridge, dish, max_length, other, other_strong, count, enough)
+        if value > 1.25 * best_value + (MIN_GAIN_PX if index > 0 else 0.0):  # The first begins strongest.
+            best, best_value = count, value
+            path[:count], strong[:count] = other[:count], other_strong[:count]
+        if best_value > enough:
+            break
+    return best, best_value
+
+
+@compiled
+def _follow_forks(ridge, dish, max_length, path, strong, begun, enough):
+    """Walk on from a path's last vertex; where much less of the thread is visible than there is, try forks.
+
+    Returns:
+        The number of vertices, and their worth.
+    """
+    forks = np.empty((200, 3))
+    count, fork_count = walk_on(ridge, dish, max_length, path, strong, begun, 9.0, forks)
+    value = worth(path, strong, count)
+    if value > enough or fork_count == 0:
+        return count, value
+    other, other_strong, other_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
+    best, best_strong, best_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
+    for _ in range(4):
+        best_value, best_count, best_fork_count = value + MIN_GAIN_PX, 0, 0
+        for index in range(fork_count):
+            at = int(forks[index, 0])
+            if at >= count or at < begun:
+                continue
+            # Of forks in a row, towards one and the same other way, the best only.
+            poorer = False
+            for near in range(max(0, index - 2), min(fork_count, index + 3)):
+                if abs(forks[near, 0] - at) < 2.5 and forks[near, 2] > forks[index, 2]:
+                    poorer = True
+            if poorer:
+                continue
+            other[:at], other_strong[:at] = path[:at], strong[:at]
+            bend = forks[index, 1]
+            reached, found = walk_on(ridge, dish, max_length, other, other_strong, at, bend, other_forks)
+            tried = worth(other, other_strong, reached)
+            if tried > best_value:
+                best_value, best_count, best_fork_count = tried, reached, found
+                best[:reached], best_strong[:reached] = other[:reached], other_strong[:reached]
+                best_forks[:found] = other_forks[:found]
+        if best_count == 0:
+            break
+        value, count, fork_count = best_value, best_count, best_fork_count
+        path[:count], strong[:count], forks[:fork_count] = best[:count], best_strong[:count], best_forks[:fork_count]
+        if value > enough:
+            break
+    return count, value

@@ -23,9 +23,9 @@ from matplotlib.image import imread
 
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics
-from magnetosuture_thread.evaluation.report.figures import BagDetails, BagFigures, LiveFigures, format_number, headlines
+from magnetosuture_thread.evaluation.plots import Photo, draw_worst_frame
+from magnetosuture_thread.evaluation.report.figures import BagDetails, Figures, LiveFigures, format_number, headlines
 from magnetosuture_thread.evaluation.report.page import page_data, write_page
-from magnetosuture_thread.evaluation.report.pictures import Photo, draw_worst_frame
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.model.forces import ThreadForces
@@ -78,7 +78,7 @@ def made_metrics(
 def made_page(about: BagDetails = ABOUT, *, live: LiveFigures | None = None, estimated: bool = False) -> str:
     """Return a page."""
     metrics = made_metrics(estimated=estimated)
-    figures = BagFigures.of(metrics, live)
+    figures = Figures.of(metrics, live)
     pictures = [
         draw_worst_frame(worst, None, target=metrics.target, length=LENGTH, dish_diameter=0.035)
         for worst in metrics.worst_frames()
@@ -156,7 +156,7 @@ def test_the_policy_lets_the_page_s_own_scripts_run_and_no_other(page: str):
 
 def test_the_data_is_that_of_the_figures(page: str):
     data = json.loads(Reader(page).scripts[0])
-    figures = BagFigures.of(made_metrics())
+    figures = Figures.of(made_metrics())
     lines = {line["id"]: line for plot in data["plots"] for line in plot["series"]}
     for target in ("truth", "seen"):
         error = figures.error[target]
@@ -204,13 +204,6 @@ def test_estimate_and_prediction_stand_side_by_side():
         assert f"--{name}: #" in page
 
 
-def test_the_head_says_the_figures_in_words(page: str):
-    text = Reader(page).text
-    for words in ("280 of 300", "broken: obstacle", "The bag does not say whether it is simulated.", "not in this bag"):
-        assert words in text
-    assert "Simulated:" not in text
-
-
 def test_what_is_simulated_and_broken_is_said():
     about = replace(ABOUT, simulated="camera frames", damage=("chunk 7",), refused={"too old": 3}, remarks=("odd",))
     live = LiveFigures({"frame to prediction": Percentiles(0.012, 0.018, 0.02)})
@@ -246,14 +239,6 @@ def test_a_long_bag_makes_no_large_page():
     assert all(len(line["values"]) <= 5010 for plot in data["plots"] for line in plot["series"])
     assert len(data["map"]["times"]) <= 1300
     assert len(json.dumps(data)) < 2_000_000
-
-
-def test_without_anything_to_hold_it_against_a_prediction_is_not_scored():
-    metrics = made_metrics(targets=())
-    page = write_page(ABOUT, metrics, BagFigures.of(metrics), [])
-    assert "error-truth" not in page
-    assert metrics.worst_frames() == []
-    assert Reader(page).open == []
 
 
 @pytest.mark.parametrize("with_frame", [True, False])
@@ -308,38 +293,16 @@ def test_a_browser_draws_all_plots_where_there_is_one(tmp_path: Path, page: str,
     assert "The plots cannot be drawn" not in shown.split("<script")[0]
 
 
-@pytest.mark.parametrize("browser", BROWSERS)
-def test_one_prediction_alone_is_seen_in_every_plot(tmp_path: Path, browser: str):
-    metrics = made_metrics(1)
-    about = replace(ABOUT, simulated="all")
-    shown = drawn(browser, tmp_path, write_page(about, metrics, BagFigures.of(metrics), [])).split("<script")
-    dots = [part.count('class="point"') for part in "".join(shown).split('id="plot-')[1:]]
-    assert len(dots) >= 4
-    assert all(dots[0:1] + dots[2:])  # the second is the map
-    assert "".join(shown).count(">simulated</text>") == len(dots)
-
-
 def test_all_times_are_shown_and_a_second_at_the_least():
     assert page_data(made_metrics(1), [])["range"] == [-0.5, 0.5]
     assert page_data(made_metrics(300), [])["range"] == pytest.approx([0.0, 299 * 0.033333333])
-
-
-def test_of_very_many_losses_none_is_left_out():
-    metrics = made_metrics()
-    metrics.lost = [[float(k), k + 0.5] for k in range(1000)]
-    metrics.lost[500] = [500.0, 500.9]  # so that these two are nearest
-    bands = page_data(metrics, [])["lost"]
-    assert len(bands) == 400
-    assert all(any(a <= begin and end <= b for a, b in bands) for begin, end in metrics.lost)
-    metrics.lost = metrics.lost[:400]
-    assert page_data(metrics, [])["lost"] == metrics.lost
 
 
 def test_the_head_shows_the_margin_that_is_broken():
     metrics = made_metrics(3)
     holds = MinimumMargin("obstacle", 1e-3, 1e-3, 7, 0, 0.1)
     broken = MinimumMargin("connectivity", -1e-4, -1e-7, 3, -1, 0.2)
-    figures = replace(BagFigures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
+    figures = replace(Figures.of(metrics), minimum={"connectivity": broken, "obstacle": holds})
     tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
     assert (tile.name, tile.assessment) == ("minimum margin, connectivity", "broken: connectivity")
     figures = replace(figures, minimum={"connectivity": replace(broken, clearance=0.0), "obstacle": holds})
@@ -347,25 +310,9 @@ def test_the_head_shows_the_margin_that_is_broken():
     assert (tile.name, tile.assessment) == ("minimum margin, obstacle", "every barrier holds")
 
 
-def test_one_frame_is_not_frames():
-    tile = headlines(ABOUT, BagFigures.of(made_metrics(1)))[0]
-    assert "over 1 frame;" in tile.detail
-
-
-def test_a_rendered_frame_is_said_to_be_one(view):
-    photo = Photo(np.full((480, 640, 3), 90, np.uint8), view)
-    worst = made_metrics().worst_frames()[0]
-    drawn_as = [
-        draw_worst_frame(worst, photo, target="truth", length=LENGTH, dish_diameter=0.035, simulated=simulated)
-        for simulated in (True, False)
-    ]
-    assert drawn_as[0].alt_text.startswith("Simulated camera frame")
-    assert drawn_as[0].source != drawn_as[1].source
-
-
 def test_the_forces_are_drawn_and_their_greatest_stated():
     metrics = made_metrics()
-    figures = BagFigures.of(metrics)
+    figures = Figures.of(metrics)
     peak = 1e-6 * (len(metrics.observed) - 1)
     assert [figures.tension, figures.pull] == pytest.approx([peak, 5e-6])
     plot = next(plot for plot in page_data(metrics, [])["plots"] if plot["id"] == "tension")
@@ -390,7 +337,7 @@ def test_the_figures_are_the_worst_and_the_counts_of_all_frames():
         metrics.add(FrameResult.of(sight, prediction, margins(clearance), 1e-4))
     for index in range(3, 40):
         metrics.observe(Observation(index * 10**8, reason=f"{index % 20}"))
-    figures = BagFigures.of(metrics)
+    figures = Figures.of(metrics)
     assert figures.minimum["obstacle"].clearance == -1e-5
     assert figures.minimum["obstacle"].time == pytest.approx(0.1)
     assert (figures.residual, figures.contact_frames) == (1e-7, 1)

@@ -11,7 +11,7 @@ import shapely
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.model.formulations import ThreadState
-from test.model.formulations.scenes import DT, box, east, formulated, lead, silk
+from test.model.formulations.scenes import DT, east, formulated, lead, silk
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 REACH = 0.02  # of nodes; chords have a part of it
@@ -93,11 +93,6 @@ def test_a_corner_that_is_not_the_nearest_of_a_chord_is_no_contact(
     assert not contacts(polygon, np.array(middle) - along, np.array(middle) + along)
 
 
-def test_a_concave_corner_is_no_contact_of_a_chord():
-    corner = Polygon(((0.0, 0.0), (0.02, 0.0), (0.02, 0.01), (0.01, 0.01), (0.01, 0.02), (0.0, 0.02)))
-    assert not contacts(corner, np.array([0.0105, 0.013]), np.array([0.013, 0.0105]))
-
-
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.0, 0.0, 0.0)])
 def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, ...]):
     disc, half = Disc(centre, 0.02), 0.5 * SEGMENT / 0.02
@@ -114,61 +109,6 @@ def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, .
     assert distance == pytest.approx(1e-4)
     assert place == pytest.approx(0.4)
     np.testing.assert_allclose(normal, east(len(centre)), atol=1e-12)
-
-
-@pytest.mark.parametrize(("bend", "beyond"), [(0.03, 1.0 / 0.03), (0.01, 1.0 / 0.02), (-0.03, 0.0)])
-def test_from_a_disc_an_arc_is_as_far_as_it_bulges_but_no_farther_than_one_on_the_surface(bend: float, beyond: float):
-    """Nodes on a circle beside the disc, around its side or, where the radius is negative, away from it."""
-    half = 0.5 * SEGMENT / abs(bend)
-    angles = half * np.array([-3.0, -1.0, 1.0, 3.0])
-    nodes = np.column_stack([bend * np.cos(angles), abs(bend) * np.sin(angles)])
-    nodes[:, 0] += 0.0201 - nodes[1, 0]  # the chord in the middle is 0.1 mm from a disc of 20 mm
-    found = [c for c in contacts_of(Disc((0.0, 0.0), 0.02), nodes) if c[1] == pytest.approx(0.5)]
-    assert len(found) == 1
-    assert found[0][0] == pytest.approx(1e-4 + beyond * SEGMENT**2 / 8.0, rel=0.02)
-
-
-def test_a_contact_of_a_chord_names_its_segment_and_its_obstacle():
-    discs = Disc((0.01, -0.0021), 0.002), Disc((0.002, -0.0021), 0.002)
-    square = Polygon(((0.0135, 0.0001), (0.0145, 0.0011), (0.0135, 0.0021), (0.0125, 0.0011)))
-    points = np.column_stack([SEGMENT * np.arange(5.0), np.zeros(5)])
-    to = ChordContacts(np.zeros(9, np.int64), np.zeros(9, np.int64), np.zeros(9), np.zeros((9, 2)), np.zeros(9))
-    data = Workspace((*discs, square), REACH).data
-    count = find_chord_contacts(points, data, SEGMENT, 0.0, np.full(5, -np.inf), 0, to)
-    assert set(zip(to.node[:count].tolist(), to.obstacle[:count].tolist(), strict=True)) == {(0, 1), (2, 0), (3, 2)}
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.4])
-def test_a_chord_over_an_edge_of_a_mesh_has_its_distance(turn: float):
-    cube = box((0.0, 0.0, 0.0), 0.005)
-    # Above the edge x = z = 0.005, across it, and turned about the axis between.
-    along = np.array([math.cos(turn) * math.sqrt(0.5), math.sin(turn), -math.cos(turn) * math.sqrt(0.5)])
-    for height in (1e-3, 1e-5, -1e-4):
-        middle = np.array([0.005, 0.001, 0.005]) + height * np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
-        (found,) = contacts(cube, middle - 0.002 * along, middle + 0.002 * along)
-        assert found[0] == pytest.approx(height, abs=1e-12)
-        assert found[1] == pytest.approx(0.5)
-        np.testing.assert_allclose(found[2], [math.sqrt(0.5), 0.0, math.sqrt(0.5)], atol=1e-12)
-    flat = np.array([0.0, 0.002, 0.0])  # along the edge: its ends are as near
-    assert not contacts(cube, middle - flat, middle + flat)
-    inside_a_face = np.array([0.001, 0.0005, 0.0055])  # over the diagonal of a flat side, which sticks out nowhere
-    assert not contacts(cube, inside_a_face - 0.001 * east(3), inside_a_face + 0.001 * east(3))
-
-
-@pytest.mark.parametrize(
-    ("across", "degrees", "near"),
-    [(0.0045, 45.0, True), (-0.0045, 45.0, True), (0.007, 45.0, False), (0.001, -20.0, False), (0.001, 110.0, False)],
-)
-def test_a_chord_over_an_edge_is_a_contact_only_between_its_ends_and_its_faces(
-    across: float, degrees: float, near: bool
-):
-    """A chord that falls by some degrees over the upper right edge of a cube, and turns to one of its ends."""
-    fall = math.radians(degrees)
-    along = np.array([math.cos(fall), math.copysign(0.4, across) if near else 0.0, -math.sin(fall)])
-    along *= 0.5 * SEGMENT / np.linalg.norm(along)
-    middle = np.array([0.0055, across, 0.0055])
-    found = contacts(box((0.0, 0.0, 0.0), 0.005), middle - along, middle + along)
-    assert len(found) == near
 
 
 def deepest(obstacle: Polygon, positions: np.ndarray, radius: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.geometry.obstacles import WALL, Disc, Mesh, Obstacle, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distances
 
 REACH = 5e-3
@@ -21,24 +21,18 @@ def star(random: np.random.Generator, corners: int) -> Polygon:
     return Polygon(tuple(map(tuple, centre + away[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))))
 
 
-def tetrahedron(random: np.random.Generator) -> Mesh:
-    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    return Mesh(5e-3 * corners + random.uniform(-5e-3, 5e-3, 3), faces)
-
-
 def polyline(random: np.random.Generator, dimension: int) -> np.ndarray:
     ways = np.cumsum(random.normal(0.0, 0.5, (25, dimension)), axis=0)
     ways *= random.choice([3e-4, 8e-4, 2e-3]) / np.linalg.norm(ways, axis=1)[:, None]
     return np.vstack([np.zeros(dimension), np.cumsum(ways, axis=0)]) + random.uniform(-6e-3, 6e-3, dimension)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_no_point_of_a_chord_is_closer_than_its_distance_and_one_is_as_close(seed: int, dimension: int):
     random = np.random.default_rng(seed)
     ball = Disc(tuple(random.uniform(-0.01, 0.01, dimension)), random.uniform(2e-4, 3e-3))
-    others: list[Obstacle] = [star(random, 5), star(random, 40)] if dimension == 2 else [tetrahedron(random)]
+    others: list[Obstacle] = [star(random, 5), star(random, 40)] if dimension == 2 else []
     shapes = [ball, *others]
     near = Workspace(shapes, REACH, dimension, WALL_RADIUS)
     far = Workspace(shapes, 0.1, dimension, WALL_RADIUS)
@@ -83,13 +77,3 @@ def test_beside_an_edge_and_through_a_thin_shape_nothing_is_missed():
     contacts = workspace.near(beside)
     found = half_segment_distances(beside, workspace.data, contacts)[contacts.obstacle == 0]
     np.testing.assert_allclose(found, 2e-4, atol=1e-12)
-
-
-def test_nothing_near_and_a_chord_without_length_have_their_own_distance():
-    workspace = Workspace([Disc((0.0, 0.0), 1e-3)], REACH, wall_radius=WALL_RADIUS)
-    nodes = np.full((3, 2), 9e-3)
-    contacts = workspace.near(nodes)
-    assert contacts.obstacle.tolist() == [WALL] * 3
-    np.testing.assert_allclose(half_segment_distances(nodes, workspace.data, contacts), contacts.distance)
-    empty = Workspace([], REACH)
-    assert len(half_segment_distances(nodes, empty.data, empty.near(nodes))) == 0

@@ -45,11 +45,6 @@ def test_a_bad_polygon_is_refused_with_its_reason(outline, holes, reason: str):
         Polygon(outline, holes)
 
 
-def test_the_error_names_the_file():
-    with pytest.raises(ConfigurationError, match=r"^maze\.yaml: polygon\.outline"):
-        Polygon(SQUARE[:2], source="maze.yaml")
-
-
 def test_rings_are_normalised_and_keep_their_first_vertex():
     hole = square(0.002, 0.002, 0.003)
     closed = (*SQUARE, SQUARE[0])
@@ -98,19 +93,6 @@ def test_an_arc_is_tangent_to_both_edges(radius: float, turn: float):
     if tangent < 0.49 * min(side, 2.0 * side * math.sin(half)):
         assert len(arc) >= 2
         np.testing.assert_allclose(np.linalg.norm(arc - centre, axis=1), radius, rtol=1e-6)
-
-
-def test_radii_shrink_where_edges_are_short():
-    smooth = Polygon(SQUARE).smoothed(1.0)
-    assert Polygon(SQUARE).area * math.pi / 4.0 - 1e-6 < smooth.area < Polygon(SQUARE).area * 0.85
-
-
-def test_an_arc_may_use_nearly_all_of_an_edge_whose_other_end_stays_as_it_is():
-    """The edges at the origin are 1 mm long and end at vertices that hardly turn."""
-    outline = ((0.0, 0.0), (0.001, -1e-6), *SQUARE[1:], (-1e-6, 0.001))
-    radius = 0.0009
-    away = np.linalg.norm(Polygon(outline).smoothed(radius).outline, axis=1)
-    assert away.min() == pytest.approx((math.sqrt(2.0) - 1.0) * radius, rel=0.05)
 
 
 def test_an_arc_that_meets_a_hole_is_made_smaller():

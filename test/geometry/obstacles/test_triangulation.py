@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Polygon, Triangulation, triangulate
+from magnetosuture_thread.geometry.obstacles import Polygon, triangulate
 
 
 def star(seed: int, vertices: int, hole: bool) -> Polygon:
@@ -41,11 +40,6 @@ def test_it_keeps_every_edge_once_and_the_area(seed: int, vertices: int, hole: b
     assert {tuple(v) for v in found.vertices.tolist()} == {*polygon.outline, *(p for h in polygon.holes for p in h)}
 
 
-def test_vertices_in_line_are_kept():
-    wall = [(0.001 * i, 0.0) for i in range(50)] + [(0.049 - 0.001 * i, 0.002) for i in range(50)]
-    assert len(triangulate(Polygon(tuple(wall))).triangles) == 98
-
-
 def test_corners_apart_by_less_than_rounding_are_refused():
     needle = Polygon(((0.0, 0.0), (0.005, 0.0), (0.0, 0.005))).smoothed(1e-320)
     with pytest.raises(ConfigurationError, match="can be cut into triangles"):
@@ -54,25 +48,3 @@ def test_corners_apart_by_less_than_rounding_are_refused():
 
 HEXAGON = tuple((0.01 * math.cos(angle), 0.01 * math.sin(angle)) for angle in np.linspace(0.0, 2.0 * np.pi, 7)[:-1])
 GOOD = [(0, 1, 2), (2, 3, 4), (4, 5, 0), (0, 2, 4)]
-
-
-@pytest.mark.parametrize(
-    ("triangles", "words"),
-    [
-        ([*GOOD, (0, 2, 4)], "overlap"),
-        (GOOD[1:], "the edge from vertex 0 to 1 lost"),
-        (GOOD[:3], "an edge inside that belongs to one triangle only"),
-        ([(0, 1, 2), (2, 3, 4), (4, 5, 0), (0, 2, 3)], "overlap"),
-    ],
-)
-def test_triangles_that_miss_a_part_or_overlap_are_refused(
-    monkeypatch: pytest.MonkeyPatch, triangles: list[tuple[int, int, int]], words: str
-):
-    def cut(given: list[tuple[int, int, int]]) -> Triangulation:
-        pieces = shapely.GeometryCollection([shapely.Polygon([HEXAGON[i] for i in corners]) for corners in given])
-        monkeypatch.setattr(shapely, "constrained_delaunay_triangles", lambda _: pieces)
-        return triangulate(Polygon(HEXAGON))
-
-    assert len(cut(GOOD).triangles) == 4
-    with pytest.raises(ConfigurationError, match=words):
-        cut(triangles)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magnetosuture_thread.geometry.obstacles import Mesh, Obstacle, Workspace
+from magnetosuture_thread.geometry.obstacles import Obstacle, Workspace
 from magnetosuture_thread.model.formulations import (
     Formulation,
     PaperOptions,
@@ -96,13 +96,3 @@ def followed(
 def stretch(thread: Thread, positions: np.ndarray) -> float:
     """Return the greatest length of a segment over its rest length, less one."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).max()) / thread.segment_length - 1.0
-
-
-def box(centre: tuple[float, float, float], half: float) -> Mesh:
-    """Return a cube."""
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * half + centre
-    faces = [
-        (0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
-        (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
-    ]  # fmt: skip
-    return Mesh(corners, np.array(faces))

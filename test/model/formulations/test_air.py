@@ -10,7 +10,6 @@ import pytest
 from scipy.optimize import brentq
 from scipy.special import j0
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.formulations import PrescribedMotion, ThreadState
 from test.model.formulations.scenes import east, formulated, in_air, straight, stretch
 
@@ -103,20 +102,3 @@ def test_bending_damping_takes_the_energy_out_of_a_spring():
             moved.append(abs(state.positions[-1, 1]))
         swings[damping] = max(moved[-200:])
     assert swings[0.02] < 0.3 * swings[0.0]
-
-
-def test_a_driven_node_takes_the_damped_bending_with_it():
-    """Bending is damped by its rate, so a rigid motion of a rope in vacuum costs nothing."""
-    thread = replace(in_air(0.1, 20, (0.0, 0.0), stiffness=1e-5), segments=20)
-    thread = replace(thread, medium=replace(thread.medium, bending_damping=0.05))
-    formulation = formulated(thread)
-    velocity = np.array([0.02, 0.01])
-    state = ThreadState(straight(thread), np.tile(velocity, (21, 1)), 1e-3)
-    for step in range(1, 50):
-        state = formulation.step(state, PrescribedMotion((0,), (step * 1e-3 * velocity)[None], east()), 1e-3).state
-    np.testing.assert_allclose(state.positions, straight(thread) + 49e-3 * velocity, atol=1e-9)
-
-
-def test_gravity_must_have_a_value_for_each_dimension():
-    with pytest.raises(ConfigurationError, match="2 values, or none"):
-        formulated(in_air(0.1, 5, (0.0, 0.0, -G)))

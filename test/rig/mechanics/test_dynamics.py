@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties, advance
 from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.rig.mechanics.newton import advance
 
 Vector = NDArray[np.float64]
 NEEDLE = NeedleBody(7e-3, 4e-4, 0.0, 1e6, 1.0)
@@ -103,87 +102,16 @@ def test_a_bent_thread_relaxes_as_its_slowest_mode(attachment: NeedleJoint, root
     np.testing.assert_allclose(decay[1:], 0.2, rtol=4e-3)
 
 
-def test_a_thread_that_is_pulled_lengthwise():
-    made, speed = rig(), 5e-3
-    for k in range(1, 31):
-        made.drive((k * FRAME * speed, 0.0), 0.0, FRAME)
-    # Half a segment at the tail is carried by the needle.
-    along = POLYAMIDE.length * (1.0 - (np.arange(60) + 0.5) / 60.0)
-    expected = POLYAMIDE.drag_along * speed * along
-    np.testing.assert_allclose(made.tension, expected, atol=1e-4 * expected[0])
-    assert np.abs(made.thread[:, 1]).max() < 1e-12
-    np.testing.assert_allclose(made.thread[-1, 0], 30 * FRAME * speed - 19e-3, atol=2e-7)
-
-
-@pytest.mark.parametrize("dt", [1e-17, 1e-13])
-def test_however_short_a_time_is_a_step(dt: float):
-    made = rig()
-    made.step(np.zeros(4), dt)
-    assert made.time == dt
-
-
-def test_a_turn_does_not_stretch_the_thread_and_leaves_what_it_was_told():
-    made = rig(CLAMPED)
-    for k in range(1, 121):
-        a = math.pi * k / 120.0
-        tail = (5e-3 * math.sin(a), 5e-3 * (1.0 - math.cos(a)))
-        made.drive(tail, a, FRAME)
-        assert np.abs(made.tension).max() / CLAMPED.stretching_stiffness < 1e-4
-    np.testing.assert_allclose(made.tail, [0.0, 1e-2], atol=1e-15)
-    assert made.heading == pytest.approx(math.pi)
-    np.testing.assert_allclose(made.thread[0], made.tail)
-    np.testing.assert_allclose(made.tip, [-7e-3, 1e-2], atol=1e-15)
-    assert made.time == pytest.approx(2.0)
-    assert made.converged
-
-
-def test_a_glued_thread_keeps_the_tangent_and_a_pinned_one_does_not():
-    turns = []
-    for thread in (CLAMPED, POLYAMIDE):
-        made = rig(thread)
-        for k in range(1, 31):
-            made.drive((0.0, 0.0), k / 30.0, FRAME)
-        first, second = np.diff(made.thread[:3], axis=0)
-        # The tangent at the tail, of second order.
-        tangent = 1.5 * math.atan2(-first[1], -first[0]) - 0.5 * math.atan2(-second[1], -second[0])
-        turns.append(math.remainder(made.heading - tangent, 2.0 * math.pi))
-    assert abs(turns[0]) < 5e-3
-    assert abs(turns[1]) > 0.5
-
-
-def test_a_curved_thread_comes_to_rest_in_its_own_shape():
-    curved = replace(CLAMPED, rest_curvature=60.0)
-    made = rig(curved, curvature=30.0)
-    for _ in range(10):
-        made.drive((0.0, 0.0), 0.0, 8.0)
-    expected = behind(curved, 60.0, count=61)
-    assert np.abs(made.thread - expected).max() < 1e-3 * curved.length
-    assert made.energy < 1e-5 * rig(curved, curvature=30.0).energy
-
-
-@pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])
-def test_without_currents_the_energy_only_falls(attachment: NeedleJoint):
-    made = rig(
-        replace(POLYAMIDE, attachment=attachment), curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),))
-    )
-    energies = [made.energy]
+def test_without_currents_the_energy_only_falls():
+    made = rig(curvature=120.0, surface=Surface((Disc((-5e-3, 1e-3), 1e-3),)))
+    segment, energies = POLYAMIDE.length / POLYAMIDE.segments, []
     for _ in range(60):
+        bends = np.diff(made.thread, 2, axis=0)
+        stretch = 0.5 * segment / POLYAMIDE.stretching_stiffness * float(made.tension @ made.tension)
+        energies.append(stretch + 0.5 * POLYAMIDE.bending_stiffness / segment**3 * float(np.sum(bends**2)))
         made.step(np.zeros(4), FRAME)
-        energies.append(made.energy)
     assert (np.diff(energies) < 0.0).all()
     assert energies[-1] < 0.7 * energies[0]
-
-
-def test_the_world_can_be_turned():
-    turn, thread = 0.8, replace(CLAMPED, segments=30)
-    plain = steered(rig(thread, curvature=40.0, heading=0.2), 1.0, 2.0)
-    turned = rig(thread, curvature=40.0, heading=0.2 + turn, field=coils(turn))
-    steered(turned, 1.0, 2.0)
-    c, s = math.cos(turn), math.sin(turn)
-    back = turned.thread @ np.array([[c, -s], [s, c]])
-    assert np.linalg.norm(plain.tail) > 1e-3
-    np.testing.assert_allclose(back, plain.thread, atol=1e-9)
-    assert turned.heading - turn == pytest.approx(plain.heading, abs=1e-7)
 
 
 @pytest.mark.parametrize("attachment", [NeedleJoint.PINNED, NeedleJoint.CLAMPED])
@@ -292,34 +220,6 @@ def test_what_a_needle_lies_against_pushes_it_away():
     assert abs(made.heading) > 0.1
 
 
-@pytest.mark.parametrize("wrong", [[math.nan, 0.0, 0.0, 0.0], [math.inf, 0.0, 0.0, 0.0], [1.0], [[1.0] * 4]])
-def test_currents_that_are_none_are_refused(wrong: list):
-    made = rig(replace(POLYAMIDE, segments=8))
-    before = made.thread
-    with pytest.raises(InvalidInputError, match="currents"):
-        made.step(wrong, FRAME)
-    np.testing.assert_array_equal(made.thread, before)
-    assert made.time == 0.0
-
-
-def test_other_wrong_input_is_refused():
-    made = rig(replace(POLYAMIDE, segments=8))
-    for dt in (0.0, -1.0, math.nan):
-        with pytest.raises(InvalidInputError, match="dt"):
-            made.step(np.zeros(4), dt)
-    with pytest.raises(InvalidInputError, match="heading"):
-        made.drive((0.0, 0.0), math.nan, FRAME)
-    with pytest.raises(InvalidInputError, match="tail"):
-        made.drive((0.0, math.inf), 0.0, FRAME)
-    with pytest.raises(InvalidInputError, match="first point at the tail"):
-        RigDynamics(NEEDLE, POLYAMIDE, OPEN, None, (1e-2, 0.0), 0.0, behind(POLYAMIDE))
-    with pytest.raises(InvalidInputError, match="currents"):
-        RigDynamics(NEEDLE, POLYAMIDE, OPEN, None, (0.0, 0.0), 0.0, behind(POLYAMIDE)).step(np.zeros(4), FRAME)
-    for wrong in ({"length": 0.0}, {"segments": 2}, {"bending_stiffness": -1.0}, {"drag_along": math.nan}):
-        with pytest.raises(ConfigurationError, match=next(iter(wrong))):
-            replace(POLYAMIDE, **wrong)
-
-
 def test_a_step_that_fails_is_halved_and_the_time_is_kept(monkeypatch: pytest.MonkeyPatch):
     made, plain, calls = rig(), rig(), [0]
 
@@ -359,5 +259,4 @@ def test_a_step_that_never_converges_is_an_error(monkeypatch: pytest.MonkeyPatch
     before = made.thread
     with pytest.raises(SolverError, match="no convergence"):
         made.step(np.zeros(4), FRAME)
-    assert not made.converged
     np.testing.assert_array_equal(made.thread, before)

@@ -9,26 +9,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, point_contacts, polygon_gap, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, polygon_gap, segment_contacts
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
     Rod,
     add_bending,
     add_contact,
-    add_drag,
     add_stretching,
-    back_substitute,
-    drag_matrices,
-    factor,
 )
 
 Vector = NDArray[np.float64]
 Term = Callable[[Vector, Vector, Vector, bool], float]
 SEGMENTS, D = 7, 1e-3
-ROD = Rod(D, 5.0, 1.3e-9, 0.97, 0.48, 0.2, 3e-5)
+ROD = Rod(D, 5.0, 1.3e-9, 0.97, 0.48, 3e-5)
 L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]) * 1e-3
 
 
@@ -87,40 +82,21 @@ def test_stretching_has_its_derivatives():
     check_derivatives(lambda q, g, b, convex: add_stretching(q, ROD, g, b, convex), bent_state())
 
 
-@pytest.mark.parametrize("rest_turn", [0.0, 0.2, -0.4])
-def test_bending_has_its_derivatives(rest_turn: float):
-    rod = ROD._replace(rest_turn=rest_turn)
-    check_derivatives(lambda q, g, b, convex: add_bending(q, rod, g, b, convex), bent_state(), 1e-7)
+def test_bending_has_its_derivatives():
+    check_derivatives(lambda q, g, b, convex: add_bending(q, ROD, g, b), bent_state(), 1e-7)
 
 
-def test_bending_is_least_at_the_rest_curvature_and_measures_curvature():
-    def at(turn: float, rest: float) -> float:
-        angle = turn * np.arange(SEGMENTS)
-        nodes = np.vstack([np.zeros(2), np.cumsum(D * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)])
-        q = np.concatenate([[0.0], nodes.ravel()])
-        return evaluated(lambda q, g, b, c: add_bending(q, ROD._replace(rest_turn=rest), g, b, c), q)[0]
-
-    energies = [at(turn, 0.2) for turn in (0.19, 0.2, 0.21)]
-    assert energies[1] == min(energies)
-    joints = SEGMENTS - 1
-    assert at(0.01, 0.0) == pytest.approx(0.5 * ROD.bending / D * joints * 0.01**2, rel=1e-4)
-    assert at(-0.2, 0.2) > at(0.2, 0.2)
-
-
-def test_drag_of_a_straight_thread():
-    nodes = np.column_stack([D * np.arange(SEGMENTS + 1), np.zeros(SEGMENTS + 1)])
-    drag = np.zeros((SEGMENTS + 1, 3))
-    drag_matrices(np.concatenate([[0.0], nodes.ravel()]), ROD, 1.0, drag)
-    np.testing.assert_allclose(drag.sum(axis=0), [ROD.along * 7e-3, 0.0, ROD.across * 7e-3], rtol=1e-12)
-    np.testing.assert_allclose(drag[0], 0.5 * drag[1])
-    np.testing.assert_allclose(drag[-1], 0.5 * drag[1])
-
-
-def test_drag_has_its_derivatives():
-    q, rest = bent_state(), bent_state() + 1e-5
-    drag = np.zeros((SEGMENTS + 1, 3))
-    drag_matrices(q, ROD, 500.0, drag)
-    check_derivatives(lambda q, g, b, convex: add_drag(q, rest, drag, g, b), q, 1e-7)
+def test_the_needles_terms_have_their_derivatives():
+    resistance = np.array([[3e-7, 2e-6, 4e-5], [2e-6, 2e-2, 1e-3], [4e-5, 1e-3, 3e-2]])
+    outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
+    needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, 1.3)
+    shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=7.1e-3).packed()
+    rows, turned = np.zeros((4, 5)), np.zeros((3, 3))
+    q, field = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]])
+    rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
+    turn_resistance(needle, 0.3, 500.0, turned)
+    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
+    check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
 
 
 def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
@@ -138,30 +114,6 @@ def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
         corner = middle - depth * away
         wedge = np.array([corner, corner + 2e-3 * away + 5e-4 * away[::-1], corner + 2e-3 * away - 5e-4 * away[::-1]])
         check_derivatives(contact_term(Surface(polygons=(wedge,)).packed()), q)
-
-
-@pytest.mark.parametrize("wall", [7.1e-3, None])
-def test_the_needles_terms_have_their_derivatives(wall: float | None):
-    resistance = np.array([[3e-7, 2e-6, 4e-5], [2e-6, 2e-2, 1e-3], [4e-5, 1e-3, 3e-2]])
-    outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
-    needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, (1.3, 2e-4))
-    shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=wall).packed()
-    rows, turned = np.zeros((4, 5)), np.zeros((3, 3))
-    q, field = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]])
-    rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
-    turn_resistance(needle, 0.3, 500.0, turned)
-    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
-    check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
-
-
-def test_the_needles_drag_turns_with_it():
-    resistance = np.array([[3e-7, 2e-6, 4e-5], [2e-6, 2e-2, 1e-3], [4e-5, 1e-3, 3e-2]])
-    needle = Needle(resistance, np.zeros(2), 0.0, np.zeros((0, 2)), 0.0, (0.0, 0.0))
-    turned, angle = np.zeros((3, 3)), 0.7
-    turn_resistance(needle, angle, 2.0, turned)
-    turn = np.eye(3)
-    turn[1:, 1:] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    np.testing.assert_allclose(turned, 2.0 * turn @ resistance @ turn.T, rtol=1e-12)
 
 
 def test_the_distance_from_a_polygon():
@@ -191,43 +143,3 @@ def test_a_segment_touches_only_corners_that_stick_out():
     assert segment_contacts(3.7e-3 - off, 1.3e-3 - off, 4.3e-3 - off, 0.7e-3 - off, 8.5e-4, 3e-5, shapes, rows) == 1
     np.testing.assert_allclose(rows[0], [4e-5, math.sqrt(0.5), math.sqrt(0.5), -1e-5, 0.5], rtol=1e-9)
     assert segment_contacts(1.005e-3, 1.3e-3, 1.3e-3, 1.005e-3, 4.2e-4, 3e-5, shapes, rows) == 0
-
-
-def test_what_a_point_touches():
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 1e-3
-    shapes = Surface((Disc((5e-3, 0.0), 1e-3),), (square,), 8e-3).packed()
-    rows = np.zeros((8, 5))
-    assert point_contacts(2e-3, 0.0, 1e-4, shapes, rows) == 0
-    assert point_contacts(3.95e-3, 0.0, 1e-4, shapes, rows) == 1
-    np.testing.assert_allclose(rows[0, :4], [5e-5, -1.0, 0.0, 1.0 / 1.05e-3], rtol=1e-9)
-    assert point_contacts(0.0, 7.95e-3, 1e-4, shapes, rows) == 1
-    np.testing.assert_allclose(rows[0, :4], [5e-5, 0.0, -1.0, -1.0 / 7.95e-3], atol=1e-15)
-    assert point_contacts(0.0, 1.05e-3, 1e-4, shapes, rows) == 1
-    np.testing.assert_allclose(rows[0, :4], [5e-5, 0.0, 1.0, 0.0], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        Surface(wall_radius=0.0),
-        Surface(polygons=(np.zeros((4, 2)),)),
-        Surface(polygons=(np.array([[0.0, 0.0], [1.0, 0.0], [math.nan, 1.0]]),)),
-        Surface(stiffness=math.inf),
-    ],
-)
-def test_a_wrong_surface_is_refused(wrong: Surface):
-    with pytest.raises(ConfigurationError, match="surface"):
-        wrong.packed()
-
-
-def test_the_banded_solver():
-    random = np.random.default_rng(4)
-    band = random.normal(size=(31, WIDTH))
-    band[:, 0] += 12.0
-    matrix, right = full(band), random.normal(size=31)
-    solution, factored = right.copy(), band.copy()
-    assert factor(factored)
-    back_substitute(factored, solution)
-    np.testing.assert_allclose(matrix @ solution, right, atol=1e-12)
-    band[20, 0] = -1.0
-    assert not factor(band)

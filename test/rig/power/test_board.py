@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from magnetosuture_thread.rig.power import packets
+from magnetosuture_thread.rig.power import board as packets
 from magnetosuture_thread.rig.power.board import FULL, RoboClawBoard
 
 
@@ -25,22 +25,6 @@ def asked(board: RoboClawBoard, command: int, form: str, time: float) -> tuple[i
     return struct.unpack(form, answer[:-2])
 
 
-def test_duties_are_taken_and_given_back():
-    board = RoboClawBoard()
-    assert board.receive(packet(34, 1000, -2000), 1.0) == b"\xff"
-    assert board.duties == (1000, -2000)
-    assert asked(board, 48, ">hh", 1.0) == (1000, -2000)
-    assert board.receive(packet(32, 5, form=">h"), 1.1) == b"\xff"
-    assert board.receive(packet(33, 6, form=">h"), 1.2) == b"\xff"
-    assert list(board.timeline) == [(1.0, (1000, -2000)), (1.1, (5, -2000)), (1.2, (5, 6))]
-
-
-def test_a_known_packet_has_its_known_bytes():
-    # Half duty on both channels, its checksum worked out by hand from the polynomial.
-    assert packet(34, 0, 0)[:-2] == bytes((0x80, 0x22, 0, 0, 0, 0))
-    assert packets.checksum(b"123456789") == 0x31C3  # the check value of this CRC in every catalogue
-
-
 def test_what_is_not_right_is_not_answered():
     board = RoboClawBoard()
     good = packet(34, 1000, 0)
@@ -51,12 +35,6 @@ def test_what_is_not_right_is_not_answered():
     assert board.receive(bytes((128, 77)), 20.0) == b""
     assert board.duties == (0, 0)
     assert board.receive(good, 21.0) == b"\xff"
-
-
-def test_packets_for_others_are_not_answered_and_cut_no_packet_in_two():
-    board = RoboClawBoard(address=129)
-    assert board.receive(packet(34, 1000, 0) + packet(34, 7, 8, address=129), 1.0) == b"\xff"
-    assert board.duties == (7, 8)
 
 
 def test_a_packet_with_a_gap_in_it_is_forgotten():
@@ -81,21 +59,6 @@ def test_it_stops_by_itself_when_it_hears_nothing():
     assert board.duties == (0, 0)
     assert board.timeline[-1][0] == pytest.approx(1.6)
     assert board.currents[0] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_without_a_timeout_it_goes_on_for_ever():
-    board = RoboClawBoard()
-    board.receive(packet(34, 1000, 0), 1.0)
-    board.advance(1e6)
-    assert board.duties == (1000, 0)
-
-
-def test_packets_for_others_do_not_keep_it_going():
-    board = RoboClawBoard(address=129)
-    board.receive(packet(14, 1, form=">B", address=129) + packet(34, 1000, 0, address=129), 1.0)
-    board.receive(packet(34, 1000, 0), 1.09)
-    board.advance(1.11)
-    assert board.duties == (0, 0)
 
 
 def test_a_current_follows_its_duty_with_the_coils_time_constant():
@@ -138,36 +101,6 @@ def test_an_error_stops_it_until_it_is_reset():
     assert board.duties == (1000, 0)
 
 
-def test_it_says_what_it_is_and_measures():
-    board = RoboClawBoard(supply=12.3)
-    answer = board.receive(bytes((128, 21)), 1.0)
-    assert answer[:-2].endswith(b"\n\x00")
-    assert struct.unpack(">H", answer[-2:])[0] == packets.checksum(bytes((128, 21)) + answer[:-2])
-    assert asked(board, 24, ">H", 1.0) == (123,)
-    assert asked(board, 25, ">H", 1.0) == (50,)
-    assert asked(board, 100, ">HH", 1.0) == (123, 50)
-    assert asked(board, 82, ">H", 1.0) == (250,)
-
-
-def test_a_current_is_reported_by_how_it_is_driven():
-    board = RoboClawBoard()
-    board.receive(packet(34, -FULL // 4, FULL // 4), 1.0)
-    first, second = asked(board, 49, ">hh", 2.0)
-    assert first == pytest.approx(600, abs=1)
-    assert second == pytest.approx(600, abs=1)
-    board.receive(packet(34, FULL // 4, FULL // 4), 2.0)
-    assert asked(board, 49, ">hh", 2.0)[0] == pytest.approx(-600, abs=1)
-    board.receive(packet(34, 0, 0), 2.0)
-    assert asked(board, 49, ">hh", 2.0)[0] == pytest.approx(600, abs=1)
-
-
-def test_a_command_may_be_acknowledged_and_not_obeyed():
-    board = RoboClawBoard()
-    board.ignored.add(34)
-    assert board.receive(packet(34, 1000, 0), 1.0) == b"\xff"
-    assert board.duties == (0, 0)
-
-
 def test_a_board_whose_power_was_gone_is_as_it_was_delivered():
     board = RoboClawBoard()
     for command in (133, 134):
@@ -193,10 +126,3 @@ def test_a_coil_with_a_broken_wire_has_no_current():
     board.broken.clear()
     board.advance(3.0)
     assert board.currents[1] == pytest.approx(6.0, abs=0.01)
-
-
-def test_the_timeline_does_not_grow_for_ever():
-    board = RoboClawBoard()
-    for number in range(11_000):
-        board.receive(packet(34, number % 2 + 1, 0), float(number))
-    assert len(board.timeline) == 10_000

@@ -12,10 +12,8 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.line import Line
-from magnetosuture_thread.rig.power.packets import checksum
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power.board import RoboClawBoard, checksum
+from magnetosuture_thread.rig.power.stage import Line, PowerStage
 
 QUESTION = bytes((128, 24))
 ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")
@@ -56,18 +54,10 @@ def test_there_may_be_no_answer(line, fault: dict[str, Any]):
     assert (line.boards[0].heard > 0.0) is ("silent" in fault)
 
 
-def test_an_answer_may_be_other_bytes(line):
-    line.faults.garbage = True
-    answer = ask(line.path, 7)
-    assert len(answer) == 7
-    assert not answer.startswith(ANSWER)
-
-
-def test_an_answer_may_have_a_wrong_checksum(line):
-    line.faults.wrong_checksum = True
-    answer = ask(line.path, 4)
-    assert answer[:3] == ANSWER[:3]
-    assert answer[3] != ANSWER[3]
+@pytest.mark.parametrize("fault", ["garbage", "wrong_checksum"])
+def test_an_answer_may_be_wrong(line, fault: str):
+    setattr(line.faults, fault, True)
+    assert ask(line.path, 4)[:4] not in (b"", ANSWER)
 
 
 def test_an_answer_may_be_late(line):
@@ -95,16 +85,6 @@ def test_a_line_that_is_taken_away_hangs_up_and_can_come_back(line):
     line.plug()
     line.plug()
     assert ask(line.path, 4) == ANSWER
-
-
-def test_boards_go_on_without_their_line(line):
-    now = time.monotonic()
-    line.boards[0].timeout, line.boards[0].heard, line.boards[0].duties = 1, now, (100, 0)
-    line.unplug()
-    while line.boards[0].duties != (0, 0):
-        assert time.monotonic() < now + 10.0
-        line.advance()
-    assert line.boards[0].timeline[-1][0] == pytest.approx(now + 0.1)
 
 
 def test_what_a_killed_simulation_left_is_replaced_and_anything_else_stays(tmp_path):

@@ -32,18 +32,6 @@ def test_a_fit_goes_through_points_of_an_arc(angle: float, curvature: float):
     assert np.abs(fitted.coordinates(points)[1]).max() < 0.01
 
 
-def test_positive_curvature_turns_clockwise_as_seen():
-    assert Arc(np.zeros(2), 0.0, 0.01).at(10.0)[1] > 0.0
-
-
-@pytest.mark.parametrize("curvature", [0.0, 0.02, -0.03])
-def test_walked_back_an_arc_is_the_same(curvature: float):
-    arc = Arc(np.array([10.0, 20.0]), 0.7, curvature)
-    back = arc.reversed_at(50.0)
-    np.testing.assert_allclose(back.at(np.array([0.0, 20.0, 50.0])), arc.at(np.array([50.0, 30.0, 0.0])), atol=1e-9)
-    np.testing.assert_allclose(back.direction(50.0), -arc.direction(), atol=1e-12)
-
-
 @pytest.mark.parametrize("curvature", [0.0, 0.02, -0.03])
 def test_a_moved_arc_has_offset_slope_and_second_derivative_where_it_leaves(curvature: float):
     arc = Arc(np.array([10.0, 20.0]), 0.7, curvature)

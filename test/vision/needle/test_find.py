@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,27 +11,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.rig.camera.dish_camera import DishCamera
-from magnetosuture_thread.rig.camera.scene import CameraScene
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.vision.images import Layer, prepare
-from magnetosuture_thread.vision.needle import measure
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.axis_guesses import _walk
-from magnetosuture_thread.vision.needle.comparison import bluntness, excess, fading, steel_rows
-from magnetosuture_thread.vision.needle.ends import leaves_tail
-from magnetosuture_thread.vision.needle.erase import without_needle
+from magnetosuture_thread.vision.needle.arc import REVERSED_PX, Arc, LengthEstimator, MeasuredNeedle, NeedleSize
 from magnetosuture_thread.vision.needle.find import find_needles
-from magnetosuture_thread.vision.needle.measured_needle import REVERSED_PX, MeasuredNeedle
-from magnetosuture_thread.vision.needle.size import LengthEstimator, NeedleSize
-from magnetosuture_thread.vision.needle.steel_map import SteelMap
 from magnetosuture_thread.vision.needle.template import (
     BLOOM_PX,
     THIN,
-    TemplateFit,
     _draw_with_slopes,
-    _solve,
     draw_needle,
 )
+from magnetosuture_thread.vision.thread.centreline import without_needle
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
 
 SIZE = NeedleSize(0.007 / VIEW.metres_per_pixel, 0.0004 / VIEW.metres_per_pixel, 0.1)
@@ -130,13 +118,6 @@ def test_a_needle_without_contrast_is_not_seen():
     assert find(faint)[0] == []
 
 
-def test_a_needle_cut_by_the_border_is_none():
-    frame = render(Pose(np.zeros(2), 0.0))
-    picture = prepare(np.ascontiguousarray(frame[:, 320:, 1]), 2)
-    view = type(VIEW)((2.0, 238.0), VIEW.metres_per_pixel)
-    assert find_needles(picture, view, 0.0175, SIZE)[0] == []
-
-
 def test_speckles_are_not_searched_for_long():
     speckled = np.full((480, 640, 3), 220, np.uint8)
     for u in range(180, 460, 30):
@@ -175,104 +156,7 @@ def test_a_length_is_measured_once_eight_confident_frames_in_a_row_agree():
     assert measured.tolerance < given.tolerance
 
 
-@pytest.mark.parametrize(("cost", "decided"), [(100.0, True), (120.0, True), (130.0, False)])
-def test_the_ends_decide_between_two_directions_that_fit_equally_in_either_order(
-    cost: float, decided: bool, monkeypatch: pytest.MonkeyPatch
-):
-    tried: list[tuple[SteelMap, TemplateFit, TemplateFit]] = []
-    pointed_way = measure._pointed_way
-
-    def recorded(*given: Any) -> TemplateFit | None:
-        tried.append(given)
-        return pointed_way(*given)
-
-    monkeypatch.setattr(measure, "_pointed_way", recorded)
-    found, _ = find(camera_of(0.0).render(np.zeros(2), 0.4, NOWHERE))
-    steel, *fits = tried[0]
-    right, wrong = sorted(fits, key=lambda fit: -float(fit.arc.direction() @ found[0].direction_px))
-    right, wrong = replace(right, cost=cost), replace(wrong, cost=100.0)
-    assert pointed_way(steel, right, wrong) is (right if decided else None)
-    assert pointed_way(steel, wrong, right) is (right if decided else None)
-
-
-@pytest.mark.parametrize(("turns", "leaves"), [((), False), ((2.8,), True), ((1.8, -1.9), False)])
-def test_a_thread_leaves_a_tail_where_one_line_goes_away_from_it(turns: tuple[float, ...], leaves: bool):
-    dark = np.zeros((120, 160), np.float32)
-    for turn in turns:
-        cv2.line(dark, (60, 60), (round(60.0 + 45.0 * math.cos(turn)), round(60.0 + 45.0 * math.sin(turn))), 0.7, 2)
-    cv2.line(dark, (60, 60), (130, 60), 0.7, 5)
-    share = dark / np.float32(0.7)
-    steel = SteelMap(share, share, share, dark, 0.7, 0.0 * dark, np.zeros(dark.shape, np.uint8), (0.0, 0.0), (160, 120))
-    fit = TemplateFit(Arc(np.array([60.0, 60.0]), 0.0, 0.0), 70.0, 5.0, 0.0, 0.0, np.eye(6), 1)
-    assert leaves_tail(steel, fit) == leaves
-
-
 LENGTH, HALF = 60.0, 2.5  # of a needle to the right from (20, 30) [px]
-STATE = np.array([20.0, 30.0, 0.0, 0.0, HALF + BLOOM_PX])
-
-
-def share_of_steel(thin: float) -> np.ndarray:
-    """Return the share of steel in an image of a needle that tapers to a share of its width."""
-    drawn = np.empty((120, 61))
-    draw_needle(np.arange(120.0) - 20.0, np.arange(61.0) - 30.0, LENGTH, HALF, BLOOM_PX, thin, drawn)
-    return np.ascontiguousarray(drawn.T, np.float32)
-
-
-@pytest.mark.parametrize(
-    ("rows", "columns", "which"),
-    [
-        ((0, 0), (0, 0), []),
-        ((27, 30), (71, 81), [0]),
-        ((31, 34), (71, 81), [1]),
-        ((28, 33), (82, 86), [2]),
-        ((28, 33), (14, 19), [3]),
-        ((21, 28), (20, 81), [4]),
-        ((33, 40), (20, 81), [5]),
-    ],
-)
-def test_what_is_dark_around_a_needle_counts_for_the_place_where_it_is(
-    rows: tuple[int, int], columns: tuple[int, int], which: list[int]
-):
-    image, result = share_of_steel(THIN), np.empty(6)
-    image[slice(*rows), slice(*columns)] = 1.0
-    excess(image, STATE, LENGTH, HALF, result)
-    assert [place for place in range(6) if result[place] > 0.5] == which
-    assert np.delete(result, which).max() < 0.2
-
-
-def test_each_row_of_a_needle_has_the_steel_of_the_image_there():
-    surely, perhaps = share_of_steel(1.0), share_of_steel(1.0)
-    perhaps[:, 40:50] = surely[:, 60:70] = 0.0
-    rows = np.empty((60, 3))
-    steel_rows(surely, perhaps, STATE, LENGTH, HALF, 1.0, rows)
-    at = np.arange(60)
-    bare, doubtful = (at > 19) & (at < 29), (at > 39) & (at < 49)
-    np.testing.assert_allclose(rows[bare, 0], 1.0)
-    assert rows[(at < 18) | (at > 30), 0].max() < 0.1
-    np.testing.assert_allclose(rows[2:58, 1], 2.0 * (HALF + BLOOM_PX), rtol=0.05)
-    assert rows[doubtful, 2].max() == 0.0
-    assert rows[(at < 38) | (at > 50), 2].min() > 0.8
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_an_end_is_as_blunt_as_each_of_its_sides(turned: bool):
-    blunt, pointed = share_of_steel(1.0), share_of_steel(THIN)
-    image = np.vstack([blunt[:30], pointed[30:]])
-    state, result = STATE.copy(), np.empty((2, 2))
-    if turned:
-        state[:3] = 20.0 + LENGTH, 30.0, math.pi
-    bluntness(image, state, LENGTH, HALF, result)
-    np.testing.assert_allclose(result[::-1, ::-1] if turned else result, [[1.0, 1.0], [1.0, 0.0]], atol=0.1)
-
-
-def test_a_tail_fades_over_more_length_than_the_sharper_side_of_the_body():
-    image = share_of_steel(1.0)
-    image[33:37, 30:80] = np.maximum(image[33:37, 30:80], np.array([[0.75], [0.6], [0.4], [0.2]]))  # a shadow
-    sharp = fading(image, STATE[:4], LENGTH, 2.0 * HALF)
-    assert abs(sharp) < 0.6
-    ramp = np.clip((np.arange(120.0) - 20.0) / 5.0, 0.0, 1.0)
-    soft = np.ascontiguousarray(np.minimum(share_of_steel(1.0), ramp), np.float32)
-    assert fading(soft, STATE[:4], LENGTH, 2.0 * HALF) == pytest.approx(0.6 * 5.0 - 1.5, abs=0.4)
 
 
 def test_a_drawn_needle_changes_with_width_and_length_as_its_slopes_say():
@@ -293,24 +177,6 @@ def test_a_drawn_needle_changes_with_width_and_length_as_its_slopes_say():
         (longer, with_shape(LENGTH + step, BLOOM_PX), with_shape(LENGTH - step, BLOOM_PX)),
     ):
         np.testing.assert_allclose(slope, (more - less) / (2.0 * step), atol=1e-4)
-
-
-def test_normal_equations_are_solved():
-    random = np.random.default_rng(2)
-    factor, right, result = random.standard_normal((6, 6)), random.standard_normal(6), np.empty(6)
-    _solve(factor @ factor.T, right, result)
-    np.testing.assert_allclose(factor @ factor.T @ result, right, atol=1e-8)
-
-
-def test_steps_through_a_dark_thing_are_counted_around_its_bends():
-    own = np.zeros((5, 7), np.uint8)
-    own[[0, 4]] = own[:, 6] = own[2, 1] = 1
-    start, steps = np.zeros_like(own), np.empty(own.shape, np.int32)
-    start[0, 0] = 1
-    _walk(own, start, steps)
-    np.testing.assert_array_equal(steps[0], np.arange(7))
-    np.testing.assert_array_equal(steps[4], [14, 13, 12, 11, 10, 9, 9])  # diagonals are one step
-    assert (steps[1:4, :6] == -1).all()
 
 
 @pytest.mark.parametrize("curvature", [0.0, 0.015, -0.02])

@@ -11,7 +11,7 @@ from benchmarks.vision.cases import SIZES, usual_case
 from benchmarks.vision.frames import DISH_RADIUS, ROWS, render
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.vision.needle.tail_edge import _crossing, _shift_of
+from magnetosuture_thread.vision.needle.tail_edge import _shift_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
@@ -68,9 +68,3 @@ def test_an_end_that_is_far_off_or_slanted_or_hardly_shows_is_not_measured(ends:
     dark = darkness(ends)
     dark[:, lines:] = 0.15
     assert np.isnan(_shift_of(ALONG, dark, DEPTH))
-
-
-def test_darkness_that_ends_below_a_level_does_not_rise_above_it_for_good():
-    dark = np.array([[0.1], [0.3], [0.7], [0.1], [0.1], [0.9]]) * np.ones(2)
-    assert np.isnan(_crossing(ALONG[:5], dark[:5, 0], 0.4))
-    assert _crossing(ALONG[:3], dark[:3, 0], 0.4) == pytest.approx(ALONG[1] + 0.25 * 0.25)

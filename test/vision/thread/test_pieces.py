@@ -17,21 +17,12 @@ from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.thread_observation import PieceEnd
 from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.look import Track
-from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.measured_needle import MeasuredNeedle
+from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.appearance import MIN_SHARE, Appearance, appearance_of, respaced
-from magnetosuture_thread.vision.thread.hiding import NEEDLE_PX, Hiding, _fit_light, _mark_unlike
-from magnetosuture_thread.vision.thread.observe import observe
-from magnetosuture_thread.vision.thread.order import Piece, find_order
-from magnetosuture_thread.vision.thread.piece_ends import BARE_COLOUR, is_bare_beyond
-from magnetosuture_thread.vision.thread.profiles import (
-    integrate_across,
-    middle_strengths,
-    sample_across,
-    usual_profile,
-)
-from magnetosuture_thread.vision.thread.strands import Strand, first_clear_of, strand_along
+from magnetosuture_thread.vision.thread.appearance import Appearance, Strand, appearance_of
+from magnetosuture_thread.vision.thread.hiding import Hiding
+from magnetosuture_thread.vision.thread.observe import Piece, find_order, observe
+from magnetosuture_thread.vision.thread.pieces import BARE_COLOUR, is_bare_beyond
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 SEED = 4712
@@ -39,7 +30,7 @@ FRAMES = 6
 SCENE = Scene(dish=Dish(2.0 * DISH_RADIUS))
 COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "hand_instrument"]
 SCALE = 8e-5
-DARK = Appearance(pale=False, width_px=3.0, darkness=np.array([1.0, 1.0]), strength=60.0, noise=1.0)
+DARK = Appearance(width_px=3.0, darkness=np.array([1.0, 1.0]), strength=60.0, noise=1.0)
 NEEDLE = MeasuredNeedle(Arc(np.array([20.0, 20.0]), 0.0, 0.0), 40.0, 5.0)
 
 
@@ -98,20 +89,6 @@ def test_pieces_beyond_a_cover_are_joined_with_an_interval_of_arc_length():
         for piece in pieces:
             assert piece.arc_length[0] <= piece.arc_length[1]
             assert len(piece.deviation) == len(piece.points)
-
-
-def test_drawn_paths_are_no_pieces():
-    assert row("drawn_path").found >= FRAMES - 1
-    assert (row("drawn_path").wrong_pieces or 0.0) < 0.01
-
-
-def test_over_time_pieces_are_found_outside_of_the_region_too():
-    tracker, image, _ = tracker_of("cover_10mm", 1)
-    alone = tracker.look(image).observation
-    seen = [tracker.track(image, 1.0 + 0.03 * k) for k in range(5)]
-    assert len(alone.pieces) > 1
-    assert len(seen[-1].observation.pieces) == len(alone.pieces)
-    assert seen[-1].observation.pieces[-1].length == pytest.approx(alone.pieces[-1].length, rel=0.02)
 
 
 def test_with_a_wrong_length_no_frame_is_complete_and_no_end_is_free():
@@ -189,58 +166,14 @@ def test_hidden_outlines_surround_what_covers_the_thread():
     assert any((low <= near).all() and (near <= high).all() for low, high in boxes)
 
 
-def test_a_strand_from_its_other_end_has_its_points_strengths_and_gaps_in_that_order():
-    points = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])
-    turned = Strand(points, np.array([3.0, 4.0, 5.0]), np.array([True, True, False])).turned()
-    assert (turned.points[0].tolist(), turned.strength.tolist()) == ([2.0, 1.0], [5.0, 4.0, 3.0])
-    assert turned.visible.tolist() == [False, True, True]
-
-
-def test_a_thread_is_visible_where_it_is_darker_than_a_share_of_its_usual_strength():
-    image = np.full((60, 120), 200, np.uint8)
-    for left, share in ((10, 1.0), (40, 1.5 * MIN_SHARE), (70, 0.5 * MIN_SHARE)):
-        cv2.line(image, (left, 30), (left + 29, 30), round(200.0 - share * DARK.strength), 3)
-    shown = strand_along(image, DARK, np.array([[20.0, 30.0], [50.0, 30.0], [80.0, 30.0]])).visible
-    assert shown.tolist() == [True, True, False]
-
-
-def test_a_walk_along_the_needle_is_clear_of_it_beyond_its_tip():
-    along = np.arange(0.0, 80.0, 2.0)
-    walk = NEEDLE.arc.at(along)
-    assert along[first_clear_of(NEEDLE, walk)] == pytest.approx(NEEDLE.length_px + NEEDLE_PX, abs=2.0)
-    assert along[first_clear_of(NEEDLE, NEEDLE.arc.at(-along))] == pytest.approx(NEEDLE_PX, abs=2.0)
-
-
-@pytest.mark.parametrize("spacing", [0.5, 2.0, 7.0, 30.0])
-def test_a_polyline_gets_vertices_of_about_the_wanted_distance(spacing: float):
-    apart = np.linalg.norm(np.diff(respaced(line((0.0, 0.0), (21.0, 28.0)), spacing), axis=0), axis=1)
-    assert np.ptp(apart) < 1e-9
-    assert abs(len(apart) - 35.0 / spacing) < 0.5 + 1e-9
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_width_and_strength_of_a_thread_are_those_of_its_profile(sign: float):
+def test_width_and_strength_of_a_thread_are_those_of_its_profile():
     aside = np.arange(80.0)[:, None] - 40.0
-    image = np.round(120.0 + sign * 60.0 * np.exp(-0.5 * aside**2) * np.ones(160)).astype(np.uint8)
+    image = np.round(120.0 - 60.0 * np.exp(-0.5 * aside**2) * np.ones(160)).astype(np.uint8)
     points = np.column_stack([np.arange(20.0, 140.0, 2.0), np.full(60, 40.0)])
     picture = prepare(image, 1)
     found = appearance_of(picture, picture.darkest.pixels, points, np.ones(60, np.bool_))
-    assert found.pale == (sign > 0.0)
     assert found.strength == pytest.approx(60.0, rel=0.03)
     assert found.width_px == pytest.approx(2.355, abs=0.5)
-
-
-def test_the_noise_of_a_pixel_is_measured_beside_the_thread():
-    deviation, random = 10.0, np.random.default_rng(0)
-    image = random.normal(150.0, deviation, (240, 320))
-    measured = []
-    for row in range(40, 220, 40):
-        cv2.line(image, (20, row), (300, row), 60.0, 3)
-    picture = prepare(np.clip(image, 0.0, 255.0).astype(np.uint8), 1)
-    for row in range(40, 220, 40):
-        points = np.column_stack([np.arange(30.0, 290.0, 2.0), np.full(130, float(row))])
-        measured.append(appearance_of(picture, picture.darkest.pixels, points, np.ones(130, np.bool_)).noise)
-    assert np.mean(measured) == pytest.approx(deviation, rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -265,22 +198,6 @@ def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_
     strength = np.where(fades & (np.arange(31) > 24), 2.0, DARK.strength)
     strand = Strand(points, strength, np.ones(31, np.bool_))
     assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, NEEDLE) == bare
-
-
-@pytest.mark.parametrize("side", range(4))
-@pytest.mark.parametrize("left", [40, 6])
-def test_an_end_beside_the_border_of_the_frame_is_not_bare(side: int, left: int):
-    image = np.full((160, 160), 180, np.uint8)
-    image[79:82, left:140] = 120
-    along = np.arange(139.0, left, -2.0)
-    points = np.column_stack([along, np.full_like(along, 80.0)])
-    for _ in range(side):  # a quarter turn
-        image = np.ascontiguousarray(np.rot90(image))
-        points = np.column_stack([points[:, 1], 159.0 - points[:, 0]])
-    picture = prepare(image, 1)
-    strand = Strand(points, np.full(len(points), DARK.strength), np.ones(len(points), np.bool_))
-    away = MeasuredNeedle(Arc(np.array([500.0, 500.0]), 0.0, 0.0), 40.0, 5.0)
-    assert is_bare_beyond(picture, picture.darkest.pixels, DARK, strand, away) == (left == 40)
 
 
 def straight_thread() -> tuple[MeasuredNeedle, np.ndarray]:
@@ -328,75 +245,3 @@ def test_a_piece_whose_place_is_unknown_has_no_direction():
     assert (first.arc_length, first.direction_known) == ((0.0, 0.0), True)
     assert [np.isnan(piece.arc_length[0]) for piece in others] == [True]
     assert not others[0].direction_known
-
-
-def test_profiles_are_taken_across_a_line_from_its_left_to_its_right():
-    image = (20.0 + 2.0 * np.arange(60) + np.arange(50)[:, None]).astype(np.uint8)
-    points, aside = np.linspace((10.0, 10.0), (40.0, 30.0), 31), np.linspace(-4.0, 4.0, 9)
-    profiles = np.empty((3, 9))
-    sample_across(image, points, np.array([0, 12, 30]), aside, profiles)
-    right = np.array([-20.0, 30.0]) / np.hypot(20.0, 30.0)
-    at = points[[0, 12, 30], None] + aside[:, None] * right
-    np.testing.assert_allclose(profiles, 20.0 + at @ (2.0, 1.0), atol=1e-9)
-
-
-def test_the_usual_profile_is_that_of_most_above_the_floor_beside_each():
-    aside = np.arange(-8.0, 8.5, 0.5)
-    shape = -60.0 * np.exp(-0.5 * aside**2)
-    profiles = shape + np.array([200.0, 150.0, 120.0, 90.0, 180.0])[:, None]
-    profiles[1, 16:] += 80.0  # an edge
-    usual = np.empty(33)
-    usual_profile(profiles, aside, 4.0, usual)
-    np.testing.assert_allclose(usual, shape, atol=0.05)
-
-
-@pytest.mark.parametrize("pale", [False, True])
-def test_the_integral_across_a_thread_is_its_share_of_the_floors_light_times_its_width(pale: bool):
-    image = np.full((60, 80), 100, np.uint8)
-    image[28:32] = 140 if pale else 60
-    points = np.column_stack([np.arange(10.0, 70.0, 2.0), np.full(30, 29.5)])
-    values = np.empty(2)
-    integrate_across(image, points, np.array([3, 20]), 8.0, 0.5, pale, values)
-    np.testing.assert_allclose(values, 0.4 * 4.0, rtol=0.03)
-
-
-@pytest.mark.parametrize("pale", [False, True])
-def test_a_line_is_as_strong_as_on_its_side_that_differs_more_or_less(pale: bool):
-    image = np.full((60, 80), 100, np.int64)
-    image[:29] = 130
-    image[28:31] = 40
-    image = 200 - image if pale else image
-    points = np.column_stack([np.arange(10.0, 70.0, 2.0), np.full(30, 29.0)])
-    for two_sided, expected in ((False, 90.0), (True, 60.0)):
-        values = np.empty(30)
-        middle_strengths(image.astype(np.uint8), points, 5.0, pale, two_sided, values)
-        np.testing.assert_allclose(values, expected)
-    aside = np.empty(30)
-    middle_strengths(image.astype(np.uint8), points - (0.0, 2.0), 5.0, pale, False, aside)
-    np.testing.assert_allclose(aside, 90.0)  # as its middle is looked for up to a pixel aside
-    middle_strengths(image.astype(np.uint8), np.add(points, (0.0, 2.0)), 5.0, pale, True, aside)
-    np.testing.assert_allclose(aside, 60.0)
-
-
-def test_the_floors_light_is_that_of_most_cells_whatever_lies_on_the_others():
-    random = np.random.default_rng(4)
-    places = np.column_stack([np.ones(600), random.uniform(-1.0, 1.0, (600, 2))])
-    given = np.array([[180.0, 150.0], [12.0, -6.0], [-8.0, 5.0]])
-    values = places @ given + random.normal(0.0, 1.0, (600, 2))
-    values[::4] += 60.0
-    values[1::7] = 20.0
-    weights = np.empty((3, 2))
-    _fit_light(places, values, weights)
-    np.testing.assert_allclose(weights, given, atol=0.5)
-
-
-def test_what_is_brighter_or_darker_or_of_another_colour_within_the_dish_is_no_floor():
-    light = np.full((20, 30, 3), 100.0, np.float32)
-    small = light.astype(np.uint8)
-    small[4, 10:13], small[8, 10:13], small[12, 10:13], small[16, 10:13] = 110, 90, (104, 100, 96), 104
-    small[10, 1], small[10, 28] = 150, 150  # at the distances 39 and 42 from the centre
-    found = np.zeros((20, 30), np.uint8)
-    _mark_unlike(small, light, (0.05, 0.06), (42.0, 30.0, 41.0), found)
-    expected = np.zeros_like(found)
-    expected[[4, 8, 12], 10:13] = expected[10, 1] = 1
-    np.testing.assert_array_equal(found, expected)

@@ -1,28 +1,294 @@
-"""A RoboClaw board on a serial line: commands, queries and verification."""
+"""A RoboClaw board on a serial line: commands, queries and verification.
+
+A port bounds the time of each exchange. The rules for duties, limits, status bits and polling do no input or output.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import enum
+import errno
 import logging
 import math
+import select
 import termios
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import serial
 from basicmicro import Basicmicro
 from basicmicro.exceptions import BasicmicroError
+from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.drivers.roboclaw import protocol
-from magnetosuture_thread.coils.drivers.roboclaw.port import DeviceError, ExchangePort
-from magnetosuture_thread.coils.drivers.roboclaw.protocol import ConsecutiveCounter, Query, Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
+Vector = NDArray[np.float64]
+
+FULL_DUTY = 32767  # duty of the full supply voltage
+MIN_RETRY_DELAY, MAX_RETRY_DELAY = 0.1, 2.0  # s between two attempts to connect
+SUPPLY_VOLTAGE_RANGE = (5.0, 80.0)  # V, over all models of boards
+DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the supply
+LIMITING_RATIO = 0.8  # of the maximum current, above which a board may reduce its duty
+OVERCURRENT_RATIO = 1.2  # of the maximum current
+MAX_OVERCURRENTS = 3  # consecutive measurements that are a fault
+MIN_EXPECTED_CURRENT = 0.5  # A; below, a missing current cannot be detected
+MIN_CURRENT_RATIO = 0.5  # of the expected current; below, a warm coil is no explanation
+# Consecutive measurements below that ratio: a fifth of a second and more at 200 Hz, so that neither a change of
+# the current nor the coil's L / R looks like a broken wire.
+MAX_SHORTFALLS = 12
+MAX_MISMATCHES = 2  # consecutive; the first may be a lost packet
+
+# Errors in the boards' manual that the manufacturer's library lacks.
+DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
 ACK = b"\xff"
 MAX_ATTEMPTS = 2
 # Pause after a failure, in which the board drops a partial packet.
 RETRY_DELAY = 0.015  # s
+
+
+class Query(enum.Enum):
+    """A query to a board between two writes."""
+
+    DUTIES = enum.auto()
+    CURRENTS = enum.auto()
+    STATUS = enum.auto()
+    VOLTAGES = enum.auto()
+    TIMEOUT = enum.auto()
+    LIMIT_1 = enum.auto()
+    LIMIT_2 = enum.auto()
+
+
+# Settings that a board loses with its supply; after a short loss, nothing else shows it.
+SETTING_QUERIES = (Query.TIMEOUT, Query.LIMIT_1, Query.LIMIT_2)
+# With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
+POLL_SEQUENCE = tuple(
+    query
+    for setting in SETTING_QUERIES
+    for query in (Query.DUTIES, Query.CURRENTS, Query.STATUS, Query.DUTIES, Query.CURRENTS, Query.VOLTAGES, setting)
+)
+
+
+def retry_delay(failures: int) -> float:
+    """Return the delay before the next connection attempt: 0.1 s, doubled with each failure, up to 2 s.
+
+    >>> [retry_delay(failures) for failures in (1, 2, 5, 6, 10**6)]
+    [0.1, 0.2, 1.6, 2.0, 2.0]
+    """
+    return min(MAX_RETRY_DELAY, MIN_RETRY_DELAY * 2.0 ** min(failures - 1, 10))
+
+
+def duties_for(currents: Vector, resistances: Vector, voltage: float) -> tuple[tuple[int, ...], bool]:
+    """Return the duties for given currents, and whether the supply voltage is too low for them.
+
+    d = I R / U, clipped to -1 ... 1, times 32767 and truncated to an integer, so that no current exceeds the
+    commanded one. A board sets the mean voltage at a coil, and the current settles with the coil's L / R.
+
+    Args:
+        currents: I, shape (m,) [A].
+        resistances: R, of each coil with its cable, shape (m,) [ohm].
+        voltage: U, of the board's supply [V].
+
+    >>> duties_for(np.array([3.0, -6.0, 30.0]), np.array([1.0, 0.5, 1.0]), 24.0)
+    ((4095, -4095, 32767), True)
+    """
+    share = currents * resistances / voltage
+    too_low = bool(np.any(np.abs(share) > 1.0))
+    return tuple(np.trunc(FULL_DUTY * np.clip(share, -1.0, 1.0)).astype(int).tolist()), too_low
+
+
+def steady_currents(duties: Sequence[int], resistances: Vector, voltage: float) -> tuple[float, ...]:
+    """Return the steady-state currents of given duties [A].
+
+    I = d U / R, see `duties_for`.
+
+    >>> steady_currents((32767, 0), np.array([1.0, 2.0]), 24.0)
+    (24.0, 0.0)
+    """
+    return tuple((np.array(duties) / FULL_DUTY * voltage / resistances).tolist())
+
+
+def is_short(expected: float, measured: float) -> bool:
+    """Return whether a coil's current is so low that its wire may be broken.
+
+    A warm coil has 20 to 40 % less. The sign is ignored.
+
+    Args:
+        expected: steady-state current of its duty [A].
+        measured: current in the coil [A].
+
+    >>> [is_short(4.0, measured) for measured in (0.03, 2.4, -4.0)]
+    [True, False, False]
+    >>> is_short(0.4, 0.0)
+    False
+    """
+    return abs(expected) >= MIN_EXPECTED_CURRENT and abs(measured) < MIN_CURRENT_RATIO * abs(expected)
+
+
+def describe_bits(bits: int, descriptions: Mapping[int, str], kind: str) -> tuple[str, ...]:
+    """Return the meaning of each set bit; an unknown bit is named by its number.
+
+    >>> describe_bits(0x0201, {1: "Emergency Stop"}, "error")
+    ('Emergency Stop', 'error bit 0x0200')
+    """
+    found = [1 << place for place in range(16) if bits >> place & 1]
+    return tuple(descriptions.get(bit, f"{kind} bit 0x{bit:04x}") for bit in found)
+
+
+def duties_match(
+    written: Sequence[int], reported: Sequence[int], currents: Sequence[float], max_current: float
+) -> bool:
+    """Return whether a board's duties match those written.
+
+    A board may round a non-zero duty, and reduce it where the coil's current is close to its limit.
+
+    Args:
+        written: duties.
+        reported: duties reported by the board.
+        currents: measured in each coil [A].
+        max_current: maximum current in a coil [A].
+
+    >>> duties_match((4096, 0), (4096, 0), (0.0, 0.0), 10.0)
+    True
+    >>> duties_match((0, 0), (1, 0), (0.0, 0.0), 10.0)
+    False
+    """
+    for target, actual, current in zip(written, reported, currents, strict=True):
+        exact = abs(target - actual) <= (DUTY_TOLERANCE if target else 0)
+        limited = abs(current) >= LIMITING_RATIO * max_current and min(0, target) <= actual <= max(0, target)
+        if not exact and not limited:
+            return False
+    return True
+
+
+class ConsecutiveCounter:
+    """Counts consecutive events.
+
+    >>> counter = ConsecutiveCounter(2)
+    >>> [counter.update(bad) for bad in (True, False, True, True)]
+    [False, False, False, True]
+
+    Args:
+        limit: number of consecutive events to report.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self.count = 0
+
+    def update(self, event: bool) -> bool:
+        """Register one observation, and return whether the limit is reached."""
+        self.count = self.count + 1 if event else 0
+        return self.count >= self._limit
+
+
+# `os.write` lets another thread have the interpreter first, and may wait for it there for longer than a board waits for
+# the next byte of a packet.
+_write = ctypes.PyDLL(None).write
+_write.argtypes, _write.restype = (ctypes.c_int, ctypes.c_char_p, ctypes.c_size_t), ctypes.c_ssize_t
+
+
+class DeviceError(Exception):
+    """Failure of a board or its line, with a text for the operator."""
+
+
+class ExchangePort(serial.Serial):
+    """Exclusive serial port for one request and one answer at a time.
+
+    Written bytes are buffered until the answer is read, so that a packet is sent without gaps: a board drops one with a
+    gap of 10 ms, and the manufacturer's library writes a packet in up to five pieces.
+
+    Args:
+        path: of the port.
+        baud_rate: of the line.
+        answer_timeout: that a board has for an answer [s].
+
+    Attributes:
+        answer_timeout: as given.
+        answer: the bytes that were read since `begin`.
+        is_drained: whether no answer to an earlier request can come any more; see `Board`.
+    """
+
+    def __init__(self, path: str, baud_rate: int, answer_timeout: float) -> None:
+        self.answer_timeout = answer_timeout
+        self._packet = bytearray()
+        self.answer = bytearray()
+        self.is_drained = True
+        self._until = self._expires = 0.0
+        try:
+            # The lock comes first, so that a process that holds the port is not disturbed.
+            super().__init__(path, baud_rate, timeout=answer_timeout, exclusive=True)
+        except (serial.SerialException, ValueError) as error:
+            raise DeviceError(_open_problem(path, error)) from error
+
+    def begin(self, expires: float = math.inf) -> None:
+        """Begin an exchange; discard late bytes of the last one.
+
+        Args:
+            expires: when the packet is outdated, and is not sent any more: a time of `time.monotonic` [s].
+        """
+        self._expires = expires
+        self.reset_input_buffer()
+        self._packet.clear()
+        self.answer.clear()
+        self._until = time.monotonic() + self.answer_timeout
+
+    def write(self, b: Any, /) -> int:
+        """Buffer bytes of a packet until the answer is read."""
+        self._packet += b
+        return len(b)
+
+    def read(self, size: int = 1, /) -> bytes:
+        """Send the packet if it has not been sent, and return up to `size` bytes of the answer.
+
+        The board's time begins when the packet is sent; an exchange waits for at most twice that, in any number of
+        reads. Bytes that have arrived are returned even if this thread was delayed: rclpy may hold the interpreter
+        for longer than the answer timeout, which is no fault of the board. For the same reason a packet that is
+        late by that much is not sent, as its command may be outdated.
+        """
+        if self._packet:
+            packet = bytes(self._packet)
+            self._packet.clear()
+            if time.monotonic() >= self._until:
+                return b""
+            self._send(packet)
+            self._until = time.monotonic() + self.answer_timeout
+        if time.monotonic() >= self._until:
+            size = min(size, self.in_waiting)
+        data = super().read(size)
+        self.answer += data
+        return data
+
+    def _send(self, packet: bytes) -> None:
+        """Write a packet to the kernel, once its buffer takes it; not its last byte, if it is outdated by then.
+
+        A process that is stopped before the clock is read sees there that the packet is outdated; one that is stopped
+        after that sends the last byte later than the board waits for it. The board drops the packet in both cases.
+        The library's own write reports a sent packet as not sent if this thread was delayed after the system call.
+        """
+        port, until = self.fileno(), min(self._until, self._expires)
+        _, writable, _ = select.select([], [port], [], max(0.0, self._until - time.monotonic()))
+        if not writable:
+            raise serial.SerialTimeoutException("the output buffer is full")
+        most, last = packet[:-1], packet[-1:]
+        is_written = _write(port, most, len(most)) == len(most)
+        if time.monotonic() >= until:
+            raise serial.SerialTimeoutException("an outdated packet")
+        if not is_written or _write(port, last, 1) != 1:
+            raise serial.SerialTimeoutException("a packet was written in part")
+
+
+def _open_problem(path: str, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return f"{path} is held by another process"
+    if number == errno.ENOENT:
+        return f"there is no {path}"
+    if number == errno.EACCES:
+        return f"no permission for {path}; its group is usually dialout"
+    return f"cannot open {path}: {error}"
+
 
 # The library logs every missing byte, a hundred times a second for a dead board; the driver reports the problem
 # in its state. A level that was set before is kept.
@@ -82,9 +348,9 @@ class Board:
         self._poll_index = 0
         self._supply_too_low = self._limited = False
         self._conditions: tuple[str, ...] = ()
-        self._mismatches = ConsecutiveCounter(protocol.MAX_MISMATCHES)
-        self._excesses = ConsecutiveCounter(protocol.MAX_OVERCURRENTS)
-        self._supply_too_lowfalls = [ConsecutiveCounter(protocol.MAX_SHORTFALLS) for _ in self._coils]
+        self._mismatches = ConsecutiveCounter(MAX_MISMATCHES)
+        self._excesses = ConsecutiveCounter(MAX_OVERCURRENTS)
+        self._shortfalls = [ConsecutiveCounter(MAX_SHORTFALLS) for _ in self._coils]
         self._coil_warnings = ["", ""]
 
     @property
@@ -128,8 +394,8 @@ class Board:
         self._set(self._device.SetTimeout, 0.1 * (self._timeout + 0.5))
         self._set(self._device.SetM1MaxCurrent, self._limit, 0)
         self._set(self._device.SetM2MaxCurrent, self._limit, 0)
-        first_currents = [Query.CURRENTS] * protocol.MAX_OVERCURRENTS
-        for query in (*protocol.SETTING_QUERIES, Query.STATUS, *first_currents, Query.VOLTAGES):
+        first_currents = [Query.CURRENTS] * MAX_OVERCURRENTS
+        for query in (*SETTING_QUERIES, Query.STATUS, *first_currents, Query.VOLTAGES):
             self._poll(query)
 
     def write(self, latest: Callable[[], tuple[Vector | None, float]]) -> None:
@@ -148,7 +414,7 @@ class Board:
         def target_duties() -> tuple[int, ...]:
             currents, self._expires = latest()
             duties, self._supply_too_low = (
-                ((0, 0), False) if currents is None else protocol.duties_for(currents, self._resistances, self.voltage)
+                ((0, 0), False) if currents is None else duties_for(currents, self._resistances, self.voltage)
             )
             self._commanded = (0.0, 0.0) if currents is None else (float(currents[0]), float(currents[1]))
             return duties
@@ -172,9 +438,9 @@ class Board:
         Raises:
             DeviceError: the board does not answer or reports a fault.
         """
-        self._poll(protocol.POLL_SEQUENCE[self._poll_index])
+        self._poll(POLL_SEQUENCE[self._poll_index])
         if not self._mismatches.count:  # else the same query again, at once
-            self._poll_index = (self._poll_index + 1) % len(protocol.POLL_SEQUENCE)
+            self._poll_index = (self._poll_index + 1) % len(POLL_SEQUENCE)
 
     def _poll(self, query: Query) -> None:
         if query is Query.DUTIES:
@@ -192,7 +458,7 @@ class Board:
             self._verify("current limit in 10 mA", limits[:1], (self._limit,))
         else:
             self.voltage = self._query(self._device.GetVolts)[0] / 10.0
-            if not protocol.is_plausible_supply(self.voltage):
+            if not SUPPLY_VOLTAGE_RANGE[0] <= self.voltage <= SUPPLY_VOLTAGE_RANGE[1]:
                 raise DeviceError(f"{self._name}: a supply of {self.voltage:g} V")
 
     def _check_duties(self) -> None:
@@ -200,9 +466,9 @@ class Board:
         matches = tuple(reported) == self._written
         if not matches:
             self._check_currents()
-            matches = protocol.duties_match(self._written, reported, self.currents, self._max_current)
+            matches = duties_match(self._written, reported, self.currents, self._max_current)
         self._limited = matches and any(
-            abs(w - r) > protocol.DUTY_TOLERANCE for w, r in zip(self._written, reported, strict=True)
+            abs(w - r) > DUTY_TOLERANCE for w, r in zip(self._written, reported, strict=True)
         )
         if self._mismatches.update(not matches):
             raise DeviceError(f"{self._name}: has duties {tuple(reported)} instead of {self._written}")
@@ -214,23 +480,23 @@ class Board:
         )
         self.currents = (first, second)
         worst = max(self.currents, key=abs)
-        if self._excesses.update(abs(worst) > protocol.OVERCURRENT_RATIO * self._max_current):
+        if self._excesses.update(abs(worst) > OVERCURRENT_RATIO * self._max_current):
             raise DeviceError(f"{self._name}: a current of {worst:.2f} A, more than {self._max_current:g} A")
-        expected = protocol.steady_currents(self._written, self._resistances, self.voltage)
-        for channel, (coil, counter) in enumerate(zip(self._coils, self._supply_too_lowfalls, strict=True)):
+        expected = steady_currents(self._written, self._resistances, self.voltage)
+        for channel, (coil, counter) in enumerate(zip(self._coils, self._shortfalls, strict=True)):
             measured, commanded = self.currents[channel], self._commanded[channel]
-            if not counter.update(protocol.is_short(expected[channel], measured)):
+            if not counter.update(is_short(expected[channel], measured)):
                 self._coil_warnings[channel] = ""
             elif not self._coil_warnings[channel]:  # keeps the first text, which would change with every answer
                 self._coil_warnings[channel] = f"coil {coil}: {measured:.2f} A measured, {commanded:.2f} A commanded"
 
     def _check_status(self) -> None:
         (bits,) = self._query(self._device.ReadError)
-        known = {**Basicmicro.ERROR_DESCRIPTIONS, **protocol.DRIVER_FAULTS}
-        errors = protocol.describe_bits(bits & 0xFFFF, known, "error")
+        known = {**Basicmicro.ERROR_DESCRIPTIONS, **DRIVER_FAULTS}
+        errors = describe_bits(bits & 0xFFFF, known, "error")
         if errors:
             raise DeviceError(f"{self._name}: {', '.join(errors)}")
-        self._conditions = protocol.describe_bits(bits >> 16, Basicmicro.WARNING_DESCRIPTIONS, "warning")
+        self._conditions = describe_bits(bits >> 16, Basicmicro.WARNING_DESCRIPTIONS, "warning")
 
     def _verify(self, what: str, got: tuple[Any, ...], expected: tuple[int, ...]) -> None:
         if got != expected:

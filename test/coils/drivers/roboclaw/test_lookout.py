@@ -35,7 +35,7 @@ def test_a_board_whose_power_was_gone_is_a_loss_however_soon_it_is_back(
 
 
 def test_a_broken_wire_is_a_warning_that_names_its_coil(bench):
-    driver = bench.open()
+    driver = bench.open(roboclaw_answer_timeout=0.5)
     bench.boards[1].broken.add(0)
     with bench.held(driver, 3.0, -6.0, 4.0, 1.0):
         bench.wait(

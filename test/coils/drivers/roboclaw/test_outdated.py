@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.drivers.roboclaw import port
+from magnetosuture_thread.coils.drivers.roboclaw import board
 
 CURRENTS = np.array([3.0, -6.0, 1.5, 2.0])
 
@@ -47,7 +47,7 @@ def test_currents_that_grow_old_before_their_packet_is_written_are_zero(bench, m
         time.sleep(0.15)
         return real(*waited)
 
-    monkeypatch.setattr(port, "select", SimpleNamespace(select=stopped))
+    monkeypatch.setattr(board, "select", SimpleNamespace(select=stopped))
     for _ in range(4):
         driver.apply(CURRENTS, time.monotonic())
         assert duties_during(bench, 0.5) == {(0, 0)}

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.drivers.roboclaw import protocol
-from magnetosuture_thread.coils.drivers.roboclaw.protocol import Query
-
-
-def test_pauses_double_up_to_two_seconds():
-    pauses = [protocol.retry_delay(failures) for failures in range(1, 20)]
-    assert pauses[:5] == [0.1, 0.2, 0.4, 0.8, 1.6]
-    assert set(pauses[5:]) == {2.0}
+from magnetosuture_thread.coils.drivers.roboclaw import board as protocol
 
 
 @pytest.mark.parametrize(
@@ -30,12 +21,6 @@ def test_a_duty_is_the_share_of_the_supply(current: float, resistance: float, vo
     assert protocol.duties_for(np.array([current]), np.array([resistance]), voltage) == ((duty,), short)
 
 
-def test_each_coil_has_a_resistance_of_its_own():
-    found = protocol.duties_for(np.array([3.0, 3.0]), np.array([1.0, 2.0]), 24.0)
-    assert found == ((4095, 8191), False)
-    assert protocol.steady_currents(found[0], np.array([1.0, 2.0]), 24.0) == pytest.approx((3.0, 3.0), abs=1e-3)
-
-
 @pytest.mark.parametrize(
     ("due", "measured", "expected"),
     [
@@ -49,16 +34,6 @@ def test_each_coil_has_a_resistance_of_its_own():
 )
 def test_a_current_falls_short_below_half_of_what_is_due(due: float, measured: float, expected: bool):
     assert protocol.is_short(due, measured) is expected
-
-
-def test_every_question_is_asked_and_duties_most_of_all():
-    assert set(protocol.POLL_SEQUENCE) == set(Query)
-    assert protocol.POLL_SEQUENCE[0] is Query.DUTIES
-    counts = Counter(protocol.POLL_SEQUENCE)
-    assert counts[Query.DUTIES] == counts[Query.CURRENTS] == max(counts.values())
-    assert all(counts[setting] == 1 for setting in protocol.SETTING_QUERIES)
-    # With two boards on a line and a question each 20 ms, each comes within about a second.
-    assert 2 * 0.02 * len(protocol.POLL_SEQUENCE) < 1.0
 
 
 @pytest.mark.parametrize(
@@ -81,8 +56,3 @@ def test_every_question_is_asked_and_duties_most_of_all():
 def test_a_board_must_have_what_was_written(written: int, has: int, current: float, expected: bool):
     assert protocol.duties_match((written, 0), (has, 0), (current, 0.0), 10.0) is expected
     assert protocol.duties_match((0, written), (0, has), (0.0, current), 10.0) is expected
-
-
-def test_supplies_are_between_five_and_eighty_volts():
-    voltages = (0.0, 4.9, 5.0, 80.0, 80.1)
-    assert [protocol.is_plausible_supply(each) for each in voltages] == [False, False, True, True, False]

@@ -1,1 +1,0 @@
-"""Baselines: general solvers of the same programs, and simulators of the same motion; the model needs none."""

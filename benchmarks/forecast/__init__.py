@@ -1,1 +1,0 @@
-"""Forecasts: how long they take, and how they compare with what then happened."""

@@ -1,0 +1,275 @@
+"""Time the operator's page in Chromium without a window, on the whole graph around the simulated rig.
+
+From a key press to the filtered velocity at the bridge, and the pictures that the page draws, with 81 segments;
+by the stamps of who sends. Needs chromium and playwright. Takes three minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from magnetosuture_thread.cli.arguments import whole_number
+from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.configuration import read_yaml
+from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
+from magnetosuture_thread.setups import read_setup
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+SETUP, SEGMENTS, FRAME_RATE = "petri_35mm_polyamide", 81, 30.0  # the latter in place of the setup's own
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+WIDTH, HEIGHT = 1366, 768  # of the page [px]
+TIMEOUT = 240.0  # s for the graph to be there; the first start on a machine compiles
+GRACE = 20.0  # s for the command to end
+HELD, RELEASED = 0.25, 0.35  # s that a key is held, and not held, on average
+KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
+STATIONS = {OPERATOR_COMMAND: "the page's command in the graph", NEEDLE_SETPOINT: "the filtered velocity at the bridge"}
+MAX_DELAY = 0.05  # s from a key press to the filtered velocity at the bridge, at the 99th percentile
+LOST = 1.0  # s after a key press, after which no velocity counts as its answer
+LISTEN = """() => { window.bench_keys = []; addEventListener('keydown', (event) => {
+    if (!event.repeat) window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"""
+
+
+@dataclass(frozen=True)
+class KeyDelays:
+    """Times from a key press to a velocity.
+
+    Attributes:
+        station: where the velocity came.
+        count: of key presses that did.
+        lost: of those that did not.
+        median: [s]
+        p99: [s]
+        greatest: [s]
+    """
+
+    station: str
+    count: int
+    lost: int
+    median: float
+    p99: float
+    greatest: float
+
+    @classmethod
+    def between(cls, station: str, keys: Sequence[float], moving: Sequence[float]) -> KeyDelays:
+        """Return the times from each key press to the first velocity after it.
+
+        Args:
+            station: where the velocity came.
+            keys: when a key was pressed, rising [s].
+            moving: when a velocity that is not zero came, rising [s]; at least one within a second of a key.
+        """
+        delays = np.append(moving, np.inf)[np.searchsorted(moving, keys)] - np.asarray(keys)
+        found = delays[delays < LOST]
+        middle, high, most = np.percentile(found, [50.0, 99.0, 100.0])
+        return cls(station, len(found), len(keys) - len(found), float(middle), float(high), float(most))
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--presses", type=whole_number, default=200, metavar="N", help="of a key (default: 200)")
+
+
+def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
+    """Time the page; return the figures."""
+    log = make_log(console)
+    log(f"starting {SETUP} with {SEGMENTS} segments and {FRAME_RATE:g} frames a second, and a browser")
+    with progress(console, "page") as advance:
+        delays, rates = _measure(options.presses, advance)
+    console.print(page_table(delays))
+    log(f"limit: {1e3 * MAX_DELAY:g} ms at the bridge, 99th percentile; {FRAME_RATE:g} pictures a second")
+    log("the page drew {drawn:.1f} pictures a second, of {states:.1f} states and {frames:.1f} frames".format(**rates))
+    return {"scenario": SETUP, "segments": SEGMENTS, "delays": [asdict(each) for each in delays], **rates}, True
+
+
+def page_table(delays: Sequence[KeyDelays]) -> Table:
+    """Return the figures as a table that fits 80 columns."""
+    title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column("", no_wrap=True)
+    for name in ("median", "p99", "maximum", "keys", "lost"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for each in delays:
+        values = (f"{1e3 * value:.1f}" for value in (each.median, each.p99, each.greatest))
+        table.add_row(each.station, *values, str(each.count), str(each.lost))
+    return table
+
+
+def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[KeyDelays], dict[str, float]]:
+    """Press keys in a browser on the page; return the delays, and pictures, states and frames a second.
+
+    Raises:
+        ConfigurationError: the browser, or what drives it, is not installed.
+        GraphError: the graph does not start, or moves nothing.
+    """
+    with _serving() as server:
+        domain, url = int(server.find(r"ROS domain (\d+)")), server.find(r"open (http\S+)")
+        server.find(r"(runs; the coils)")
+        with _page(url) as page, _sent(domain) as sent:
+            for button in ("#control", "#arm"):
+                page.locator(f"{button}:enabled").click(timeout=1e3 * TIMEOUT)
+            page.evaluate(LISTEN)
+            began, before = time.monotonic(), dict(page.evaluate("() => ({ ...window.console_stats })"))
+            _press(page, presses, progress)
+            after, took = dict(page.evaluate("() => ({ ...window.console_stats })")), time.monotonic() - began
+            keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
+    if not all(sent.values()):
+        raise GraphError("no key moved the needle")
+    delays = [KeyDelays.between(words, keys, sent[channel.recorded]) for channel, words in STATIONS.items()]
+    return delays, {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
+
+
+class _Server:
+    """The command `magnetosuture console`, running."""
+
+    def __init__(self, setup: Path) -> None:
+        command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
+        self._lines: list[str] = []
+        self._reading = threading.Thread(target=self._read, daemon=True)
+        self._reading.start()
+
+    def find(self, pattern: str) -> str:
+        """Wait for a line, and return what the pattern's group holds.
+
+        Raises:
+            GraphError: the command ended, or prints no such line.
+        """
+        deadline = time.monotonic() + TIMEOUT
+        while time.monotonic() < deadline and self._process.poll() is None:
+            if found := re.search(pattern, "\n".join(self._lines)):
+                return found[1]
+            time.sleep(0.05)
+        raise GraphError(f"the console ended, or is not ready after {TIMEOUT:g} s: {' '.join(self._lines[-1:])}")
+
+    def end(self) -> None:
+        """Press Ctrl-C."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(GRACE)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reading.join()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.append(line.rstrip())
+
+
+@contextmanager
+def _serving() -> Iterator[_Server]:
+    """Run the command with the setup that is measured."""
+    content = read_yaml(read_setup(SETUP).path, "setup file")
+    content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
+    content["/**/rig_simulator"]["ros__parameters"]["frame_rate"] = FRAME_RATE
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{SETUP}.yaml"
+        path.write_text(yaml.safe_dump(content), encoding="utf-8")
+        server = _Server(path)
+        try:
+            yield server
+        finally:
+            server.end()
+
+
+def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:
+    """Hold a key, and release it, again and again; at random times, so that they meet every phase of all loops.
+
+    Each leads the needle towards the dish's centre: at the wall nothing would move.
+    """
+    chance = random.Random(1)
+    for done in range(presses):
+        tip = [float(entry) for entry in (page.get_attribute("#dish", "data-tip") or "0,0").split(",")]
+        key = KEYS[done % 2][int(tip[done % 2] > 0.0)]
+        page.keyboard.down(key)
+        time.sleep(HELD * chance.uniform(0.8, 1.2))
+        page.keyboard.up(key)
+        time.sleep(RELEASED * chance.uniform(0.8, 1.2))
+        progress((done + 1) / presses)
+
+
+@contextmanager
+def _page(url: str) -> Iterator[Page]:
+    """Open a page in a browser without a window."""
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        raise ConfigurationError("browser", "none found", f"one of {', '.join(BROWSERS)}: apt install chromium")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        expected = "what drives the browser: pip install playwright"
+        raise ConfigurationError("playwright", "not installed", expected) from None
+    with sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
+        try:
+            page = started.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page.goto(url)
+            yield page
+        finally:
+            started.close()
+
+
+@contextmanager
+def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
+    """Yield the times [s] at which a velocity that is not zero was sent on each topic, filled when the block ends.
+
+    By the senders' stamps: when we hear of it does not matter to the coils. A command that got lost on its way to us
+    is known by the needle command that followed from it, which keeps its stamp.
+    """
+    from magnetosuture_thread.messages.cdr import header_stamp
+    from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.processes import environment_of, graph_environment
+    from magnetosuture_thread.nodes.recorder import Recorder
+
+    taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
+    times: dict[str, list[float]] = {channel.recorded: [] for channel in STATIONS}
+
+    def receive(topic: str, arrival: int, data: bytes) -> None:
+        stamp = header_stamp(data)
+        linear = topics.NEEDLE_COMMAND.decode(data).twist.linear
+        if stamp is not None and (linear.x or linear.y):
+            times[OPERATOR_COMMAND.recorded if topic == NEEDLE_COMMAND.recorded else topic].append(stamp * 1e-9)
+
+    with environment_of(graph_environment(domain)):
+        recorder = Recorder(domain, taken, simulated_clock=False, receive=receive)
+    over = threading.Event()
+
+    def listen() -> None:
+        while not over.is_set():
+            recorder.spin(0.05)
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    try:
+        yield times
+    finally:
+        over.set()
+        thread.join()
+        recorder.close()
+        for found in times.values():
+            found.sort()

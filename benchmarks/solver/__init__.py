@@ -1,1 +1,0 @@
-"""Time of the thread model's steps and solves, beside other solvers of the same programs and other simulators."""

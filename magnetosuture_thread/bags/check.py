@@ -1,0 +1,234 @@
+"""Checks a bag: what it holds and what of it is damaged; and writes what can be vouched for into a new one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from magnetosuture_thread.bags.bag_folder import QOS, UNCHECKED_NOTE, jazzy_qos_profiles
+from magnetosuture_thread.bags.mcap.writer import LIBRARY
+from magnetosuture_thread.bags.message_types import own_definition
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.storage import CDR, Connection, DamageReport
+from magnetosuture_thread.bags.writer import MAX_TIME, BagWriter
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.messages.cdr import stamp_and_frame
+from magnetosuture_thread.texts import shortened
+
+RECORDER_NOTE = "recorder"  # note of a repaired bag: which library wrote the one before
+
+
+@dataclass
+class TopicReport:
+    """Report on a topic.
+
+    Attributes:
+        topic: its name, remapped.
+        types: of its messages; more than one is an error of the recorder.
+        count: number of messages.
+        first: when the first was recorded [s since the bag's start]; None without messages.
+        last: when the last was [s since the bag's start].
+        gap: greatest time between two messages [s].
+        backward: number of messages whose stamp is before that of the one before them.
+        unreadable: number of messages whose stamp cannot be read although their type has one.
+        frames: frame ids of the messages.
+        known: whether our graph uses the topic, and at least one of its messages can be used.
+        problem: why it does not, although it has the name of one of our topics.
+    """
+
+    topic: str
+    types: tuple[str, ...]
+    count: int = 0
+    first: float | None = None
+    last: float | None = None
+    gap: float = 0.0
+    backward: int = 0
+    unreadable: int = 0
+    frames: set[str] = field(default_factory=set)
+    known: bool = False
+    problem: str = ""
+    _stamp: int | None = None
+
+    def add(self, record: RecordedMessage, time: float, *, is_cdr: bool) -> None:
+        """Add a message that was recorded at a time [s since the bag's start]."""
+        self.count += 1
+        if self.last is not None:
+            self.gap = max(self.gap, time - self.last)
+        self.first = time if self.first is None else self.first
+        self.last = time
+        if not is_cdr or not record.decoder.has_header():
+            return
+        try:
+            stamp, frame = stamp_and_frame(record.topic, record.data)
+        except BagError:
+            self.unreadable += 1
+            return
+        self.frames.add(frame)
+        self.backward += self._stamp is not None and stamp < self._stamp
+        self._stamp = stamp
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the report in SI units; null where there is no value."""
+        first, last = self.first, self.last
+        span = last - first if first is not None and last is not None else 0.0
+        return {
+            "topic": self.topic,
+            "types": list(self.types),
+            "messages": self.count,
+            "rate_hz": (self.count - 1) / span if span > 0.0 else None,
+            "first_s": first,
+            "last_s": last,
+            "greatest_gap_s": self.gap if self.count > 1 else None,
+            "stamps_going_back": self.backward,
+            "unreadable_stamps": self.unreadable,
+            "frames": sorted(self.frames),
+            "known": self.known,
+            "problem": self.problem or None,
+        }
+
+
+def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = lambda fraction: None) -> dict[str, Any]:
+    """Read all messages of a bag and return a report on its content in SI units; null where there is no value.
+
+    Args:
+        bag: to inspect.
+        dish_frame: name of the dish frame in the bag.
+        progress: called with the completed fraction, 0 to 1.
+    """
+    recording = Recording(bag, dish_frame=dish_frame)
+    topics: dict[str, TopicReport] = {}
+    for name in sorted(bag.counts):
+        own = bag.conflicts.get(name) or (bag.topics[name],)
+        problem = recording.problem_of(name)
+        topics[name] = TopicReport(name, own, known=recording.uses(name) and not problem, problem=problem)
+    refused: Counter[str] = Counter()
+    for connection, record in bag.every_record(refused):
+        time = (record.time - bag.start) * 1e-9
+        topics[bag.name_of(connection)].add(record, time, is_cdr=connection.serialization == CDR)
+        progress(time / max(bag.duration, 1e-9))
+    return {
+        "bag": str(bag.path),
+        "start_s": bag.start * 1e-9,
+        "duration_s": bag.duration,
+        "messages": sum(bag.counts.values()),
+        "notes": bag.notes,
+        "files": bag.facts,
+        "unchecked": bag.unchecked or None,
+        "unverified": bag.unverified or None,
+        "remarks": bag.remarks,
+        "refused": dict(refused),
+        "damage": None if bag.damage is None else _damage(bag.damage),
+        "topics": [topic.to_json() for topic in topics.values()],
+    }
+
+
+def _damage(damage: DamageReport) -> dict[str, Any]:
+    places = [
+        {
+            "file": region.file,
+            "start_byte": region.start,
+            "end_byte": region.end,
+            "what": region.what,
+            "first_s": None if region.first is None else region.first * 1e-9,
+            "last_s": None if region.last is None else region.last * 1e-9,
+        }
+        for region in damage.regions
+    ]
+    counts = {"chunks_lost": damage.chunks, "bytes_lost": damage.bytes, "messages_lost": damage.messages}
+    return {"text": str(damage), **counts, "places": places}
+
+
+@dataclass
+class RepairReport:
+    """What became of a bag.
+
+    Attributes:
+        messages: that the new bag holds.
+        refused: messages that it does not, by reason.
+        dropped: other records that it does not, by kind.
+        unpacked: messages that the recorder had packed one by one, and that are not in the new bag.
+        defined: types that had no definition, and have ours.
+        kept: attachments and metadata records.
+        rewritten: topics whose quality of service is written by name, as Jazzy reads it.
+    """
+
+    messages: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    unpacked: int = 0
+    defined: list[str] = field(default_factory=list)
+    kept: int = 0
+    rewritten: list[str] = field(default_factory=list)
+
+    @property
+    def is_same(self) -> bool:
+        """Return whether the new bag holds everything, as it was."""
+        return not (self.refused or self.dropped or self.unpacked or self.defined or self.rewritten)
+
+
+def write_repaired_bag(
+    bag: Bag, folder: Path, name: str, progress: Callable[[float], None] = lambda fraction: None
+) -> RepairReport:
+    """Write every message of a bag that can be vouched for into a new one, with its notes, definitions and attachments.
+
+    The bytes of messages, definitions, attachments and metadata records stay as they are; so do times and numbers of
+    messages, the profile, and entries of others in metadata.yaml. Messages that the recorder packed one by one, as the
+    storage says, are unpacked, and topics have their remapped names. Types keep the definitions of the bag; ours is
+    written where it has none and we know the type. Chunks, indices, statistics and metadata.yaml are made anew.
+
+    Args:
+        bag: the bag to repair.
+        folder: of the new one; must be empty.
+        name: of the new one.
+        progress: called with the completed fraction, 0 to 1.
+
+    Raises:
+        BagError: the new bag cannot be written.
+    """
+    notes = dict(bag.notes)
+    if bag.unchecked and not bag.unverified:
+        notes.setdefault(UNCHECKED_NOTE, f"made by `bag repair` from a bag that {bag.unchecked}")
+    if bag.library and bag.library != LIBRARY:
+        notes.setdefault(RECORDER_NOTE, shortened(bag.library))
+    report = RepairReport()
+    numbers: dict[Connection, int] = {}
+    with BagWriter(folder, notes, name=name, profile=shortened(bag.profile), custom_data=bag.custom_data) as writer:
+        for extra in bag.extras(report.dropped):
+            writer.add_extra(extra)
+            report.kept += 1
+        for connection in bag.connections():
+            if connection not in numbers:
+                numbers[connection] = writer.add_connection(_defined(bag, connection, report))
+        for item in bag.stored():
+            try:
+                if item.time > MAX_TIME:
+                    raise BagError(bag.name_of(item.connection), "a time that cannot be")
+                data = bag.load(item)
+            except BagError as error:
+                report.refused[str(error)] += 1
+                continue
+            writer.write_to(
+                numbers[item.connection], item.time, data, publish_time=item.publish_time, sequence=item.sequence
+            )
+            report.messages += 1
+            report.unpacked += data is not item.data
+            progress((item.time - bag.start) / max(bag.end - bag.start, 1))
+    return report
+
+
+def _defined(bag: Bag, connection: Connection, report: RepairReport) -> Connection:
+    """Return a connection as it is written to the new bag."""
+    definition = connection.definition
+    if not definition.text and connection.serialization == CDR:
+        own = own_definition(definition.type_name)
+        if own.text:
+            definition = own
+            report.defined.append(own.type_name)
+    profiles = connection.metadata.get(QOS, "")
+    if jazzy_qos_profiles(profiles) != profiles:
+        report.rewritten.append(bag.name_of(connection))
+    return replace(connection, topic=bag.name_of(connection), definition=definition)

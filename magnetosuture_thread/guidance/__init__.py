@@ -1,1 +1,0 @@
-"""Guidance: velocity commands that move the needle along a path."""

@@ -1,0 +1,396 @@
+"""Plays recorded messages into the running graph, and passes on its outputs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
+from typing import Any, TypeAlias
+
+import rclpy
+import rclpy.time
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+
+from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.interface import (
+    CAMERA,
+    CAMERA_INFO,
+    CURRENTS,
+    DIAGNOSTICS,
+    MARGINS,
+    NEEDLE_POSE,
+    PAUSE_REPLAY,
+    PREDICTED_THREAD,
+    SCENE,
+)
+from magnetosuture_thread.messages.cdr import header_stamp
+from magnetosuture_thread.messages.reading import nanoseconds
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.node import GuardedNode
+
+CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
+STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
+START_TIMEOUT = 180.0  # s for all nodes to be there
+# s after we have found all nodes, for the nodes to have found us and each other: DDS announces a node a few times as it
+# starts and then each 3 s, and on a busy machine the first of these get lost.
+SETTLE = 3.2
+QUIET = 0.5  # s without any answer, once all has been taken and answered: the graph is done
+STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
+DRAIN_TIMEOUT = 30.0  # s after the last input at the most
+DEPTH = 300  # messages that may wait for a slow node before any is lost
+MAX_TAKEN = 100  # outputs taken between two inputs at the most
+ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
+Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data` (CDR bytes)
+FRAMES = frozenset(channel.name for channel in CAMERA.values())
+
+
+class Timeline:
+    """Maps simulated to real time; before it begins, and while it is paused, simulated time stands still.
+
+    Args:
+        start: the simulated time to begin with [ns].
+        rate: how much faster than real time it runs.
+    """
+
+    def __init__(self, start: int, rate: float) -> None:
+        self.start = start
+        self._rate = rate
+        self._began: float | None = None
+        self._paused: float | None = None
+        self._stood = 0.0
+
+    def begin(self) -> None:
+        """Begin, or begin anew, at the start."""
+        self._began, self._stood = time.perf_counter(), 0.0
+        self._paused = self._began if self._paused is not None else None
+
+    @property
+    def paused(self) -> bool:
+        """Whether it is paused."""
+        return self._paused is not None
+
+    def pause(self, still: bool) -> None:
+        """Pause the time, or resume it."""
+        now = time.perf_counter()
+        if still and self._paused is None:
+            self._paused = now
+        elif not still and self._paused is not None:
+            if self._began is not None:
+                self._stood += now - self._paused
+            self._paused = None
+
+    def running(self) -> float:
+        """Return for how long it has been running, by real time, since it began [s]."""
+        if self._began is None:
+            return 0.0
+        now = time.perf_counter() if self._paused is None else self._paused
+        return now - self._began - self._stood
+
+    def now(self) -> int:
+        """Return the simulated time [ns]."""
+        return self.start + round(self.running() * self._rate * 1e9)
+
+    def left(self, simulated: int) -> float:
+        """Return how long it takes until a simulated time [ns], in real time [s]; for ever while it is paused."""
+        if self._paused is not None:
+            return math.inf
+        return (simulated - self.start) * 1e-9 / self._rate - self.running()
+
+
+class Losses:
+    """Keeps count of a replay.
+
+    Attributes:
+        played: messages published, by topic.
+        frames_taken: camera frames that the tracker says it has taken.
+    """
+
+    def __init__(self) -> None:
+        self.played: Counter[str] = Counter()
+        self.frames_taken = 0
+        self._refused: dict[str, int] = {}
+        self._poses: set[int] = set()
+        self._answered: set[int] = set()
+        self._numbers: dict[str, int] = {}
+        self._taken: Counter[str] = Counter()
+
+    @property
+    def frames_played(self) -> int:
+        """Return the camera frames published."""
+        return sum(count for topic, count in self.played.items() if topic in FRAMES)
+
+    @property
+    def frames_waiting(self) -> bool:
+        """Whether the tracker has not taken all frames yet."""
+        return self.frames_taken < self.frames_played
+
+    @property
+    def poses_waiting(self) -> bool:
+        """Whether a pose has not been answered yet; one that the model refuses never is."""
+        return bool(self._poses - self._answered)
+
+    def heard(self, topic: str, stamp: int | None, number: int | None) -> None:
+        """Count an output of the graph.
+
+        Args:
+            topic: its name.
+            stamp: of the frame that it is about [ns].
+            number: that its publisher gave it, if the middleware tells.
+        """
+        if number is not None and number != topics.UNNUMBERED:
+            self._numbers[topic] = max(self._numbers.get(topic, 0), number)
+            self._taken[topic] += 1
+        if stamp is not None and topic == NEEDLE_POSE.name:
+            self._poses.add(stamp)
+        if stamp is not None and topic in (PREDICTED_THREAD.name, MARGINS.name):
+            self._answered.add(stamp)
+
+    def count_diagnostics(self, data: bytes) -> None:
+        """Count a node's status on /diagnostics."""
+        for status in topics.DIAGNOSTICS.decode(data).status:
+            values = {value.key: value.value for value in status.values}
+            node = status.name.split(":")[0]
+            if node == "vision_tracker":
+                self.frames_taken = max(self.frames_taken, int(values.get("frames", "0")))
+            self._refused[node] = int(values.get("refused", "0"))
+
+    def dropped(self) -> dict[str, int]:
+        """Return how many messages got lost, by the way on which."""
+        unanswered = len(self._poses - self._answered) - self._refused.get("thread_model", 0)
+        unheard = sum(max(0, number - self._taken[topic]) for topic, number in self._numbers.items())
+        counts = {"poses without an answer": max(0, unanswered), "outputs lost by the recording": unheard}
+        if self.frames_played:
+            counts = {"frames not taken by vision_tracker": self.frames_played - self.frames_taken, **counts}
+        return counts
+
+
+class LiveReplay:
+    """A node that plays messages into the graph with /clock, and passes on all outputs.
+
+    What it plays that is an output of a node otherwise, as poses are where no tracker runs, it passes on as well. Its
+    service `replay/pause` lets time stand still.
+
+    Args:
+        domain: the graph's ROS domain.
+        timeline: the simulated time.
+        played: topics to play.
+        nodes: how many nodes there are to be; all follow /clock.
+        receive: called with topic, simulated time [ns] and CDR bytes of every output.
+        watch: called while waiting; raises if the graph is broken.
+        log: called with a line for a person when time stands still or goes on.
+
+    Attributes:
+        published: of each input topic, when the message of a stamp was published [s].
+        arrived: of each output topic, when the first message of a stamp arrived [s]; of currents, of a command's stamp.
+        losses: what was played, taken and lost.
+    """
+
+    def __init__(
+        self,
+        domain: int,
+        timeline: Timeline,
+        *,
+        played: Collection[topics.Topic],
+        nodes: int,
+        receive: Callable[[str, int, bytes], None],
+        watch: Callable[[], None],
+        log: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self._time = timeline
+        self._nodes = nodes
+        self._receive = receive
+        self._watch = watch
+        self._log = log
+        self._last_answer = time.perf_counter()
+        self._still, self._last_clock = timeline.start, 0.0
+        self._taken = 0
+        self.losses = Losses()
+        self.published: dict[str, dict[int, float]] = defaultdict(dict)
+        self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain, args=[])
+        self._node = GuardedNode("replay", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
+        self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
+        self._inputs = {
+            topic.channel.recorded: self._node.create_publisher(topic.message, topic.name, _lossless(topic.qos))
+            for topic in played
+        }
+        self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
+        # Poses are played where no tracker runs.
+        by_tracker = (topics.TRACKER_STATE, topics.THREAD_OBSERVATION)
+        unheard = {*self._echoed, *(topic.channel.recorded for topic in by_tracker if self._echoed)}
+        self._outputs = {
+            topic.name: self._node.create_subscription(
+                topic.message, topic.name, self._taker(topic), _lossless(topic.qos), raw=True
+            )
+            for topic in topics.OUTPUTS
+            if topic.channel.recorded not in unheard
+        }
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def wait_for_graph(self) -> None:
+        """Wait until every played input has a subscriber and every output a publisher.
+
+        Raises:
+            GraphError: the nodes do not come, or one ends.
+        """
+        on_request = {topic.name for topic in topics.ON_REQUEST}
+        deadline = time.perf_counter() + START_TIMEOUT
+        complete: float | None = None
+        while complete is None or time.perf_counter() - complete < SETTLE:
+            self._watch()
+            self._publish_clock(self._time.start)
+            self._executor.spin_once(timeout_sec=0.02)
+            missing = [
+                name
+                for name, publisher in self._inputs.items()
+                if name not in (CAMERA_INFO.recorded, SCENE.recorded) and not publisher.get_subscription_count()
+            ]
+            expected = {name: output for name, output in self._outputs.items() if name not in on_request}
+            missing += [name for name, output in expected.items() if not output.get_publisher_count()]
+            if self._clock.get_subscription_count() < self._nodes:
+                missing.append("/clock")
+            if missing:
+                complete = None
+            elif complete is None:
+                complete = time.perf_counter()
+            if time.perf_counter() > deadline:
+                raise GraphError(f"after {START_TIMEOUT:g} s the graph is not complete: nobody at {', '.join(missing)}")
+
+    def play(self, records: Iterable[Recorded], progress: Callable[[float], None]) -> None:
+        """Play messages at their times, then wait until the graph has answered.
+
+        Args:
+            records: by time; topics that are not played are passed over.
+            progress: called with the time played since the start [s].
+        """
+        self._time.begin()
+        clock = self._time.start
+        for record in records:
+            publisher = self._inputs.get(record.topic)
+            if publisher is None:
+                continue
+            clock = self._run_clock(clock, record.time)
+            self._publish_clock(record.time)
+            self._publish(publisher, record)
+            progress((record.time - self._time.start) * 1e-9)
+        self._drain(clock)
+
+    def play_on(self, records: Callable[[], Iterable[Recorded]]) -> None:
+        """Play messages over and over, for who watches; nothing is recorded any more.
+
+        Time is set back before each pass, and the nodes begin anew.
+        """
+        self._receive = lambda topic, time, data: None
+        while True:
+            self.losses = Losses()
+            self.play(records(), lambda time: None)
+
+    def _publish(self, publisher: Any, record: Recorded) -> None:
+        name, stamp = record.topic.lstrip("/"), header_stamp(record.data)
+        now = time.time()
+        publisher.publish(record.data)
+        self.losses.played[name] += 1
+        if stamp is not None:
+            self.published[name][stamp] = now
+        if record.topic == SCENE.recorded:
+            self._receive(record.topic, record.time, bytes(record.data))
+        if record.topic in self._echoed:
+            if stamp is not None:
+                self.arrived[name].setdefault(stamp, now)
+            self.losses.heard(name, stamp, None)
+            self._receive(record.topic, record.time, bytes(record.data))
+
+    def _drain(self, clock: int) -> None:
+        """Let time go on until the graph has taken and answered all, and no more answers come."""
+        deadline = self._time.running() + DRAIN_TIMEOUT
+        self._last_answer = time.perf_counter()
+        while self._time.running() < deadline:
+            enough = STUCK if self.losses.poses_waiting else QUIET
+            if not self.losses.frames_waiting and time.perf_counter() > self._last_answer + enough:
+                return
+            clock = self._run_clock(clock, clock + round(CLOCK_PERIOD * 1e9))
+
+    def _run_clock(self, clock: int, until: int) -> int:
+        """Publish /clock up to a simulated time, taking outputs all the while; return the next tick."""
+        self._take_waiting()
+        while clock < until:
+            self._spin_until(clock)
+            self._publish_clock(clock)
+            clock += round(CLOCK_PERIOD * 1e9)
+        self._spin_until(until)
+        return clock
+
+    def _take_waiting(self) -> None:
+        """Take outputs that have come already, however late we are."""
+        self._watch()
+        for _ in range(MAX_TAKEN):
+            before = self._taken
+            self._executor.spin_once(timeout_sec=0.0)
+            if self._taken == before:
+                return
+
+    def _spin_until(self, simulated: int) -> None:
+        """Take outputs until a simulated time is there."""
+        while (left := self._time.left(simulated)) > 0.0:
+            self._watch()
+            self._executor.spin_once(timeout_sec=min(left, 0.01))
+            if self._time.paused and time.perf_counter() - self._last_clock > STILL_PERIOD:
+                self._publish_clock(self._still)
+
+    def _taker(self, topic: topics.Topic) -> Callable[[Any, Any], None]:
+        """Return the callback of an output topic."""
+        name = topic.channel.name
+
+        def take(data: bytes, info: dict[str, Any]) -> None:
+            self._taken += 1
+            with suppress(InvalidInputError, ValueError):  # no message of ours
+                count(data, info)
+                self._receive(topic.channel.recorded, self._time.now(), bytes(data))
+
+        def count(data: bytes, info: dict[str, Any]) -> None:
+            is_currents = topic.channel is CURRENTS  # which count by the command that they follow, if any
+            stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
+            if stamp is not None:
+                # When it reached this process: how long it waited here for its turn is not the graph's delay.
+                self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)
+            if topic in ANSWERS:
+                self._last_answer = time.perf_counter()
+                self.losses.heard(name, stamp, info["publication_sequence_number"])
+            if topic.channel is DIAGNOSTICS:
+                self.losses.count_diagnostics(data)
+
+        return take
+
+    def _on_pause(self, asked: Any, answer: Any) -> Any:
+        """Let time stand still, or go on."""
+        self._time.pause(asked.data)
+        answer.success = True
+        at = (self._time.now() - self._time.start) * 1e-9
+        answer.message = f"{'paused' if asked.data else 'goes on'} at {at:.2f} s"
+        self._log(answer.message)
+        return answer
+
+    def _publish_clock(self, simulated: int) -> None:
+        self._still, self._last_clock = simulated, time.perf_counter()
+        self._clock.publish(Clock(clock=rclpy.time.Time(nanoseconds=simulated).to_msg()))
+
+
+def _lossless(qos: QoSProfile) -> QoSProfile:
+    """Return a quality of service that waits for slow readers; only the replay has time to."""
+    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=qos.durability)

@@ -1,1 +1,0 @@
-"""Plays a recorded bag into the running graph."""

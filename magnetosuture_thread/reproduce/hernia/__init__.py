@@ -1,1 +1,0 @@
-"""The simulated hernia repair: a thread steered by hand around a ring, in the thread model alone."""

@@ -1,0 +1,554 @@
+"""The simulated overhead camera: draws the dish, the needle and the thread as a lens would see them.
+
+Everything here is simulated. The look was set beside sample frames: a double dark rim, glare arcs and
+hot spots, dust, soft shadows, a tapered steel needle, a thread about one pixel wide, sensor noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.needle_arc import needle_axis
+from magnetosuture_thread.geometry.obstacles import Disc, Obstacle
+from magnetosuture_thread.geometry.polyline import Points
+
+Image = NDArray[np.uint8]
+Light = NDArray[np.float32]
+Box = tuple[slice, slice]
+ToCanvas = Callable[[Points], NDArray[np.int32]]
+
+OVERSAMPLING = 4
+TILE_PX = 60.0  # a long line is drawn in pieces of this length: a large, nearly empty canvas would be slow
+STEEL_BGR = (52.0, 48.0, 44.0)
+GLEAM_BGR = (88.0, 84.0, 78.0)
+LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
+SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
+SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
+MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
+NOISE_FIELDS = 12
+NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
+REACH_PX = 24.0  # of shadows and blur around what moves
+# Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
+RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
+DROP_SHADOW_PX = np.array([3.0, 4.0])
+LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
+GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How an obstacle looks. A tracker measures on green, so that soft tissue differs from the floor in the others.
+
+    Attributes:
+        bgr: its colour, blue, green, red from 0 to 255.
+        edge_bgr: the colour at its outline, into which the other fades.
+        rounding: how far inwards that reaches, and the edge is rounded [m].
+        relief: how much brighter the rounded edge is towards the lamp, and darker away from it.
+        mottle: depth of its light and dark patches.
+    """
+
+    bgr: tuple[float, float, float]
+    edge_bgr: tuple[float, float, float]
+    rounding: float = 0.0
+    relief: float = 0.0
+    mottle: float = 0.0
+
+
+SILICONE = Look((168.0, 176.0, 205.0), (168.0, 176.0, 205.0))
+LOOKS = {
+    "silicone": SILICONE,
+    "tissue": Look((196.0, 194.0, 242.0), (178.0, 184.0, 236.0), 0.7e-3, 9.0, 8.0),
+    "hernia": Look((164.0, 166.0, 226.0), (150.0, 162.0, 212.0), 0.5e-3, 6.0, 4.0),
+}
+LOOK_OF_KIND = {"tissue": "tissue", "instrument": "silicone", "wall": "silicone"}  # of a scene's shapes
+
+
+@dataclass(frozen=True)
+class CameraScene:
+    """The things before the camera, all in the dish frame [m].
+
+    Attributes:
+        dish_diameter: inner diameter of the dish.
+        needle_length: length of the needle along its body.
+        needle_width: width of its body.
+        needle_curvature: of its arc, positive to the left of the heading [1/m].
+        thread_diameter: diameter of the thread.
+        thread_bgr: the thread's colour, blue, green, red from 0 to 255.
+        obstacles: seen from above.
+        looks: of each of them; none given: pale silicone.
+    """
+
+    dish_diameter: float = 0.035
+    needle_length: float = 0.007
+    needle_width: float = 0.0004
+    needle_curvature: float = 0.0
+    thread_diameter: float = 60e-6
+    thread_bgr: tuple[float, float, float] = (132.0, 78.0, 100.0)
+    obstacles: Sequence[Obstacle] = ()
+    looks: Sequence[Look] = ()
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """The light, the lens and the sensor.
+
+    Attributes:
+        gain: of the exposure; 1 is well exposed.
+        slope: how much darker one corner is than the opposite one, in units of the usual.
+        tint_bgr: colour of the light.
+        glare: strength of the lamp's reflections in the liquid, 0 for none.
+        noise: standard deviation of the sensor's noise, in units of the usual.
+        blur_px: the lens's, as the standard deviation of a Gaussian.
+    """
+
+    gain: float = 1.0
+    slope: float = 1.0
+    tint_bgr: tuple[float, float, float] = (0.955, 0.985, 1.0)
+    glare: float = 1.0
+    noise: float = 1.0
+    blur_px: float = 0.75
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Something between the dish and the camera.
+
+    Attributes:
+        outline: closed, shape (m, 2) [m].
+        bgr: its colour.
+        blur_px: its edge is out of focus by this.
+        opacity: 1 hides what is below.
+    """
+
+    outline: Points
+    bgr: tuple[float, float, float]
+    blur_px: float = 1.5
+    opacity: float = 1.0
+
+
+def encode_jpeg(image: Image, quality: int) -> NDArray[np.uint8]:
+    """Return a BGR image as the bytes of a JPEG file, shape (bytes,); quality from 1 to 100."""
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ValueError(f"an image of shape {image.shape} cannot be encoded")
+    return np.asarray(data, dtype=np.uint8).ravel()
+
+
+class DishCamera:
+    """Renders frames of a scene.
+
+    What stands still is drawn and exposed once, with several fields of noise; a frame takes one of these
+    pictures and draws the region of what moves anew. There the field is shifted, each colour by itself, to where it was
+    never used: as of a sensor, no two frames are equal, also of a needle at rest.
+
+    Args:
+        scene: what stands before the camera.
+        view: where the dish is in the image.
+        size: width and height of the image [px].
+        seed: of the dust, the smears and the sensor noise; the same seed gives the same frames.
+        lighting: light, lens and sensor.
+        noise_fields: drawn once; a frame takes one of them.
+    """
+
+    def __init__(
+        self,
+        scene: CameraScene,
+        view: DishView,
+        size: tuple[int, int] = (640, 480),
+        seed: int = 0,
+        lighting: Lighting | None = None,
+        noise_fields: int = NOISE_FIELDS,
+    ) -> None:
+        self._scene = scene
+        self.view = view
+        self.size = size
+        self._lighting = lighting or Lighting()
+        self._random = np.random.default_rng(seed)
+        self._background = _StillLife(scene, self._lighting, view, size, self._random).draw()
+        self._still = self._through_lens(self._background)
+        self._noise = [self._noise_field() for _ in range(noise_fields)]
+        self._exposed = [self._expose(self._still, noise, 1.0) for noise in self._noise]
+        self._shifts, self._shifting = np.zeros((noise_fields, 3, 2), np.int64), np.random.default_rng(seed)
+
+    def render(
+        self, tail: Points, heading: float, thread: Points, covers: tuple[Cover, ...] = (), gain: float = 1.0
+    ) -> Image:
+        """Draw one frame.
+
+        Args:
+            tail: the needle's blunt end, shape (2,) [m].
+            heading: angle of the needle at its tail against the x axis [rad].
+            thread: centreline from the tail on, shape (m, 2) [m].
+            covers: what is between dish and camera in this frame.
+            gain: of this frame's exposure, beside the lighting's.
+
+        Returns:
+            BGR image, shape (height, width, 3).
+        """
+        outline = self._needle_outline(tail, heading)
+        line = self.view.to_pixels(thread)
+        edges = [self.view.to_pixels(cover.outline) for cover in covers]
+        box = box_around(np.vstack([outline, line, *edges]), self.size, REACH_PX)
+        chosen = int(self._random.integers(len(self._noise)))
+        noise = self._noise[chosen]
+        image = self._exposed[chosen].copy() if gain == 1.0 else self._expose(self._still, noise, gain)
+        if box is not None:
+            region = self._background[box].copy()
+            self._add_strand_and_needle(region, box, line, outline, tail, heading)
+            for cover, edge in zip(covers, edges, strict=True):
+                self._add_cover(region, box, cover, edge)
+            image[box] = self._expose(self._through_lens(region), self._noise_in(box, chosen), gain)
+        return image
+
+    def _add_strand_and_needle(
+        self, region: Light, box: Box, line: Points, outline: Points, tail: Points, heading: float
+    ) -> None:
+        scene, scale = self._scene, self.view.metres_per_pixel
+        strand = line_covered(box, line, MENISCUS * scene.thread_diameter / scale)
+        shade = np.float32(0.35) * strand
+        near = box_around(outline, self.size, REACH_PX)
+        needle = None
+        if near is not None:
+            needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
+            inside = _within(near, box)
+            np.maximum(shade[inside], needle, out=shade[inside])
+        lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
+        lay(region, strand, 1.0, scene.thread_bgr)
+        if near is not None and needle is not None:
+            lay(region[inside], needle, 1.0, STEEL_BGR)
+            lay(
+                region[inside], line_covered(near, self.view.to_pixels(self._gleam(tail, heading)), 1.0), 1.0, GLEAM_BGR
+            )
+
+    def _add_cover(self, region: Light, box: Box, cover: Cover, edge: Points) -> None:
+        hidden = covered(box, lambda canvas, at: cv2.fillPoly(canvas, [at(edge)], 255, cv2.LINE_8, 4))
+        lay(region, cv2.GaussianBlur(hidden, (0, 0), cover.blur_px), cover.opacity, cover.bgr)
+
+    def _needle_outline(self, tail: Points, heading: float) -> Points:
+        """Return the needle's outline in pixels: a body of one width, the last fifth tapering to a fine point."""
+        at = np.concatenate([np.linspace(0.0, 0.8, 17), np.linspace(0.84, 1.0, 5)])
+        half = 0.5 * self._scene.needle_width * np.interp(at, [0.8, 1.0], [1.0, 0.12])
+        points, along = needle_axis(tail, heading, self._scene.needle_length, self._scene.needle_curvature, at)
+        aside = half[:, None] * np.column_stack([-along[:, 1], along[:, 0]])
+        return self.view.to_pixels(np.vstack([points - aside, (points + aside)[::-1]]))
+
+    def _gleam(self, tail: Points, heading: float) -> Points:
+        """Return the line along which the body reflects the lamp: on the side that faces it."""
+        scene = self._scene
+        at = np.linspace(0.07, 0.77, 15)
+        points, along = needle_axis(tail, heading, scene.needle_length, scene.needle_curvature, at)
+        aside = np.column_stack([-along[:, 1], along[:, 0]])
+        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ LAMP)[:, None] * aside)
+
+    def _through_lens(self, light: Light) -> Light:
+        return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
+
+    def _noise_field(self) -> Light:
+        """Return noise for white light of level 1; the sensor's colour interpolation spreads it a little."""
+        width, height = self.size
+        noise = self._random.standard_normal((height, width, 3), dtype=np.float32)
+        level = np.float32(self._lighting.noise * NOISE_LEVEL / np.sqrt(90.0))
+        return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
+
+    def _noise_in(self, box: Box, chosen: int) -> Light:
+        """Return a field's noise in a region, shifted as at no use before; fields go on beyond their borders."""
+        field, noise = self._noise[chosen], []
+        for colour, shift in enumerate(self._shifts[chosen]):
+            rows, columns = (np.arange(part.start, part.stop) + by for part, by in zip(box, shift, strict=True))
+            noise.append(field[:, :, colour].take(rows, axis=0, mode="wrap").take(columns, axis=1, mode="wrap"))
+        self._shifts[chosen] = self._shifting.integers(field.shape[:2], size=(3, 2))
+        return np.dstack(noise)
+
+    def _expose(self, light: Light, noise: Light, gain: float) -> Image:
+        """Expose the sensor, add its noise, which grows with the root of the light, and round to 8 bits."""
+        light = light * np.float32(gain * self._lighting.gain)
+        return np.asarray(cv2.add(light, cv2.multiply(cv2.sqrt(light), noise), dtype=cv2.CV_8U), dtype=np.uint8)
+
+
+def _within(inner: Box, outer: Box) -> Box:
+    """Return a box in the coordinates of one that holds it."""
+    rows, columns = (slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer, strict=True))
+    return rows, columns
+
+
+@dataclass
+class _StillLife:
+    """Draws the background once.
+
+    Attributes:
+        scene: what stands there.
+        lighting: the light on it.
+        view: where the dish is in the image.
+        size: width and height of the image [px].
+        random: of smears, hot spots and dust.
+    """
+
+    scene: CameraScene
+    lighting: Lighting
+    view: DishView
+    size: tuple[int, int]
+    random: np.random.Generator
+
+    def draw(self) -> Light:
+        """Return the light that falls on the sensor before lens and exposure, shape (rows, columns, 3)."""
+        width, height = self.size
+        view, lighting = self.view, self.lighting
+        u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        scale = view.metres_per_pixel
+        radius = np.float32(0.5 * self.scene.dish_diameter)
+        away = np.hypot(u - view.centre_px[0], v - view.centre_px[1]).astype(np.float32) * np.float32(scale)
+        slope = (lighting.slope * (u / width + v / height - 1.0)).astype(np.float32)
+        table = 176.0 - 10.0 * slope + self._smear(12.0, 80.0)
+        floor = 222.0 - 9.0 * slope + self._smear(6.0, 50.0) + self._smear(2.5, 9.0)
+        floor -= 16.0 * np.clip((away / radius - 0.75) / 0.25, 0.0, 1.0) ** 2
+        cast = np.hypot(u - view.centre_px[0] - 5.0, v - view.centre_px[1] - 6.0).astype(np.float32) * np.float32(scale)
+        shade = 0.15 - 0.15 * np.tanh((cast - radius - 1.6e-3) / (10.0 * scale))  # of the wall on the table
+        table *= 1.0 - shade * (0.5 + 0.5 * np.tanh((away - radius - 1.1e-3) / (2.0 * scale)))
+        inside = 0.5 - 0.5 * np.tanh((away - radius - 0.25e-3) / (0.8 * scale))
+        light = table * (1.0 - inside) + floor * inside
+        for beyond, spread, depth in RIM_DEPTHS:
+            light -= depth * np.exp(-(((away - radius - beyond) / spread) ** 2))
+        light += 22.0 * np.exp(-(((away - radius - 0.6e-3) / 0.15e-3) ** 2))
+        image = np.asarray(light[:, :, None] * np.asarray(lighting.tint_bgr, dtype=np.float32), dtype=np.float32)
+        looks = self.scene.looks or [SILICONE] * len(self.scene.obstacles)
+        for obstacle, look in zip(self.scene.obstacles, looks, strict=True):
+            self._add_obstacle(image, obstacle, look)
+        self._add_glare(image)
+        self._add_dust(image)
+        return np.asarray(np.clip(image, 0.0, 258.0, out=image), dtype=np.float32)
+
+    def _smear(self, depth: float, size: float) -> Light:
+        """Return smooth random light of a given depth and feature size [px]."""
+        width, height = self.size
+        rough = self.random.standard_normal((height // 4 + 1, width // 4 + 1), dtype=np.float32)
+        smooth = cv2.GaussianBlur(rough, (0, 0), size / 4.0)
+        smooth *= np.float32(0.5 * depth) / np.float32(max(float(smooth.std()), 1e-9))
+        return np.asarray(cv2.resize(smooth, self.size, interpolation=cv2.INTER_CUBIC), dtype=np.float32)
+
+    def _add_obstacle(self, image: Light, obstacle: Obstacle, look: Look) -> None:
+        """Add a solid: a soft shadow, its top, a highlight on a disc."""
+        rings = [self.view.to_pixels(ring) for ring in still_outlines(obstacle)]
+        corners = np.vstack(rings)
+        box = box_around(corners, self.size, margin=24.0)
+        if box is None:
+            return
+        region = image[box]
+
+        def solid(of: Sequence[Points]) -> Light:
+            return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
+
+        shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
+        region *= 1.0 - 0.2 * shade[:, :, None]
+        top = solid(rings)
+        colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
+        region += top[:, :, None] * (colour - region)
+        if isinstance(obstacle, Disc):
+            radius = obstacle.radius / self.view.metres_per_pixel
+            small = self.view.to_pixels(np.asarray(obstacle.centre)) - 0.35 * radius
+            ring = small + 0.25 * radius * _circle(128)
+            shine = cv2.GaussianBlur(solid([ring]), (0, 0), 0.15 * radius + 0.5)
+            region += shine[:, :, None] * 40.0
+
+    def _surface(self, top: Light, look: Look) -> Light:
+        """Return the colour of a solid's top, rounded at its outline, shape (rows, columns, 3) or for all (3,)."""
+        colour = np.asarray(look.bgr, dtype=np.float32)
+        if not look.rounding:
+            return colour
+        reach = np.float32(look.rounding / self.view.metres_per_pixel)
+        inwards = cv2.distanceTransform((top > 0.5).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        level = np.minimum(inwards / reach, 1.0)
+        height = cv2.GaussianBlur(np.sqrt(level * (2.0 - level)).astype(np.float32), (0, 0), 0.25 * float(reach) + 0.5)
+        slope = np.stack(
+            [cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=0.125)]
+        )
+        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray(LAMP_PX, np.float32), slope, axes=1)
+        edge = np.asarray(look.edge_bgr, dtype=np.float32)
+        return np.asarray(edge + height[:, :, None] * (colour - edge) + lit[:, :, None], dtype=np.float32)
+
+    def _add_glare(self, image: Light) -> None:
+        """Add two arcs of the lamp's reflection along the wall, and small hot spots."""
+        radius = 0.5 * self.scene.dish_diameter / self.view.metres_per_pixel
+        centre = np.asarray(self.view.centre_px)
+        glare = np.zeros(image.shape[:2], np.float32)
+        for share, first, last, thickness in GLARE_ARCS:
+            angles = np.radians(np.arange(first, last, 0.5))
+            parts = (np.degrees(angles) - first) / (last - first)
+            sizes = np.maximum(np.rint(thickness * np.sin(np.pi * parts)), 1.0).astype(int) // 2
+            dots = centre + share * radius * np.column_stack([np.cos(angles), -np.sin(angles)])
+            box, arc, on_canvas = self._canvas(dots)
+            for dot, size in zip(on_canvas, sizes.tolist(), strict=True):
+                cv2.circle(arc, dot, size, 1.0, -1)
+            np.maximum(glare[box], cv2.GaussianBlur(arc, (0, 0), 2.2), out=glare[box])
+        for _ in range(3):
+            angle, share = self.random.uniform(0.0, 2.0 * np.pi), self.random.uniform(0.2, 0.75)
+            axes = (int(self.random.integers(2, 5)), int(self.random.integers(2, 4)))
+            box, spot, (at,) = self._canvas(centre + share * radius * np.array([[np.cos(angle), np.sin(angle)]]))
+            cv2.ellipse(spot, at, axes, 0.0, 0.0, 360.0, 1.0, -1)
+            np.maximum(glare[box], cv2.GaussianBlur(spot, (0, 0), 1.2), out=glare[box])
+        lit = glare > 0.0
+        image[lit] += self.lighting.glare * np.minimum(glare[lit], 1.0)[:, None] * (265.0 - image[lit])
+
+    def _add_dust(self, image: Light) -> None:
+        """Add faint specks and rings."""
+        width, height = self.size
+        for _ in range(14):
+            centre = [self.random.integers(0, width), self.random.integers(0, height)]
+            size, thickness = (3, 1) if self.random.random() < 0.3 else (1, -1)
+            depth = float(self.random.uniform(4.0, 16.0))
+            box, speck, (at,) = self._canvas(np.array([centre]))
+            cv2.circle(speck, at, size, 1.0, thickness)
+            image[box] -= depth * cv2.GaussianBlur(speck, (0, 0), 0.9)[:, :, None]
+
+    def _canvas(self, centres: Points) -> tuple[Box, Light, list[tuple[int, int]]]:
+        """Return the part of the image that something small and its blur may reach, and a canvas with its centres.
+
+        Args:
+            centres: of what is drawn, shape (m, 2) [px]; with a radius of 5 px at most, and a blur of 2.2.
+        """
+        margin, last = 24.0, np.array(self.size) - 1  # 5 px, and twice the 9 px that the blur reaches
+        left, top = np.clip(np.floor(centres.min(axis=0) - margin), 0.0, last).astype(int).tolist()
+        right, bottom = np.clip(np.ceil(centres.max(axis=0) + margin), 0.0, last).astype(int).tolist()
+        at = np.rint(centres).astype(int) - (left, top)
+        box = slice(top, bottom + 1), slice(left, right + 1)
+        return box, np.zeros((bottom + 1 - top, right + 1 - left), np.float32), [(x, y) for x, y in at.tolist()]
+
+
+def _circle(corners: int) -> Points:
+    """Return a unit circle as a polygon, shape (corners, 2)."""
+    angles = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def still_outlines(obstacle: Obstacle) -> list[Points]:
+    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m].
+
+    Raises:
+        ValueError: a mesh has no outline in the plane.
+    """
+    if isinstance(obstacle, Disc):
+        return [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
+    return obstacle.rings
+
+
+def box_around(points: Points, size: tuple[int, int], margin: float) -> Box | None:
+    """Return the rows and columns of an image that hold points, with a margin; None if none does.
+
+    Args:
+        points: shape (m, 2) [px].
+        size: width and height of the image [px].
+        margin: [px].
+    """
+    points = points[np.all(np.isfinite(points), axis=1)]
+    if not len(points):
+        return None
+    low = np.maximum(np.floor(points.min(axis=0) - margin), 0.0)
+    high = np.minimum(np.ceil(points.max(axis=0) + margin), size)
+    if np.any(high <= low):
+        return None
+    (left, top), (right, bottom) = low.astype(int), high.astype(int)
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+
+def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
+    """Return the share of each pixel in a box that a shape covers, shape (rows, columns).
+
+    Args:
+        box: rows and columns.
+        draw: called with a canvas and what turns pixels (u, v) into its coordinates, in sixteenths.
+    """
+    rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
+    canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
+
+    draw(canvas, lambda pixels: _on_canvas(pixels - (box[1].start, box[0].start)))
+    small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
+
+
+def line_covered(box: Box, line: Points, width_px: float) -> Light:
+    """Return the share of each pixel in a box that a line of a given width covers, shape (rows, columns).
+
+    Args:
+        box: rows and columns.
+        line: vertices, shape (m, 2) [px].
+        width_px: of the line; less than a quarter of a pixel is drawn as that and fainter.
+    """
+    rows, columns = box
+    result = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+    wide = max(1, round(width_px * OVERSAMPLING))
+    fainter = min(1.0, width_px * OVERSAMPLING / wide)
+    line = line - (columns.start, rows.start)
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    starts = np.searchsorted(length, np.arange(0.0, length[-1], TILE_PX), side="right") - 1
+    ends = np.append(starts[1:], len(line) - 1)
+    low = np.minimum(np.minimum.reduceat(line, starts), line[ends]) - (2.0 + width_px)
+    high = np.maximum(np.maximum.reduceat(line, starts), line[ends]) + (3.0 + width_px)
+    parts = np.clip(np.column_stack([low, high]), 0.0, [*result.shape[::-1]] * 2).astype(int).tolist()
+    at = _on_canvas(line)
+    for first, last, (left, top, right, bottom) in zip(starts, ends, parts, strict=True):
+        if left < right and top < bottom:
+            canvas = np.zeros(((bottom - top) * OVERSAMPLING, (right - left) * OVERSAMPLING), np.uint8)
+            piece = at[first : last + 1] - (left * OVERSAMPLING * 16, top * OVERSAMPLING * 16)
+            cv2.polylines(canvas, [piece], False, 255, wide, cv2.LINE_8, 4)
+            part = result[top:bottom, left:right]
+            small = cv2.resize(canvas, part.shape[::-1], interpolation=cv2.INTER_AREA)
+            np.maximum(part, small, out=part)
+    return np.asarray(result * np.float32(fainter / 255.0), dtype=np.float32)
+
+
+def _on_canvas(pixels: Points) -> NDArray[np.int32]:
+    """Return pixels (u, v) in the coordinates of a canvas that begins with (0, 0), in sixteenths."""
+    return np.asarray(np.round(((pixels + 0.5) * OVERSAMPLING - 0.5) * 16.0), dtype=np.int32)
+
+
+@compiled
+def lay(region: Light, share: Light, strength: float, bgr: tuple[float, float, float]) -> None:
+    """Cover a region with a colour by a share of each pixel, times a strength, where the share is not zero."""
+    scale = np.float32(strength)
+    b, g, r = np.float32(bgr[0]), np.float32(bgr[1]), np.float32(bgr[2])
+    for i in range(share.shape[0]):
+        for j in range(share.shape[1]):
+            if share[i, j] != 0.0:
+                part = scale * share[i, j]
+                region[i, j, 0] += part * (b - region[i, j, 0])
+                region[i, j, 1] += part * (g - region[i, j, 1])
+                region[i, j, 2] += part * (r - region[i, j, 2])
+
+
+@compiled
+def blurred(sparse: Light, kernel: Light, right: int, down: int) -> Light:
+    """Return the convolution of a mostly empty image with a kernel along rows and columns, zeros around it.
+
+    Args:
+        sparse: shape (rows, columns).
+        kernel: shape (k,); its first value is for the pixel `right` and `down` of one that is not zero.
+        right: see there.
+        down: the same.
+    """
+    rows, columns = sparse.shape
+    size = kernel.shape[0]
+    result = np.zeros_like(sparse)
+    line = np.zeros(columns, np.float32)
+    for i in range(rows):
+        low, high = columns, 0
+        for j in range(columns):
+            if sparse[i, j] != 0.0:
+                begin, end = max(j + right, 0), min(j + right + size, columns)
+                low, high = min(low, begin), max(high, end)
+                for n in range(begin, end):
+                    line[n] += sparse[i, j] * kernel[n - j - right]
+        if low < high:
+            spread = line[low:high]
+            for n in range(max(i + down, 0), min(i + down + size, rows)):
+                target, weight = result[n, low:high], kernel[n - i - down]
+                for j in range(spread.shape[0]):
+                    target[j] += weight * spread[j]
+            spread[:] = 0.0
+    return result

@@ -1,0 +1,57 @@
+"""The drivers without hardware: one that records, and one for the simulated rig."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.coils.drivers import RecordingDriver, SimulatedDriver, make_driver
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+
+
+def test_it_keeps_what_it_was_told_and_ends_with_zeros():
+    driver = make_driver(CoilBridgeSettings(), 4, lambda currents: None, lambda: 0)
+    assert isinstance(driver, RecordingDriver)
+    driver.open()
+    currents = np.array([1.0, 0.0, 0.5, 0.0])
+    driver.apply(currents, 0.0)
+    currents[0] = 9.0
+    driver.close()
+    assert [applied.tolist() for applied in driver.applied] == [[1.0, 0.0, 0.5, 0.0], [0.0] * 4]
+
+
+def test_it_refuses_what_a_real_driver_would():
+    driver = RecordingDriver(4)
+    driver.apply(np.ones(4), 0.0)
+    assert not driver.applied
+    driver.open()
+    with pytest.raises(ValueError, match="4 currents"):
+        driver.apply(np.zeros(3), 0.0)
+
+
+def test_it_sends_while_somebody_listens_and_ends_with_zeros():
+    sent: list[list[float]] = []
+    listeners = [1]
+    driver = SimulatedDriver(4, lambda currents: sent.append(currents.tolist()), lambda: listeners[0])
+    driver.apply(np.ones(4), 0.0)
+    assert not driver.state().ready
+    driver.open()
+    assert driver.state().ready
+    driver.apply(np.ones(4), 0.0)
+    driver.close()
+    driver.apply(np.ones(4), 0.0)
+    assert sent == [[1.0] * 4, [0.0] * 4]
+
+
+def test_without_anybody_there_it_is_not_ready_and_each_loss_counts():
+    listeners = [0]
+    driver = SimulatedDriver(4, lambda currents: None, lambda: listeners[0])
+    driver.open()
+    assert (driver.state().ready, driver.state().problem) == (False, "no rig_simulator subscribed")
+    assert driver.state().losses == 0
+    for number in (1, 2):
+        listeners[0] = 1
+        assert driver.state().ready
+        listeners[0] = 0
+        driver.apply(np.ones(4), 0.0)
+        assert driver.state().losses == number

@@ -1,0 +1,52 @@
+"""The simulated camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
+
+THREAD = np.array([[0.0, 0.0], [-0.005, 0.001], [-0.01, 0.0]])
+
+
+def render(seed: int, scene: CameraScene | None = None, tail: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    """Return one frame."""
+    camera = DishCamera(scene or CameraScene(), DishView((322.0, 238.0), 8e-5), seed=seed)
+    return camera.render(np.asarray(tail), 0.5, THREAD + tail)
+
+
+def test_the_same_seed_gives_the_same_frame():
+    assert (render(1) == render(1)).all()
+    assert (render(1) != render(2)).any()
+
+
+def test_frames_have_the_light_of_a_dish_under_a_lamp():
+    frame = render(3).astype(float)
+    assert frame.shape == (480, 640, 3)
+    assert 205 < np.median(frame[150:330, 220:420]) < 240  # floor
+    assert 140 < np.median(frame[:20, :20]) < 210  # table
+    rim = frame[238, 100:108].mean(axis=1)  # across the inner of the two rims
+    assert rim.min() < 110
+    assert frame[230:250, 335:360].min() < 80  # needle
+
+
+def test_the_sensor_has_noise():
+    camera = DishCamera(CameraScene(), DishView((322.0, 238.0), 8e-5))
+    first = camera.render(np.array([0.0, 0.0]), 0.5, THREAD).astype(float)
+    second = camera.render(np.array([0.0, 0.0]), 0.5, THREAD).astype(float)
+    noise = (first - second)[150:200, 250:300].std() / np.sqrt(2.0)
+    assert 1.0 < noise < 4.0
+
+
+def test_a_needle_partly_or_wholly_out_of_the_image_is_drawn_without_an_error():
+    for tail in ((0.024, 0.0), (0.0, 0.02), (-0.03, -0.03), (1.0, 1.0)):
+        assert render(4, tail=tail).shape == (480, 640, 3)
+
+
+def test_jpeg_there_and_back():
+    frame = render(5)
+    decoded = cv2.imdecode(encode_jpeg(frame, 95), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert np.abs(decoded.astype(float) - frame).mean() < 3.0
