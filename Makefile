@@ -1,5 +1,7 @@
 # make demo   play the example bag through the live graph
-# make test   run all tests
+# make test   run the tests, but for those that take long
+# make test-all  run all tests: browsers, tutorials, attacks and campaigns too
+# make kernels  compile what nodes would compile when they first start
 # make coverage  measure which lines of the core packages their tests run
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
@@ -26,7 +28,7 @@ INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip 
 # Every node is a process that imports most of the packages: without their bytecode that takes it thrice as long.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage lint docs colcon peers clean help
+.PHONY: demo test test-all kernels coverage lint docs colcon peers clean help
 .PHONY: .packages .messages
 
 demo: $(READY)
@@ -34,8 +36,14 @@ demo: $(READY)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
 test: $(READY)
-	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph"
-	$(RUN)/python -m pytest -m whole_graph $(GRAPHS)
+	$(RUN)/python -m pytest --numprocesses=2 --dist=worksteal -m "not whole_graph and not slow"
+	$(RUN)/python -m pytest -m "whole_graph and not slow" $(GRAPHS)
+
+test-all: test
+	$(RUN)/python -m pytest -m slow test
+
+kernels: $(READY)
+	$(RUN)/magnetosuture compile
 
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
 coverage: $(READY)

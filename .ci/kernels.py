@@ -13,15 +13,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from magnetosuture_thread.cli.commands.compile_kernels import kernel_steps
 from magnetosuture_thread.compiled import PACKAGE
-from magnetosuture_thread.forecast import make_forecaster
-from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.warm_up import warm_up
 
 ROOT = Path(__file__).resolve().parent.parent
-SETUP = "petri_35mm_polyamide_post"
 # Tests with kernels that no setup has: in space and of PyElastica, which share hardly any with the setups, ...
 IN_SPACE = (
     "test/benchmarks/test_solver.py::test_simulators_follow_the_rod",
@@ -41,11 +36,8 @@ def compile_kernels() -> None:
     """Compile what rig, thread model, estimator, tracker and forecast run, and what else tests do."""
     pytest = [sys.executable, "-m", "pytest", "-q"]
     with subprocess.Popen([*pytest, *IN_SPACE], cwd=ROOT) as in_space:
-        setup = read_setup(SETUP)
-        Rig(setup.rig, setup.scene).warm_up()
-        ThreadSession(setup.model, setup.scene)
-        warm_up()
-        make_forecaster(setup.model, setup.scene).warm_up()
+        for load in kernel_steps().values():
+            load()
         besides = subprocess.run([*pytest, *BESIDES], cwd=ROOT, check=False)
     if in_space.returncode or besides.returncode:
         sys.exit("a test failed whose kernels were to be compiled")

@@ -27,7 +27,6 @@ copyright = author
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "commits_of_tables",
     "generated_reference",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",

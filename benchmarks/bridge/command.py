@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 SETUP = "petri_35mm_polyamide"
 BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
 MOVING = 0.3  # s for which the coils must be driven before something is killed
-ATTEMPTS = 7  # to arm
-HEARD = 10.0  # s for a process to start and to be heard
+ATTEMPTS = 12  # to arm, each of up to 10 s
+RESTART_AFTER = 6  # attempts; on a busy machine a bridge takes a minute to start
+START_TIMEOUT = 60.0  # s for processes to start and to be heard, on a busy machine
+REARM_AFTER = 10.0  # s without current, after which the bridge is armed again
 TIMEOUT = 30.0  # s for anything to happen
 KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
 FULL = 32767  # duty of the full supply
@@ -125,7 +127,7 @@ class BridgeBench:
             stops = [float(line) for line in log.read_text().split("\n")[:-1]]  # the last line may be half written
             if self._driven():
                 last = time.monotonic()
-            elif time.monotonic() - last > HEARD:
+            elif time.monotonic() - last > REARM_AFTER:
                 self.arm()  # a machine that stands still for longer than a board's answer may take is a fault
             delays = self.watch.to_zero(stops)
             self._progress(len(delays) / trials)
@@ -175,9 +177,9 @@ class BridgeBench:
 
     def drive(self) -> None:
         """Wait until the coils have been driven for a while, and start all anew where they are not."""
-        for _ in range(ATTEMPTS):
+        for _ in range(3):
             try:
-                self.wait(self._driven_for_a_while, "the coils to be driven", HEARD)
+                self.wait(self._driven_for_a_while, "the coils to be driven", START_TIMEOUT)
                 return
             except GraphError:
                 # A killed process may leave Fast DDS's shared memory such that no later one is heard.
@@ -201,7 +203,7 @@ class BridgeBench:
                 self._nodes.check()
                 if attempt == ATTEMPTS - 1:
                     raise GraphError(f"the bridge cannot be armed: {error}") from None
-                if attempt % 2:
+                if attempt == RESTART_AFTER - 1:
                     self.restarts += 1
                     self._nodes.kill("coil_bridge")
                     self._nodes.start("coil_bridge")
@@ -244,7 +246,7 @@ def measure_bridge(
         hostile: messages.
         log: called with a line for a person at each stage.
         progress: called with the share of a stage done, 0 to 1.
-        busy: whether to keep all cores busy meanwhile.
+        busy: whether to keep all cores busy meanwhile; else boards have more time for an answer.
 
     Returns:
         The figures: `delays` as of `ZeroDelays`; `loop`, by how much an interval of the loop differs from its period
@@ -275,6 +277,8 @@ def measure_bridge(
         alone = {"without_prediction": "slow", "speed_without_prediction": settings.max_speed, "pose_uncertainty": 0.01}
         boards = {"roboclaw_ports": ports, "roboclaw_addresses": [board.address for board in stage.boards]}
         parameters = {"driver": "roboclaw", **boards, "coil_resistance": RESISTANCE, **alone}
+        if not busy:  # a test, on a machine that others may keep busy
+            parameters["roboclaw_answer_timeout"] = 0.5
         file = folder / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
         arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]

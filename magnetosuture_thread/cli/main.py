@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
 from magnetosuture_thread.cli.arguments import EXIT_CODES, FAILED, WRONG_USE, check_outputs
-from magnetosuture_thread.cli.commands import bag, calibrate, campaign, evaluate, run_graph, scene
+from magnetosuture_thread.cli.commands import bag, calibrate, campaign, compile_kernels, evaluate, run_graph, scene
 from magnetosuture_thread.cli.terminal import make_console
 from magnetosuture_thread.errors import missing_module
 
@@ -20,7 +20,7 @@ MOVED = {  # commands of before, and what is written instead
     "hernia": "`magnetosuture reproduce hernia`",
     "behaviour": "`magnetosuture reproduce thread-behavior`",
 }
-COMMANDS = (run_graph, evaluate, calibrate, campaign, scene, bag)  # in the order of --help
+COMMANDS = (run_graph, evaluate, calibrate, campaign, scene, bag, compile_kernels)  # in the order of --help
 
 DESCRIPTION = """\
 Predicts where a suture thread goes behind a magnetically steered needle.

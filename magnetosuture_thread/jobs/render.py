@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread import Attachment, ConfigurationError, Disc, interface
 from magnetosuture_thread.bags.writer import BagWriter
@@ -110,34 +109,28 @@ def render_bag(
 
 
 def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
-    """Refuse a setup that says another thread, attachment or obstacle than the trajectory has."""
-    metadata = reference.metadata
+    """Refuse a setup with another thread, attachment or obstacle than the trajectory's.
+
+    Lengths that differ by less than a nanometre are the same. No trajectory has polygons, and the simulated camera does
+    not draw them.
+    """
+    metadata, model, obstacles = reference.metadata, setup.model, setup.scene.obstacles
     attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}.get(str(metadata.get("boundary")))
     length = metadata.get("material", {}).get("L_m")
-    for name, given, expected in (
-        ("thread_model.thread_length", setup.model.thread_length, length),
-        ("thread_model.attachment", setup.model.attachment, attachment.value if attachment else None),
-        ("scene", setup.scene.obstacles, reference.discs),
-    ):
-        if expected is not None and not _same(given, expected):
-            raise ConfigurationError(name, given, f"{expected}, as in {reference.name}", str(setup.path))
-
-
-def _same(given: object, expected: object) -> bool:
-    """Return whether two settings are the same; lengths that differ by less than a nanometre are."""
-    if isinstance(given, str) or isinstance(expected, str):
-        return given == expected
-    if isinstance(given, tuple) and not all(isinstance(obstacle, Disc) for obstacle in given):
-        return False  # no trajectory has polygons, and the simulated camera does not draw them
-    return _numbers(given).shape == _numbers(expected).shape and np.allclose(
-        _numbers(given), _numbers(expected), rtol=0.0, atol=1e-9
+    given, expected = (
+        np.array([(*d.centre, d.radius) for d in discs if isinstance(d, Disc)])
+        for discs in (obstacles, reference.discs)
     )
-
-
-def _numbers(value: Any) -> NDArray[np.float64]:
-    if isinstance(value, tuple):
-        return np.array([(*disc.centre, disc.radius) for disc in value], dtype=np.float64)
-    return np.asarray(value, dtype=np.float64)
+    same = len(given) == len(obstacles) == len(expected) and np.allclose(given, expected, rtol=0.0, atol=1e-9)
+    problems: dict[str, tuple[object, object]] = {}
+    if length is not None and not math.isclose(model.thread_length, length, rel_tol=0.0, abs_tol=1e-9):
+        problems["thread_model.thread_length"] = model.thread_length, length
+    if attachment is not None and model.attachment != attachment.value:
+        problems["thread_model.attachment"] = model.attachment, attachment.value
+    if not same:
+        problems["scene"] = obstacles, reference.discs
+    for name, (found, wanted) in problems.items():
+        raise ConfigurationError(name, found, f"{wanted}, as in {reference.name}", str(setup.path))
 
 
 class _FrameTopics:

@@ -164,17 +164,16 @@ def _setup_of(recording: Recording, name: str, folder: Path, scene: Scene | None
     Raises:
         ConfigurationError: it cannot be used; of the bag's own, the message says to name another.
     """
-    notes = recording.notes
-    named = notes.get("setup", "")
+    named, text = recording.notes.get("setup", ""), recording.notes.get(SETUP_NOTE, "")
     if name:
         if named and name != named:
             log(f"the bag names the setup {named}; taking {name}")
         return read_setup(name, scene)
-    if notes.get(SETUP_NOTE) or named:
+    if text or named:
         try:
-            return setup_of_notes(notes, folder, scene)
+            return setup_of_notes(recording.notes, folder, scene)
         except ConfigurationError as error:
-            if not notes.get(SETUP_NOTE):
+            if not text:
                 raise
             # Its lines may be of another version of this package, which had dish and obstacles in every section.
             expected = "what this version knows; name a setup by --setup"

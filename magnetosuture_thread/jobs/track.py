@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -65,8 +64,8 @@ class FrameSource:
 
     Attributes:
         count: number of frames.
-        names: of picture files, each there once: the file's name alone, with as many of its folders as tell it
-            apart from others of that name, and numbered where a file is given twice; empty for a bag.
+        names: of picture files; with their folders where two have the same name, and numbered where a file is given
+            twice; empty for a bag.
         is_sequence: whether the frames follow one another in time, as in a bag.
         notes: what a bag's writer says of it.
         doubts: on a bag, a line each: what is damaged, or why damage may not have been noticed.
@@ -92,7 +91,9 @@ class FrameSource:
         self.is_sequence = self._recording is not None
         if remap and self._recording is None:
             raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
-        self.names = _names(self._files)
+        names = [file.name for file in self._files]
+        unique = len(set(names)) == len(names)
+        self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
         recording = self._recording
         self.count = recording.counts[self._channel.recorded] if recording is not None else len(self._files)
 
@@ -213,19 +214,6 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
     return given
 
 
-def _names(files: Sequence[Path]) -> list[str]:
-    """Return a name for each file; see `FrameSource.names`."""
-    parts = [Path(os.path.abspath(file)).parts for file in files]
-    names: dict[tuple[str, ...], str] = {}
-    unnamed, count = set(parts), 1
-    while unnamed:
-        uses = Counter(own[-count:] for own in unnamed)
-        told = {own for own in unnamed if uses[own[-count:]] == 1}
-        names |= {own: str(Path(*own[-count:])) for own in told}
-        unnamed, count = unnamed - told, count + 1
-    return numbered([names[own] for own in parts], "{} ({})")
-
-
 def _stamp(record: RecordedMessage) -> float:
     """Return when a frame was taken [s]; when it was recorded, where it is broken."""
     try:
@@ -339,7 +327,7 @@ def track(
     warm_up()
     results = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
-    files = numbered([Path(name.replace("/", "_")).stem for name in source.names], "{}_{}")
+    files = numbered([Path(name).stem for name in source.names], "{}_{}")
     with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
         for index, frame in enumerate(source):
             own = lens or source.lens

@@ -28,9 +28,9 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameter_files import node_options
 from magnetosuture_thread.nodes.parameters import declare
-from magnetosuture_thread.nodes.player import Timeline
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
+from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.rig.camera import DishCamera, encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame

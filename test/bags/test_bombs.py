@@ -32,6 +32,7 @@ for index, path in enumerate(sys.argv[1:]):
 """
 
 
+@pytest.mark.slow
 def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
     """The first bag is a sound one: what is imported for it is not the others' time."""
     paths = [str(metadata_bomb(tmp_path / "sound", ""))]

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from magnetosuture_thread.bags import message_types
 from magnetosuture_thread.bags.conversion import TransformTree
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
@@ -125,28 +126,9 @@ POINTS = [(0.0, 0.0, 0.0), (1.0, 0.5, 0.0), (2.0, 0.0, 0.25)]
 
 
 def marker(kind: int = 4, action: int = 0) -> Any:
-    fields = {
-        "header": stamped(1),
-        "ns": "",
-        "id": 0,
-        "type": kind,
-        "action": action,
-        "pose": pose(0.0, 0.0, 0.0),
-        "scale": make("geometry_msgs/msg/Vector3", 1.0, 1.0, 1.0),
-        "color": make("std_msgs/msg/ColorRGBA", 1.0, 1.0, 1.0, 1.0),
-        "lifetime": make("builtin_interfaces/msg/Duration", 0, 0),
-        "frame_locked": False,
-        "points": [make(POINT, *xyz) for xyz in POINTS],
-        "colors": [],
-        "texture_resource": "",
-        "texture": make(COMPRESSED_IMAGE.type_name, stamped(1), "", np.zeros(0, dtype=np.uint8)),
-        "uv_coordinates": [],
-        "text": "",
-        "mesh_resource": "",
-        "mesh_file": make("visualization_msgs/msg/MeshFile", "", np.zeros(0, dtype=np.uint8)),
-        "mesh_use_embedded_materials": False,
-    }
-    return typestore().types["visualization_msgs/msg/Marker"](**fields)
+    points = [make(POINT, *xyz) for xyz in POINTS]
+    fields = {"header": stamped(1), "type": kind, "action": action, "pose": pose(0.0, 0.0, 0.0), "points": points}
+    return message_types.make("visualization_msgs/msg/Marker", **fields)
 
 
 @pytest.mark.parametrize("channel", [MEASURED_THREAD, GROUND_TRUTH_THREAD])
@@ -181,15 +163,6 @@ def test_a_marker_that_is_no_line_is_refused_and_counted(tmp_path: Path):
     recording = Recording(bag)
     assert len(list(recording.records([MEASURED_THREAD]))) == 1
     assert recording.refused == {"/thread/measured: a marker that is no line strip being added": 2}
-
-
-def test_a_command_without_a_stamp_is_stamped_when_it_was_recorded(tmp_path: Path):
-    linear = make("geometry_msgs/msg/Vector3", 1.0, 2.0, 0.0)
-    twist = make("geometry_msgs/msg/Twist", linear, make("geometry_msgs/msg/Vector3", 0.0, 0.0, 3.0))
-    bag = bag_of(tmp_path, ("/cmd_vel", twist), remap={"/cmd_vel": NEEDLE_COMMAND.recorded})
-    found = only(Recording(bag), NEEDLE_COMMAND)
-    assert (found.header.stamp.sec, found.header.frame_id) == (1, "dish")
-    assert (found.twist.linear.y, found.twist.angular.z) == (2.0, 3.0)
 
 
 def test_what_is_ours_is_passed_on_byte_for_byte(tmp_path: Path):

@@ -6,6 +6,8 @@ import pytest
 
 from benchmarks.bridge.command import ZeroDelays, bridge_table, measure_bridge
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.whole_graph
 def test_whatever_falls_silent_or_is_killed_the_boards_go_to_zero_and_work_again():

@@ -13,6 +13,8 @@ from rich.console import Console
 from benchmarks.network.cable import Cable
 from benchmarks.network.command import CutReport, network_table
 
+pytestmark = pytest.mark.slow
+
 
 class PluggedCable:
     """A cable between two sockets, each frame a packet, in a thread of its own."""

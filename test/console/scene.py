@@ -4,44 +4,40 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import math
 import time
 from typing import Any
 
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.polyline import points_at
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 
 VIEW = DishView((322.0, 238.0), 8e-5)
 NODES = 40
-BLOCKS = [  # tissue on both sides of the ring
-    [(-0.0135, -0.0045), (-0.0075, -0.0045), (-0.0075, 0.0045), (-0.0135, 0.0045)],
-    [(0.0075, -0.0045), (0.0135, -0.0045), (0.0135, 0.0045), (0.0075, 0.0045)],
-]
+REST = {"commanded": [0.0, 0.0], "filtered": [0.0, 0.0], "applied": [0.0, 0.0]}
 RING = 0.006
-TURN = 2.45  # of the thread around the ring [rad]
-LEAVES = -1.0  # where it comes to the ring [rad]
+# Tissue on both sides of the ring: from left, bottom to right, top [m].
+BLOCKS = {"left": (-0.0135, -0.0045, -0.0075, 0.0045), "right": (0.0075, -0.0045, 0.0135, 0.0045)}
 
 
 def thread(points: int = NODES, wander: float = 0.0) -> np.ndarray:
     """Return a thread that lies around the ring and runs on to its free end, from the tail on [m]."""
-    radius = RING + 0.00045
-    angles = np.linspace(LEAVES + TURN, LEAVES, 60)
-    wrapped = radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    first, last = wrapped[0], wrapped[-1]
-    ahead = np.array([-math.sin(angles[0]), math.cos(angles[0])])
-    behind = np.array([math.sin(angles[-1]), -math.cos(angles[-1])])
-    out = first + np.linspace(0.0022, 0.0, 12)[:, None] * ahead
+    angles = np.linspace(1.45, -1.0, 60)
+    wrapped = (RING + 0.00045) * np.column_stack([np.cos(angles), np.sin(angles)])
+    ahead, behind = np.array([-np.sin(1.45), np.cos(1.45)]), np.array([np.sin(-1.0), -np.cos(-1.0)])
+    out = wrapped[0] + np.linspace(0.0022, 0.0, 12)[:, None] * ahead
     along = np.linspace(0.0, 0.008, 40)[:, None]
-    free = last + along * behind + 40.0 * along**2 * np.array([-0.4, -0.6])
-    line = np.vstack([out[:-1], wrapped, free[1:]])
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at = np.linspace(0.0, lengths[-1], points)
-    result = np.column_stack([np.interp(at, lengths, line[:, axis]) for axis in range(2)])
+    free = wrapped[-1] + along * behind + 40.0 * along**2 * np.array([-0.4, -0.6])
+    result = resampled_points(np.vstack([out[:-1], wrapped, free[1:]]), points)
     result[:, 1] += wander * np.sin(np.linspace(0.0, 9.0, points))
     return result
+
+
+def resampled_points(line: np.ndarray, count: int) -> np.ndarray:
+    """Return equally spaced points of a line."""
+    return points_at(line, np.linspace(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).sum(), count))
 
 
 def heading() -> float:
@@ -53,25 +49,20 @@ def heading() -> float:
 @functools.cache
 def picture() -> bytes:
     """Return a frame of the scene as the bytes of a JPEG file."""
-    obstacles: list[Obstacle] = [Disc((0.0, 0.0), RING), *(Polygon(tuple(block)) for block in BLOCKS)]
-    camera = DishCamera(CameraScene(obstacles=obstacles), VIEW, seed=5)
+    camera = DishCamera(CameraScene(obstacles=[Disc((0.0, 0.0), RING)]), VIEW, seed=5)
     return encode_jpeg(camera.render(thread()[0], heading(), thread(200, 4e-5)), 90).tobytes()
 
 
 def clearances(line: np.ndarray) -> list[float]:
-    """Return the distance of each node from the ring and the blocks [m]."""
-    from_ring = np.linalg.norm(line, axis=1) - RING
-    from_blocks = [
-        np.linalg.norm(np.maximum(np.maximum(np.min(block, axis=0) - line, line - np.max(block, axis=0)), 0.0), axis=1)
-        for block in np.array(BLOCKS)
-    ]
-    return np.minimum(from_ring, np.min(from_blocks, axis=0)).tolist()
+    """Return the distance of each node from the ring [m]."""
+    return (np.linalg.norm(line, axis=1) - RING).tolist()
 
 
-def block(name: str, corners: list[tuple[float, float]]) -> dict[str, Any]:
+def block(name: str) -> dict[str, Any]:
     """Return a block of tissue as the page gets it."""
-    label = np.mean(corners, axis=0).tolist()
-    outline = [list(corner) for corner in corners]
+    left, bottom, right, top = BLOCKS[name]
+    outline = [[left, bottom], [right, bottom], [right, top], [left, top]]
+    label = [(left + right) / 2.0, (bottom + top) / 2.0]
     return {"name": name, "kind": "tissue", "label": label, "outline": outline, "holes": []}
 
 
@@ -116,36 +107,25 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "dish_depth": 0.003,
             "shapes": [
                 {"name": "ring", "kind": "instrument", "label": [0.0, 0.0], "disc": [0.0, 0.0, RING]},
-                *(block(name, corners) for name, corners in zip(("left", "right"), BLOCKS, strict=True)),
+                *map(block, BLOCKS),
             ],
         },
         "filter": {
+            **REST,
             "source": "operator",
-            "commanded": [0.0, 0.0],
-            "filtered": [0.0, 0.0],
-            "applied": [0.0, 0.0],
             "slowdown": factor,
             "active": [],
-            "overridden": "",
-            "reason": "",
-            "age": 0.01,
+            **{"overridden": "", "reason": "", "age": 0.01},
         },
         "bridge": {
             "state": "active",
             "armed": True,
             "emergency_stopped": False,
             "reasons": [],
-            "commanded": [0.0, 0.0],
-            "filtered": [0.0, 0.0],
-            "applied": [0.0, 0.0],
+            **REST,
             "saturated": False,
-            "driver": "simulated",
-            "driver_ready": True,
-            "driver_warnings": [],
-            "current": [0.0] * 4,
-            "measured_current": [0.0] * 4,
-            "refused": 0,
-            "age": 0.01,
+            **{"driver": "simulated", "driver_ready": True, "driver_warnings": []},
+            **{"current": [0.0] * 4, "measured_current": [0.0] * 4, "refused": 0, "age": 0.01},
         },
         "nodes": {
             "vision_tracker": {"level": "ok", "message": "needle tracked", "values": {}, "age": 0.4},

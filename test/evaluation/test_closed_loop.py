@@ -82,14 +82,6 @@ def test_a_pose_far_from_the_truth_is_counted_as_wrong(x: float, angle: float, w
     assert loop.collector.summary("x").wrong == wrong
 
 
-def test_a_turn_over_half_a_circle_is_the_short_way_round():
-    loop = Loop()
-    loop.truth(10**9, angle=math.pi - 0.01)
-    loop.wish(10**9, LENGTH)
-    loop.pose(10**9, angle=-math.pi + 0.01)
-    assert loop.collector.summary("x").heading_error == pytest.approx(0.02)
-
-
 def test_only_the_time_of_steering_counts():
     loop = Loop()
     for index in range(10):

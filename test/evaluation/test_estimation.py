@@ -20,7 +20,7 @@ from magnetosuture_thread.evaluation.estimation import (
     hidden_part,
     mean_band,
 )
-from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, TimeSeries
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -92,17 +92,6 @@ def test_innovations_larger_than_expected_are_not():
     assert (found.means > found.high).all()
 
 
-def test_a_time_without_measurement_is_no_window():
-    squared = np.ones((200, 16))
-    squared[60:140] = np.nan
-    found = consistency_of(squared)
-    assert (found.windows, len(found.means)) == (4, 4)
-    squared[40:150] = np.nan
-    found = consistency_of(squared)
-    assert (found.windows, len(found.means)) == (2, 4)
-    assert found.share == 1.0
-
-
 def test_hidden_is_what_no_piece_shows():
     estimate = EstimatedThread(NODES, True)
     whole = ThreadObservation((piece(0.0, 0.9, PieceEnd.TAIL),), complete=True)
@@ -131,15 +120,6 @@ def test_hidden_shares_are_of_time_and_not_of_frames():
     assert found.time == pytest.approx(0.75, abs=0.02)
     assert found.all_time == pytest.approx(0.25, abs=0.02)
     assert found.length == pytest.approx(0.5, abs=0.02)
-
-
-def test_a_gap_does_not_count_for_the_frame_before_it():
-    series = TimeSeries(["hidden", "corrected"])
-    for time in (0.0, 0.1, 0.2, 9.0, 9.1):
-        series.add(time, {"hidden": 1.0 if time == 0.2 else 0.0, "corrected": 1.0})
-    found = HiddenShares.of(series)
-    assert found is not None
-    assert found.time == pytest.approx(0.2)
 
 
 def test_disturbances_of_one_beginning_are_one_event():

@@ -142,13 +142,6 @@ def test_the_last_estimate_of_a_frame_is_compared_beside_the_prediction():
     assert [event.begin_s for event in estimation.disturbances] == pytest.approx([-0.1, 0.9])
 
 
-def test_a_command_counts_as_driven_only_if_it_was_followed():
-    collector = GraphCollector(length=1.0)
-    collector.add("/coils/currents", Message(header=header(7), command=header(5).stamp, stop=""))
-    collector.add("/coils/currents", Message(header=header(8), command=header(6).stamp, stop="no command for 0.2 s"))
-    assert collector.applied == {5}
-
-
 def test_latencies_pair_stamps():
     published = {"camera/image_raw/compressed": {1: 0.0, 2: 1.0}, "needle/servo_cv": {1: 0.5}}
     arrived = {"needle/measured_cp": {1: 0.01, 2: 1.03}, "thread/predicted": {2: 1.04}, "coils/currents": {7: 0.1}}

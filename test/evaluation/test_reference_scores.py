@@ -11,16 +11,13 @@ import pytest
 
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.plots import draw_case
-from magnetosuture_thread.evaluation.reference import read_reference
 from magnetosuture_thread.evaluation.reference_scores import (
     CaseResult,
     Evaluation,
     find_references,
-    reference_thread,
     score,
 )
 from magnetosuture_thread.evaluation.tables import evaluation_table
-from magnetosuture_thread.model.thread import Attachment
 
 MATERIAL = {
     "kind": "polyamide USP 7-0 monofilament",
@@ -97,16 +94,6 @@ def test_the_mapping_is_what_was_promised(tmp_path: Path):
         "step_p99_s",
     } <= set(mapping["cases"][0])
     assert (mapping["formulation"], mapping["solver"]) == ("paper", "banded")
-
-
-def test_the_thread_is_the_one_in_the_file(tmp_path: Path):
-    path = write(tmp_path, "clamped", boundary="clamped")
-    thread, _ = reference_thread(read_reference(path), path)
-    assert (thread.length, thread.segments, thread.diameter) == (0.019, 25, 6e-5)
-    assert thread.attachment is Attachment.CLAMPED
-    assert thread.bending_stiffness == 1.27e-9
-    assert (thread.medium.drag_across, thread.medium.drag_along) == (0.974, 0.487)
-    assert reference_thread(read_reference(path), path, 40)[0].segments == 40
 
 
 @pytest.mark.parametrize(

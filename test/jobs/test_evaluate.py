@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import struct
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.frames import WorstFrame
@@ -22,17 +20,13 @@ from magnetosuture_thread.evaluation.plots import ReportPicture, draw_worst_fram
 from magnetosuture_thread.evaluation.tables import TIMES, Row
 from magnetosuture_thread.geometry.obstacles import Disc as ObstacleDisc
 from magnetosuture_thread.interface import (
-    CURRENTS,
-    MEASURED_THREAD,
     NEEDLE_POSE,
     PREDICTED_THREAD,
     SCENE,
-    THREAD_OBSERVATION,
     Channel,
 )
 from magnetosuture_thread.jobs import evaluate_bag as job
 from magnetosuture_thread.jobs.evaluate import evaluate_bags, find_bags, kind_of
-from magnetosuture_thread.jobs.evaluate_bag import RecordedPredictions
 from magnetosuture_thread.jobs.replay_offline import replay_offline
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -66,17 +60,6 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     assert "28 of 30" in page
     assert page.count("data:image/jpeg;base64,") == 1
     assert "Simulated camera frame at" in page
-
-
-def test_the_silence_of_the_camera_is_in_row_and_page(tmp_path: Path, short_bag: Path):
-    (whole,) = evaluate_bags([short_bag], tmp_path / "whole")
-    assert (whole["silences"], whole["silent_s"]) == (0, 0.0)
-    begin = Bag(short_bag).start + 3 * 10**8
-    (row,) = evaluate_bags([copied(short_bag, tmp_path / "b", [], silent=(begin, begin + 5 * 10**8))], tmp_path / "out")
-    assert row["silences"] == 1
-    assert 0.45 < float(str(row["silent_s"])) < 0.65
-    assert row["max_silence_s"] == row["silent_s"]
-    assert "in 1 gap" in (tmp_path / "out" / "b.html").read_text()
 
 
 def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
@@ -132,15 +115,6 @@ def test_a_wrong_set_up_is_said_at_once(tmp_path: Path, short_bag: Path):
     with pytest.raises(BagError, match="exists already"):
         evaluate_bags([short_bag], tmp_path)
     assert not (tmp_path / "out").exists()
-
-
-def test_an_interruption_leaves_nothing(tmp_path: Path, short_bag: Path):
-    def interrupt(share: float) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        evaluate_bags([short_bag], tmp_path / "out", progress=interrupt)
-    assert list(tmp_path.iterdir()) == []
 
 
 def touched(*paths: Path) -> None:
@@ -239,35 +213,6 @@ def test_a_picture_has_the_obstacles_that_were_in_force(
     assert [worst.frame.obstacles for worst in shown] == [(ObstacleDisc((0.0, 0.012), 0.002),)] * len(shown)
     assert shown
     assert "Simulated camera frame at" in (tmp_path / "out" / "changed.html").read_text()
-
-
-def test_broken_currents_cost_no_figure(tmp_path: Path, short_bag: Path):
-    bag = copied(short_bag, tmp_path / "b", [(CURRENTS, Bag(short_bag).start + 10**8, b"\0\1\0\0abc")])
-    (row,) = evaluate_bags([bag], tmp_path / "out", duration=0.4)
-    assert row["problem"] == ""
-
-
-def test_why_nothing_was_predicted_is_said(tmp_path: Path, short_bag: Path):
-    replay_offline(short_bag, tmp_path / "replay")
-    half = copied(tmp_path / "replay" / "bag", tmp_path / "a", [], leave=MEASURED_THREAD.recorded)
-    bag = copied(half, tmp_path / "b", [], leave=THREAD_OBSERVATION.recorded)
-    (row,) = evaluate_bags([bag], tmp_path / "out", source="poses")
-    assert str(row["problem"]).endswith("had a needle; waiting for the thread to be seen")
-
-
-def test_recorded_predictions_of_frames_that_nobody_asks_for_hide_none(monkeypatch: pytest.MonkeyPatch):
-    def record(stamp: int) -> RecordedMessage:
-        seconds, rest = divmod(stamp, 10**9)
-        return RecordedMessage("/thread/predicted", "", stamp, struct.pack("<4sIII", b"\0\1\0\0", seconds, rest, 0))
-
-    points = [SimpleNamespace(x=0.0, y=0.0), SimpleNamespace(x=1.0, y=0.0)]
-    monkeypatch.setattr(RecordedMessage, "decode", lambda self: SimpleNamespace(positions=points))
-    recording: Any = SimpleNamespace(
-        counts={PREDICTED_THREAD.recorded: 1}, records=lambda *a, **n: (record(k * 10**6) for k in range(2000))
-    )
-    predicted = RecordedPredictions(recording, 0.0, None)
-    assert predicted.of(5 * 10**6) is not None
-    assert predicted.of(1500 * 10**6) is not None
 
 
 def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):

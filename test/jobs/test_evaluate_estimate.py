@@ -73,11 +73,6 @@ def evaluated(bag: Path, folder: Path) -> tuple[dict[str, Any], str]:
     return row, (folder / f"{bag.name}.html").read_text()
 
 
-def mean_error(row: dict[str, Any], kind: str) -> float:
-    """Return the mean error against the ground truth."""
-    return float(row[kind]["error_ground_truth_mean_percent"])
-
-
 def test_a_whole_path_corrects_what_the_model_does_not_know(tmp_path: Path, pushed_bag: Path):
     row, page = evaluated(pushed_bag, tmp_path / "out")
     estimate, prediction = row["estimate"], row["prediction"]
@@ -115,32 +110,6 @@ def test_a_path_that_ends_early_is_a_part_and_hides_the_rest(tmp_path: Path, pus
     assert row["corrected_frames"] == FRAMES
     # A whole thread of 62 % of the length would be bent to fit into the part.
     assert row["estimate"]["error_ground_truth_max_percent"] < row["prediction"]["error_ground_truth_max_percent"]
-
-
-@pytest.mark.parametrize("share", [0.6, 0.9])
-def test_a_path_that_always_ends_early_is_never_all_of_the_thread(tmp_path: Path, pushed_bag: Path, share: float):
-    bag = with_paths(pushed_bag, tmp_path / "early", lambda k, points: points[: round(64 * share)])
-    row, _ = evaluated(bag, tmp_path / "out")
-    assert (row["hidden_time_share"], row["all_hidden_time_share"]) == (1.0, 0.0)
-    assert row["estimate"]["error_measured_mean_percent"] < 0.3
-    assert row["estimate"]["error_ground_truth_mean_percent"] < row["prediction"]["error_ground_truth_mean_percent"]
-
-
-def test_points_that_are_not_finite_are_left_out(tmp_path: Path, pushed_bag: Path):
-    def broken(number: int, points: np.ndarray) -> np.ndarray:
-        points = points.copy()
-        if number % 3 == 1:
-            points[20:25] = np.nan
-        if number % 3 == 2:
-            points[:] = np.inf
-        return points
-
-    row, _ = evaluated(with_paths(pushed_bag, tmp_path / "broken", broken), tmp_path / "out")
-    assert row["corrected_frames"] == 2 * FRAMES // 3
-    assert row["all_hidden_time_share"] == pytest.approx(1 / 3, abs=0.02)
-    assert (
-        row["estimate"]["error_ground_truth_mean_percent"] < 0.5 * row["prediction"]["error_ground_truth_mean_percent"]
-    )
 
 
 def test_without_a_measurement_the_estimate_is_the_prediction_and_says_so(
@@ -192,19 +161,6 @@ def piece(points: np.ndarray, first: int, last: int) -> ThreadPiece:
     return ThreadPiece(points[first:last], np.full(last - first, 1e-5), *ends, (start, start))
 
 
-def test_the_summary_of_a_replay_has_both_side_by_side(tmp_path: Path, pushed_bag: Path):
-    replay_offline(pushed_bag, tmp_path / "out")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert list(summary["prediction"]) == list(summary["estimate"]) == NAMES
-    assert summary["prediction"]["error_ground_truth_mean_percent"] == summary["error_truth"]["mean"]
-    assert summary["prediction"]["error_measured_max_percent"] == summary["error_seen"]["maximum"]
-    assert summary["estimate"]["error_ground_truth_mean_percent"] < 0.3 * summary["error_truth"]["mean"]
-    assert summary["hidden_time_share"] == 0.0
-    assert summary["consistency"]["windows"] == 1
-    assert summary["disturbances"][0]["significance"] > 0.0
-    assert summary["disturbances"][0]["begin_s"] >= 0.0
-
-
 def test_the_messages_of_a_replay_give_the_figures_of_its_summary(tmp_path: Path, pushed_bag: Path):
     """As a live replay is evaluated: by what was published."""
     summary = replay_offline(pushed_bag, tmp_path / "out")
@@ -222,14 +178,3 @@ def test_the_messages_of_a_replay_give_the_figures_of_its_summary(tmp_path: Path
     assert [event.arc_length_m for event in found.disturbances] == [
         event.arc_length_m for event in expected.disturbances
     ]
-
-
-def test_the_formulation_of_the_paper_is_not_estimated(tmp_path: Path, pushed_bag: Path):
-    (row,) = evaluate_bags([pushed_bag], tmp_path / "out", formulation="paper", duration=0.5)
-    estimate, prediction = row["estimate"], row["prediction"]
-    assert isinstance(estimate, dict)
-    assert isinstance(prediction, dict)
-    assert set(estimate.values()) == {None}
-    assert prediction["error_ground_truth_mean_percent"] > 0.0
-    assert row["hidden_time_share"] is None
-    assert 'id="plot-consistency"' not in (tmp_path / "out" / "pushed.html").read_text()

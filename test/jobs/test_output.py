@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -50,7 +51,9 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
 
 def test_rows_become_a_parquet_table(tmp_path: Path):
     parquet = pytest.importorskip("pyarrow.parquet")
-    rows = [{"bag": "a", "frames": 3, "error": 0.5, "problem": ""}, {"bag": "b", "frames": None, "error": None}]
-    rows[1]["problem"] = "is damaged"
+    rows: list[dict[str, Any]] = [
+        {"bag": "a", "frames": 3, "error": 0.5, "problem": ""},
+        {"bag": "b", "frames": None, "error": None, "problem": "is damaged"},
+    ]
     write_parquet(tmp_path / "table.parquet", rows)
     assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == rows

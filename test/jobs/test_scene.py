@@ -115,9 +115,3 @@ def test_wrong_use_ends_with_one_line_and_code_2(tmp_path: Path, capsys, argumen
     assert words in errors
     assert errors.count("\n") == 1
     assert list(tmp_path.iterdir()) == [bad]
-
-
-@pytest.mark.parametrize("arguments", [["draw", "hernia_ring"], ["check", "hernia_ring", "--needle-width", "nan"], []])
-def test_arguments_that_are_missing_or_wrong_are_refused(arguments: list[str]):
-    with pytest.raises(SystemExit, match="2"):
-        main(["scene", *arguments])

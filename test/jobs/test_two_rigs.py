@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from test.console.visitor import Page, opened
 from test.jobs.test_console import tail, wait
-from test.nodes.conftest import Graph
+from test.nodes.conftest import Graph, own_context
 
 pytestmark = pytest.mark.whole_graph
 
@@ -72,7 +73,7 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rigs]:
         for space in (LEFT, RIGHT):
             arguments = ("--params-file", str(setup), "-r", f"__ns:=/{space}", *REMAPPED[space])
             stack.enter_context(NodeProcesses(names, arguments, environment, folder / space))
-        graph = Graph(domain)
+        graph = Graph(stack.enter_context(own_context(domain)), domain)
         stack.callback(graph.close)
         currents = {space: graph.listen_later(within(space, topics.RIG_CURRENTS)) for space in (LEFT, RIGHT)}
         logs = {space: folder / space / "console.log" for space in (LEFT, RIGHT)}
@@ -89,6 +90,11 @@ async def ready(page: Page) -> None:
     own = {*ALL_NODES, "console"} - {PLANNER, "path_follower"}
     await wait(page, lambda: set(page.graph["nodes"]) == own, "the nodes of its rig")
     assert await page.ask(type="acquire_control") == ""
+
+
+def is_disarmed(page: Page) -> bool:
+    """Return whether a page shows its bridge disarmed."""
+    return not page.graph["bridge"]["armed"]
 
 
 async def jog(page: Page) -> None:
@@ -118,7 +124,7 @@ def test_commands_of_one_page_reach_its_own_rig_alone_also_on_a_remapped_topic(r
                 assert np.linalg.norm(tail(other) - still) < 5e-4  # it may still be drawn by its thread
                 await page.release()
                 assert await page.ask(type="bridge_action", action="disarm") == ""
-                await wait(page, lambda page=page: not page.graph["bridge"]["armed"], "the bridge to be disarmed")
+                await wait(page, partial(is_disarmed, page), "the bridge to be disarmed")
 
     asyncio.run(use())
     assert any(message.twist.linear.x == 0.003 for message in commands)

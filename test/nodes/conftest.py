@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import pytest
@@ -122,14 +122,21 @@ class Graph:
             self._failure = error
 
 
+@contextmanager
+def own_context(domain: int) -> Iterator[Context]:
+    """Return a context on a ROS domain, ended after it."""
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, args=[])
+    yield context
+    context.try_shutdown()
+
+
 @pytest.fixture(scope="module")
 def shared_context() -> Iterator[tuple[Context, int]]:
     """The context of a module's tests, on a ROS domain of its own."""
     with reserved_domain() as domain:
-        context = Context()
-        rclpy.init(context=context, domain_id=domain, args=[])
-        yield context, domain
-        context.try_shutdown()
+        with own_context(domain) as context:
+            yield context, domain
         assert is_empty(domain), "a node is still in the graph; who gets this domain next would meet it"
 
 

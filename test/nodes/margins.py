@@ -13,4 +13,4 @@ from magnetosuture_thread.messages.packing import packed_margins
 
 def no_margins(stamp: Time, reason: str) -> Any:
     """Return the message that says that there are none, and why."""
-    return deserialize_message(packed_margins((stamp.sec, stamp.nanosec), None, reason), SafetyMargins)
+    return deserialize_message(packed_margins(stamp, None, reason), SafetyMargins)

@@ -21,7 +21,7 @@ from magnetosuture_thread.nodes.perception import perception
 from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from test.nodes.conftest import Graph
+from test.nodes.conftest import Graph, own_context
 from test.nodes.test_run import heard as is_heard
 from test.nodes.test_vision_tracker import compressed
 
@@ -82,8 +82,8 @@ def frames(camera, thread_arc) -> list[np.ndarray]:
 def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
     said = []
     for alone in (True, False):
-        with reserved_domain() as domain:
-            graph = Graph(domain)
+        with reserved_domain() as domain, own_context(domain) as context:
+            graph = Graph(context, domain)
             try:
                 if alone:
                     tracker, model = graph.add(VisionTrackerNode, scene=SCENE), graph.add(ThreadModelNode, scene=SCENE)

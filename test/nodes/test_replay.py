@@ -16,8 +16,9 @@ from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
-from magnetosuture_thread.nodes import player, topics
-from magnetosuture_thread.nodes.player import LiveReplay, Losses, Timeline
+from magnetosuture_thread.nodes import player, timeline, topics
+from magnetosuture_thread.nodes.player import LiveReplay, Losses
+from magnetosuture_thread.nodes.timeline import Timeline
 from test.nodes import wire
 from test.nodes.margins import no_margins
 
@@ -33,7 +34,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     def on(duration: float) -> None:
         now[0] += duration
 
-    monkeypatch.setattr(player, "time", Clock)
+    monkeypatch.setattr(timeline, "time", Clock)
     return on
 
 

@@ -86,7 +86,7 @@ def colour_of(message: MarkerArray) -> tuple[float, float, float]:
 def place(graph, *geometries: Disc | Polygon) -> Scene:
     """Publish a scene with these shapes, for a node that is made next."""
     scene = scene_with(*geometries)
-    graph.said = graph.probe.create_publisher(SceneMessage, topics.SCENE.name, topics.LATCHED)
+    graph.said = graph.probe.create_publisher(SceneMessage, topics.SCENE.name, topics.SCENE.qos)
     graph.said.publish(wire.scene_message(graph.now(), scene))
     return scene
 

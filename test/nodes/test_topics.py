@@ -8,13 +8,15 @@ import pytest
 import yaml
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 
 
 def test_ros2_bag_gets_the_quality_of_service_of_topics_whose_last_message_is_kept():
     file = Path(__file__).parents[2] / "config" / "ros2_bag" / "qos.yaml"
-    every = {topic.channel.recorded: topic for topic in vars(topics).values() if isinstance(topic, topics.Topic)}
+    channels = [each for each in vars(interface).values() if isinstance(each, interface.Channel)]
+    every = {channel.recorded: topics.topic_of(channel) for channel in channels}
     assert yaml.safe_load(file.read_text()) == {
         name: {
             "history": topic.qos.history.short_key,
@@ -31,7 +33,7 @@ def test_ros2_bag_gets_the_quality_of_service_of_topics_whose_last_message_is_ke
 def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
     overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]
     for topic in (*topics.INPUTS, *topics.OUTPUTS):
-        if topic.qos is topics.LATCHED:
+        if topic.channel.quality is interface.Quality.LATCHED:
             assert topic.channel.recorded not in overrides
         else:
             for role in ("publisher", "subscription"):

@@ -21,7 +21,8 @@ def test_limit_pair_keeps_direction_and_maximum_norm(vector: tuple[float, float]
 
 
 def test_a_limited_change_reaches_the_target_in_the_fewest_steps():
-    value, values = (1.0, 1.0), []
+    value: tuple[float, float] = (1.0, 1.0)
+    values: list[tuple[float, float]] = []
     while value != (1.0, -1.0):
         x, y, _, _ = limit_velocity((1.0, -1.0), 1.0, math.inf, value, 0.5)
         value = (x, y)

@@ -14,7 +14,6 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
-from magnetosuture_thread.vision.dish.watch import see_dish
 from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -116,14 +115,6 @@ def test_a_larger_dish_with_a_faint_thread_is_tracked():
     assert share > 0.95
 
 
-def test_a_dish_of_another_size_than_the_scale_says_is_none():
-    frame = render(Pose(np.zeros(2), 0.3))
-    assert VisionTracker(VisionTrackerSettings(metres_per_pixel=8e-5), SCENE).look(frame).reason == ""
-    assert (
-        VisionTracker(VisionTrackerSettings(metres_per_pixel=9e-5), SCENE).look(frame).reason == "no dish in the image"
-    )
-
-
 def test_without_a_needle_it_says_lost():
     seen = TRACKER.look(render(Pose(np.array([0.5, 0.5]), 0.0)))
     assert (seen.state, seen.reason) == (State.LOST, "no needle in the dish")
@@ -209,15 +200,6 @@ def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str,
             followed += end != "tail" and line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[1] > 0.9
     assert end == "tail" or followed + lost == 8
     assert lost <= (end == "side" and gap == 0.0)  # as 1 of 240 others was
-
-
-def test_a_dark_frame_is_taken_for_a_negative_only_where_its_negative_shows_the_dish():
-    settings = VisionTrackerSettings(dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel)
-    frame = render(Pose(np.zeros(2), 0.3))
-    for image, negative in ((frame, False), (255 - frame, True), (np.full_like(frame, 40), False)):
-        found = see_dish(image, settings, 0.035)
-        assert found is not None
-        assert found.dark_field == negative
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])

@@ -15,7 +15,6 @@ from magnetosuture_thread.rig.camera import DishCamera, Look
 from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.look import Track
-from magnetosuture_thread.vision.overlay import draw_scene
 from magnetosuture_thread.vision.scene_mask import scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
@@ -134,13 +133,6 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
     inside = mask.solid[tuple(pixels.astype(int).T[::-1] // factor)] > 0
     assert (exact[inside] > 3e-4 / view.metres_per_pixel - 1.5).all()
     assert inside.sum() > 20
-
-
-def test_outlines_are_drawn_where_the_shapes_are():
-    image = np.zeros((480, 640, 3), np.uint8)
-    draw_scene(image, VIEW, read_scene("dish_35mm_post"))
-    u, v = np.round(VIEW.to_pixels(np.add(POST.centre, (POST.radius, 0.0)))).astype(int)
-    assert image[v - 1 : v + 2, u - 1 : u + 2].max() > 100
 
 
 def test_the_set_ups_camera_sees_the_needle_among_dark_tissue():

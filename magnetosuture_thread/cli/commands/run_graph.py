@@ -117,7 +117,7 @@ def run_replay(options: argparse.Namespace) -> int:
     DIR, which must not exist, gets
       bag/           all outputs of the graph, an mcap bag
       summary.json   the figures of the table
-      summary.png    a frame with the threads; errors, consistency and margins over time
+      summary.png    the frame with the greatest error: the dish and a close-up, with the threads
       logs/          what each node printed (live only)
     """
     for name in ("rate", "loop"):

@@ -208,7 +208,7 @@ def _never(data: bytes) -> None:
 
 
 class ConsoleServices:
-    """Clients of the coil bridge's services, and of those that pause time.
+    """Clients of the services of the coil bridge, of the needle planner, and of those that pause time.
 
     The clients are created at once, so that the emergency stop is discovered before it is needed.
 
@@ -219,68 +219,44 @@ class ConsoleServices:
     def __init__(self, node: Node) -> None:
         self._clients = {name: node.create_client(kind, name) for name, kind in SERVICES.items()}
         self._answers: dict[str, dict[int, Any]] = {name: {} for name in SERVICES}
-        self._turn = 0
+        self._action = 0  # number of the latest
 
     def ready(self, name: str) -> bool:
         """Return whether a service is available."""
         return bool(self._clients[name].service_is_ready())
 
-    async def execute_action(self, action: str) -> str:
-        """Execute one of `ACTIONS`; return an empty text, the reason of a refusal, or what is wrong all the same.
+    async def call(self, name: str, request: Any, *, is_action: bool = False) -> str:
+        """Call a service; return an empty text, the reason of a refusal, or what is wrong all the same.
 
-        The latest action has priority: one that still waits for its answer is cancelled.
+        A service may be called repeatedly, so that a lost answer blocks nothing; only a plan is requested once.
+
+        Args:
+            name: of the service.
+            request: to it.
+            is_action: whether it is one of `ACTIONS`, of which the latest cancels one that still waits for its answer.
         """
-        self._turn += 1
-        turn = self._turn
-        name, request = ACTIONS[action]
-        return await self._call(name, request, lambda: self._turn == turn)
-
-    async def set_paused(self, name: str, paused: bool) -> str:
-        """Pause or resume time by one of the services `PAUSE_REPLAY` and `PAUSE_RIG`."""
-        return await self._call(name, SetBool.Request(data=paused), lambda: True)
-
-    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
-        """Plan a procedure, or execute one of `PROCEDURE_ACTIONS`; return an empty text, or the reason of a refusal."""
-        if action == "plan":
-            request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
-            return await self._call(PLAN_PROCEDURE, request, lambda: True)
-        return await self._call(PROCEDURE_ACTIONS[action], Trigger.Request(), lambda: True)
-
-    async def _call(self, name: str, request: Any, is_current: Any) -> str:
-        client, answers = self._clients[name], self._answers[name]
+        self._action += is_action
+        action, client, answers = self._action, self._clients[name], self._answers[name]
         timeout, retry_period = (PLAN_TIMEOUT, math.inf) if name == PLAN_PROCEDURE else (TIMEOUT, RETRY_PERIOD)
         calls: list[int] = []
         deadline, retry_at = time.monotonic() + timeout, 0.0
         while (now := time.monotonic()) < deadline:
-            if not is_current():
+            if is_action and action != self._action:
                 return "cancelled by a later action"
-            if now >= retry_at and client.service_is_ready():
-                # The services may be called repeatedly: a lost answer blocks nothing.
-                with client.handle:
+            with client.handle:
+                if now >= retry_at and client.service_is_ready():
                     calls.append(client.handle.send_request(request))
-                retry_at = now + retry_period
+                    retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
-            self._collect(name)
-            for number in calls:
-                if number in answers:
-                    answer = answers.pop(number)
-                    text = shortened(str(answer.message), MAX_REASON_CHARS)
-                    if answer.success:  # where time is paused, that is all the message says
-                        return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else text
-                    return text or "refused"
-        if not calls:
-            return f"no service {name} within {timeout:g} s"
-        return f"{name} did not answer within {timeout:g} s"
-
-    def _collect(self, name: str) -> None:
-        """Collect answers of all calls."""
-        client = self._clients[name]
-        with client.handle:
-            while True:
-                header, answer = client.handle.take_response(client.srv_type.Response)
-                if header is None:
-                    return
-                self._answers[name][header.request_id.sequence_number] = answer
+            with client.handle:  # take the answers to all calls
+                while (found := client.handle.take_response(client.srv_type.Response))[0] is not None:
+                    answers[found[0].request_id.sequence_number] = found[1]
+            for answer in [answers.pop(number) for number in calls if number in answers]:
+                text = shortened(str(answer.message), MAX_REASON_CHARS)
+                if answer.success:  # where time is paused, that is all the message says
+                    return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else text
+                return text or "refused"
+        return f"{name} did not answer within {timeout:g} s" if calls else f"no service {name} within {timeout:g} s"
 
 
 class ConsoleGraph:
@@ -337,7 +313,12 @@ class ConsoleGraph:
 
     async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
         """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
-        return self.blocked or await self.services.execute_procedure(action, procedure, hold_to_run)
+        if self.blocked:
+            return self.blocked
+        if action == "plan":
+            request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
+            return await self.services.call(PLAN_PROCEDURE, request)
+        return await self.services.call(PROCEDURE_ACTIONS[action], Trigger.Request())
 
     async def execute_action(self, action: str) -> str:
         """Arm, disarm, stop or reset; return an empty text, or the reason of a refusal.
@@ -348,7 +329,7 @@ class ConsoleGraph:
             return f"action: got {action!r}, expected one of {', '.join(ACTIONS)}"
         if self.blocked and action != "stop":
             return self.blocked
-        return await self.services.execute_action(action)
+        return await self.services.call(*ACTIONS[action], is_action=True)
 
     def state(self) -> dict[str, Any]:
         """Return the present state; see `console.graph`."""

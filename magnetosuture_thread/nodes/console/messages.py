@@ -205,7 +205,16 @@ def filter_state(message: FilterState) -> dict[str, Any]:
 
 def bridge(message: CoilBridgeState) -> dict[str, Any]:
     """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
-    shown = ("armed", "emergency_stopped", "reasons", "commanded", "filtered", "applied", "saturated", "driver")
+    shown: tuple[str, ...] = (
+        "armed",
+        "emergency_stopped",
+        "reasons",
+        "commanded",
+        "filtered",
+        "applied",
+        "saturated",
+        "driver",
+    )
     shown += ("driver_ready", "driver_warnings", "current", "measured_current", "refused")
     return {"state": _constant(message, message.state, "STATE_", "fault"), **_plain(message, *shown)}
 

@@ -16,6 +16,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
 
 from magnetosuture_thread import MagnetosutureError
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
@@ -94,7 +95,7 @@ class GraphHost:
         name = self._pause_service()
         if not name:
             return "no node of this graph can pause time"
-        refusal = await self.graph.services.set_paused(name, paused)
+        refusal = await self.graph.services.call(name, SetBool.Request(data=paused))
         if not refusal:
             self.paused = paused
         return refusal

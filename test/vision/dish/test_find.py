@@ -73,16 +73,6 @@ def test_a_bumped_camera_is_believed_only_after_several_frames():
     assert seen is not None
 
 
-def test_a_dark_frame_gives_no_view_and_changes_none():
-    gray = gray_of((322.0, 238.0), 8e-5, 3)
-    watch = DishWatch(VisionTrackerSettings(), 0.035)
-    watch.look(gray)
-    view = watch.view
-    assert watch.look(0 * gray)[0] == "too little of the dish is seen"
-    assert watch.look(gray)[0] == ""
-    assert watch.view is view
-
-
 def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
     bright = np.full((480, 640), 128, np.uint8)
     cv2.circle(bright, (322, 238), 200, 255, -1, cv2.LINE_AA)  # saturated, so that the rim's dark is not told

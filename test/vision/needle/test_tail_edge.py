@@ -11,7 +11,6 @@ from benchmarks.vision.cases import SIZES, usual_case
 from benchmarks.vision.frames import DISH_RADIUS, ROWS, render
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.vision.needle.tail_edge import _shift_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
@@ -41,30 +40,3 @@ def test_the_tail_is_neither_too_far_back_nor_too_far_ahead(columns: int):
         ahead.append(float((track.tail - case.needle.tail) @ along) / case.working_scale)
     assert abs(np.mean(ahead) + DRAWN_LARGER_PX) < 0.05
     assert np.std(ahead) < 0.12
-
-
-ALONG = np.arange(-5.5, 5.6, 0.25)
-DEPTH = 0.7
-
-
-def darkness(ends: np.ndarray) -> np.ndarray:
-    """Return the darkness along lines in which steel begins, on a floor that grows darker towards it."""
-    share = 1.0 / (1.0 + np.exp(-2.5 * (ALONG[:, None] - ends)))
-    return (1.0 - share) * (0.15 + 0.03 * ALONG[:, None]) + DEPTH * share
-
-
-@pytest.mark.parametrize("shift", [0.0, 0.4, -0.6])
-def test_an_end_lies_where_its_step_is_half_over_whatever_leaves_it(shift: float):
-    dark = darkness(np.full(7, shift))
-    assert _shift_of(ALONG, dark, DEPTH) == pytest.approx(shift, abs=0.04)
-    dark[np.abs(ALONG - shift + 1.0) < 1.0, 4] += 0.4  # a thread along one line, up to the end
-    assert _shift_of(ALONG, dark, DEPTH) == pytest.approx(shift, abs=0.04)
-
-
-@pytest.mark.parametrize(
-    ("ends", "lines"), [(np.full(7, 1.3), 7), (np.linspace(-1.5, 1.5, 7), 7), (np.zeros(7), 2), (np.zeros(7), 0)]
-)
-def test_an_end_that_is_far_off_or_slanted_or_hardly_shows_is_not_measured(ends: np.ndarray, lines: int):
-    dark = darkness(ends)
-    dark[:, lines:] = 0.15
-    assert np.isnan(_shift_of(ALONG, dark, DEPTH))

@@ -1,0 +1,59 @@
+"""Simulated time of a replay or of the simulated rig."""
+
+from __future__ import annotations
+
+import math
+import time
+
+
+class Timeline:
+    """Maps simulated to real time; before it begins, and while it is paused, simulated time stands still.
+
+    Args:
+        start: the simulated time to begin with [ns].
+        rate: how much faster than real time it runs.
+    """
+
+    def __init__(self, start: int, rate: float) -> None:
+        self.start = start
+        self._rate = rate
+        self._began: float | None = None
+        self._paused: float | None = None
+        self._stood = 0.0
+
+    def begin(self) -> None:
+        """Begin, or begin anew, at the start."""
+        self._began, self._stood = time.perf_counter(), 0.0
+        self._paused = self._began if self._paused is not None else None
+
+    @property
+    def paused(self) -> bool:
+        """Whether it is paused."""
+        return self._paused is not None
+
+    def pause(self, still: bool) -> None:
+        """Pause the time, or resume it."""
+        now = time.perf_counter()
+        if still and self._paused is None:
+            self._paused = now
+        elif not still and self._paused is not None:
+            if self._began is not None:
+                self._stood += now - self._paused
+            self._paused = None
+
+    def running(self) -> float:
+        """Return for how long it has been running, by real time, since it began [s]."""
+        if self._began is None:
+            return 0.0
+        now = time.perf_counter() if self._paused is None else self._paused
+        return now - self._began - self._stood
+
+    def now(self) -> int:
+        """Return the simulated time [ns]."""
+        return self.start + round(self.running() * self._rate * 1e9)
+
+    def left(self, simulated: int) -> float:
+        """Return how long it takes until a simulated time [ns], in real time [s]; for ever while it is paused."""
+        if self._paused is not None:
+            return math.inf
+        return (simulated - self.start) * 1e-9 / self._rate - self.running()
