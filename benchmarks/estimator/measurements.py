@@ -1,26 +1,20 @@
-"""Plays the cases through estimator, predictor, camera and registration: errors, consistency and time."""
+"""Plays the cases through estimator and predictor: errors, consistency and time."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.estimator.camera import CameraModel
 from benchmarks.estimator.cases import CASES, RATE, Case, contact_frame, free_run, run_of, second_thread
-from benchmarks.estimator.trackers import CameraAlone, CoherentPointDrift
 from benchmarks.estimator.truth import Run
-from magnetosuture_thread.evaluation.reference import read_reference
-from magnetosuture_thread.evaluation.reference_scores import reference_thread
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
-from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -52,8 +46,6 @@ class CaseFigures:
         limits: of mean and maximum.
         estimate: errors.
         prediction: of the model alone, from the true first shape.
-        camera: of the camera alone; None if it was not asked for.
-        registration: of the registration tracker; None if it was not asked for.
         consistent: part of the windows of 5 s in which the mean normalised innovation squared is within its 95 % band.
         innovation: mean normalised innovation squared.
         worse: number of runs whose estimate is worse than the prediction alone.
@@ -67,8 +59,6 @@ class CaseFigures:
     limits: tuple[float, float]
     estimate: Errors
     prediction: Errors
-    camera: Errors | None
-    registration: Errors | None
     consistent: float
     innovation: float
     worse: int
@@ -87,7 +77,7 @@ def targets(run: Run, segments: int) -> NDArray[np.float64]:
 def estimator_of(thread: Thread, run: Run, case: Case | None = None) -> ThreadEstimator:
     """Return an estimator that knows of a run what the case lets it."""
     posts = () if case is not None and case.post == "unknown" else run.posts
-    options = EstimatorOptions() if case is None or not case.learned else EstimatorOptions(slow_parameters=case.learned)
+    options = EstimatorOptions(slow_parameters=case.learned) if case is not None and case.learned else None
     estimator = ThreadEstimator(ThreadPredictor(thread, Workspace(posts, 5e-3, wall_radius=run.wall_radius)), options)
     estimator.warm_up()
     return estimator
@@ -130,7 +120,7 @@ def play(
     """Return the estimates of a run."""
     session = EstimatorSession(estimator)
     estimator.reset()
-    poses = [_scaled(pose, case.camera) for pose in run.poses]
+    poses = [replace(pose, tail=pose.tail * case.camera.scale) for pose in run.poses]
     played = Played([], [])
     for index, pose in enumerate(poses):
         late = seen[index - case.latency] if index >= case.latency else None
@@ -153,10 +143,6 @@ def play(
     return played
 
 
-def _scaled(pose: NeedlePose, camera: CameraModel) -> NeedlePose:
-    return replace(pose, tail=pose.tail * camera.scale)
-
-
 def predict(run: Run, estimator: ThreadEstimator, first: Points) -> NDArray[np.float64]:
     """Return the nodes of the model alone at each pose but the first, from the true first shape."""
     predictor = estimator.predictor
@@ -165,11 +151,9 @@ def predict(run: Run, estimator: ThreadEstimator, first: Points) -> NDArray[np.f
     return np.array([predictor.step(pose).positions for pose in run.poses[1:]])
 
 
-def measure_case(
-    case: Case, count: int, seed: int, segments: int, with_trackers: bool, progress: Callable[[], None]
-) -> CaseFigures:
+def measure_case(case: Case, count: int, seed: int, segments: int, progress: Callable[[], None]) -> CaseFigures:
     """Measure one case over all threads and a number of seeds."""
-    errors: dict[str, list[NDArray[np.float64]]] = {"estimate": [], "prediction": [], "camera": [], "registration": []}
+    errors: dict[str, list[NDArray[np.float64]]] = {"estimate": [], "prediction": []}
     inside: list[bool] = []
     innovations: list[NDArray[np.float64]] = []
     worse = runs = found = alarms = 0
@@ -179,7 +163,7 @@ def measure_case(
             run = run_of(case, material, attachment, number)
             if run is None:
                 continue
-            thread = _with_segments(run.thread, segments)
+            thread = replace(run.thread, segments=segments)
             truth, estimator = targets(run, segments), estimator_of(thread, run, case)
             seen = observations(case, run, number)
             estimates, measured = play(case, run, seen, estimator, truth[0])
@@ -189,13 +173,6 @@ def measure_case(
             alone = _off(predict(run, estimator, truth[0]), truth, thread.length)
             errors["estimate"].append(off[judged])
             errors["prediction"].append(alone[judged])
-            if with_trackers:
-                camera, drift = CameraAlone(truth[0], thread.length), CoherentPointDrift(truth[0], thread.length)
-                by_camera = np.array([camera.step(each) for each in seen[1:]])
-                tails = [_scaled(pose, case.camera).tail for pose in run.poses[1:]]
-                by_drift = np.array([drift.step(tail, each) for tail, each in zip(tails, seen[1:], strict=True)])
-                errors["camera"].append(_off(by_camera, truth, thread.length)[judged])
-                errors["registration"].append(_off(by_drift, truth, thread.length)[judged])
             worse += bool(off[judged].mean() > alone[judged].mean())
             runs += 1
             squared = _squared(measured)
@@ -212,8 +189,6 @@ def measure_case(
         limits=case.limits,
         estimate=estimate,
         prediction=Errors.of(_flat(errors["prediction"])),
-        camera=Errors.of(_flat(errors["camera"])) if with_trackers else None,
-        registration=Errors.of(_flat(errors["registration"])) if with_trackers else None,
         consistent=float(np.mean(inside)) if inside else 0.0,
         innovation=float(np.mean(np.concatenate([np.ones(1), *innovations]))),
         worse=worse,
@@ -222,10 +197,6 @@ def measure_case(
         false_alarms=alarms,
         met=met and runs > 0 and (case.post != "unknown" or found >= 0.95 * runs),
     )
-
-
-def _with_segments(thread: Thread, segments: int) -> Thread:
-    return replace(thread, segments=segments)
 
 
 def _off(nodes: NDArray[np.float64], truth: NDArray[np.float64], length: float) -> NDArray[np.float64]:
@@ -268,84 +239,23 @@ def _within_band(estimates: Sequence[ThreadEstimate], squared: NDArray[np.float6
 
 
 def measure_cost(segments: int, seed: int) -> dict[str, float]:
-    """Return median times of a step with and without a measurement [s], and the number of points."""
-    case = CASES["right, free"]
-    run = free_run("silk_6_0", "pinned", seed, 25.0)
-    thread = _with_segments(run.thread, segments)
+    """Return median processor times of a step with and without a measurement [s], and the number of points."""
+    case, run = CASES["right, free"], free_run("silk_6_0", "pinned", seed, 25.0)
+    thread = replace(run.thread, segments=segments)
     estimator, seen = estimator_of(thread, run), observations(case, run, seed)
-    truth = targets(run, segments)[0]
+    first = seen[0]
+    assert first is not None
+    estimator.start_observed(run.poses[0], first)
     times: dict[str, list[float]] = {"estimate_s": [], "prediction_s": []}
-    for repeat in range(2):
-        estimator.reset()
-        first = seen[0]
-        assert first is not None
-        estimator.start_observed(run.poses[0], first)
-        for pose, each in zip(run.poses[1:], seen[1:], strict=True):
-            began = time.perf_counter()
-            estimator.step(pose, each)
-            times["estimate_s"].append(time.perf_counter() - began)
-        estimator.predictor.start_at(run.poses[0], truth)
-        for pose in run.poses[1:]:
-            began = time.perf_counter()
-            estimator.predictor.step(pose)
-            times["prediction_s"].append(time.perf_counter() - began)
-        del repeat
-    points = seen[1].pieces[0].points if seen[1] is not None else np.empty((0, 2))
-    return {name: float(np.median(values)) for name, values in times.items()} | {"points": float(len(points))}
-
-
-def measure_references(folder: Path, seed: int, progress: Callable[[], None]) -> dict[str, dict[str, float]]:
-    """Return errors on reference trajectories, in % of the length, by the trajectory's name."""
-    found = {}
-    for path in sorted(folder.glob("*.npz")):
-        progress()
-        reference = read_reference(path)
-        thread, _ = reference_thread(reference, path, None)
-        heading = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
-        step = max(1, round(1.0 / (RATE * float(np.median(np.diff(reference.times))))))
-        poses = tuple(
-            NeedlePose(float(reference.times[k]), reference.tails[k], heading[k])
-            for k in range(0, len(reference.times), step)
-        )
-        run = Run(thread, poses, reference.threads[::step], reference.discs, np.inf)
-        case = CASES["right, free"]
-        truth, estimator = targets(run, thread.segments), estimator_of(thread, run)
-        estimates = play(case, run, observations(case, run, seed), estimator, truth[0]).current
-        off = Errors.of(_off(np.array([each.positions for each in estimates]), truth, thread.length)[int(RATE) :])
-        alone = Errors.of(_off(predict(run, estimator, truth[0]), truth, thread.length)[int(RATE) :])
-        found[reference.name] = {
-            "estimate_mean": off.mean,
-            "estimate_maximum": off.maximum,
-            "prediction_mean": alone.mean,
-            "prediction_maximum": alone.maximum,
-        }
-    return found
-
-
-def measure_long(minutes: float, seed: int, segments: int) -> dict[str, float]:
-    """Return the mean errors of the first and the last minute of a long run, in % of the length."""
-    case, run = CASES["stiffness x 5"], None
-    run = run_of(case, "silk_6_0", "pinned", seed, 60.0 * minutes)
-    assert run is not None
-    thread = _with_segments(run.thread, segments)
-    truth, estimator = targets(run, segments), estimator_of(thread, run)
-    session, rng = EstimatorSession(estimator), np.random.default_rng(seed)
-    mean, maximum = np.zeros(len(run.poses)), 0.0
-    for index, (pose, nodes) in enumerate(zip(run.poses, run.threads, strict=True)):  # one frame in memory at a time
-        session.on_observation(pose.stamp, case.camera.observe(nodes, pose.stamp, rng))
-        estimate = session.on_pose(pose).estimate
-        assert estimate is not None
-        off = Errors.of(100.0 / thread.length * np.linalg.norm(estimate.positions[1:] - truth[index, 1:], axis=1))
-        mean[index], maximum = off.mean, max(maximum, off.maximum if index >= RATE else 0.0)
-    minute = int(60 * RATE)
-    return {
-        "minutes": minutes,
-        "first_minute_mean": float(mean[int(RATE) : minute].mean()),
-        "last_minute_mean": float(mean[-minute:].mean()),
-        "maximum": maximum,
+    for pose, each in zip(run.poses[1:], seen[1:], strict=True):
+        began = time.process_time()
+        estimator.step(pose, each)
+        times["estimate_s"].append(time.process_time() - began)
+    estimator.predictor.start_at(run.poses[0], targets(run, segments)[0])
+    for pose in run.poses[1:]:
+        began = time.process_time()
+        estimator.predictor.step(pose)
+        times["prediction_s"].append(time.process_time() - began)
+    return {name: float(np.median(values)) for name, values in times.items()} | {
+        "points": float(len(first.pieces[0].points))
     }
-
-
-def as_json(figures: Sequence[CaseFigures]) -> list[dict[str, Any]]:
-    """Return what goes into JSON."""
-    return [asdict(each) for each in figures]

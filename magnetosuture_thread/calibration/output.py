@@ -9,13 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from magnetosuture_thread.calibration.fleet import FleetResult
-from magnetosuture_thread.calibration.parameters import (
-    ATTACHMENT,
-    OFFSET,
-    stiffness_over_drag,
-    with_stiffness_over_drag,
-)
+from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
 from magnetosuture_thread.model.settings import ThreadModelSettings
 
@@ -50,69 +44,11 @@ def to_yaml(calibration: CalibrationResult) -> str:
     return "\n".join(lines) + "\n"
 
 
-FLEET = (
-    "A thread calibrated by `magnetosuture calibrate --fleet`, for the node thread_model. Only the ratio "
-    "B = EI / zeta_perp moves a thread, so the viscosity below is taken to be the mean of the fleet's liquids, and "
-    "each bag's is told relative to it. Intervals are of 95 %."
-)
-
-
-def fleet_yaml(fleet: FleetResult, start: ThreadModelSettings) -> str:
-    """Return the text of the file of a calibration over many bags, the same for the same result.
-
-    Args:
-        fleet: the result.
-        start: what the setup and the material say.
-    """
-    words = [FLEET]
-    for bag in fleet.bags:
-        if math.isnan(bag.error):
-            words.append(f"{bag.name}: not used: {bag.reason}.")
-            continue
-        source = f"simulated: {bag.simulated}" if bag.simulated else "nothing in it says that it is simulated"
-        told = f"not used: {bag.reason}"
-        if bag.viscosity is not None:
-            value, low, high = bag.viscosity
-            told = f"viscosity {value:.3f} of the mean [{low:.3f} to {high:.3f}], error {bag.error:.3g} % of the length"
-        words.append(f"{bag.name} ({source}): {told}.")
-    words.append(f"Viscosities scatter by {100.0 * fleet.scatter:.2g} %.")
-    found = fleet.estimate
-    settings = with_stiffness_over_drag(start, found.value)
-    given = [f"    {name}: {_written(getattr(start, name))}" for name in GIVEN if getattr(start, name)]
-    note = f"Pa; B = {found.value:.4g} m^4/s [{_interval(found)}]"
-    return "\n".join(
-        [
-            *(line for text in words for line in _comment(text)),
-            "/**/thread_model:",
-            "  ros__parameters:",
-            *given,
-            f"    elastic_modulus: {_written(settings.elastic_modulus)} # {note}\n",
-        ]
-    )
-
-
-def fleet_table(fleet: FleetResult) -> Table:
-    """Return a row for each bag: its own stiffness over drag, and the viscosity of its liquid."""
-    found = fleet.estimate
-    table = Table(title=f"{found.name} {found.value:.4g} {found.unit}, 95 % interval {_interval(found)}")
-    table.caption = f"viscosities over the fleet's mean, which scatter by {100.0 * fleet.scatter:.2g} %"
-    table.add_column("bag", overflow="fold", min_width=12)
-    for name in ("B alone [m^4/s]", "viscosity", "95 % interval", "error [%]"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for bag in fleet.bags:
-        cells = ("-", "not used", "-")
-        if bag.viscosity is not None:
-            value, low, high = bag.viscosity
-            cells = (f"{bag.stiffness_over_drag:.4g}", f"{value:.3f}", f"{low:.3f} to {high:.3f}")
-        table.add_row(bag.name, *cells, "-" if math.isnan(bag.error) else f"{bag.error:.3g}")
-    return table
-
-
 def _header(calibration: CalibrationResult) -> list[str]:
     words = [
-        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the setup's"
+        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the setup's "
+        "own section, or give the node both files, this one last."
     ]
-    words[0] += " own section, or give the node both files, this one last."
     if not calibration.finished:
         words.insert(0, "BEST SO FAR, NOT FINISHED: the calibration was interrupted. There are no intervals.")
     for score, simulated in zip(calibration.scores, calibration.simulated, strict=True):

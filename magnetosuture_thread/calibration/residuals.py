@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import GraphError, InvalidInputError
 from magnetosuture_thread.evaluation.metrics import error_figures, mean_over_nodes, node_errors
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import ThreadSession
 from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 REMEMBERED = 16  # settings, with all that they predict; a Jacobian asks again for its middle
 SHARES = {"starts": 0.2, "fit": 0.4, "identified": 0.15, "held out": 0.25}  # of the time, by stage
@@ -54,6 +57,38 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
     except InvalidInputError:
         return np.full_like(kept, np.nan)
     return kept
+
+
+@contextmanager
+def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") -> Iterator[RunTasks]:
+    """Give a function that runs tasks, here or in processes of their own; see `make_runner`.
+
+    Args:
+        runs: that tasks name by their index.
+        workers: number of processes; with one, no other process is started.
+        scheduler: address of a Dask scheduler, whose workers replay in place of those; empty for none.
+
+    Raises:
+        GraphError: a process died.
+    """
+    with make_runner(partial(_run_task, tuple(runs)), workers, scheduler) as runner:
+
+        def run(tasks: Sequence[Task]) -> list[Points]:
+            results = dict[int, Points]()
+            for index, result in runner.run(tasks):
+                if isinstance(result, WorkerDiedError):
+                    raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
+                results[index] = result
+            return [results[index] for index in range(len(tasks))]
+
+        yield run
+
+
+def _run_task(
+    runs: Sequence[RecordedRun], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
+) -> Points:
+    index, settings = task
+    return replay_with_parameters(runs[index], settings)
 
 
 def across_residuals(vertices: Points, run: RecordedRun, length: float) -> Array:

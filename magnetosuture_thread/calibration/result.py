@@ -8,10 +8,9 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
-from magnetosuture_thread.calibration.residuals import frame_errors, mean_across, mean_error
+from magnetosuture_thread.calibration.residuals import mean_across, mean_error
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.settings import ThreadModelSettings
@@ -128,10 +127,6 @@ class BagFit:
     run: RecordedRun
     before: Points
     after: Points
-
-    def error(self, vertices: Points, length: float) -> NDArray[np.float64]:
-        """Return the prediction error of each compared frame [% of length]."""
-        return frame_errors(vertices, self.run.targets, length)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from magnetosuture_thread.evaluation.frames import SILENT_PERIODS, Array, FrameResult, TimeSeries
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.model.estimator import Disturbance, SlowParameter
-from magnetosuture_thread.model.estimator.parameter_kinds import KINDS
+from magnetosuture_thread.model.estimator.stiffness import STIFFNESS_OVER_DRAG
 
 ESTIMATE_COLUMNS = ("hidden", "corrected", "innovations", "innovation_squared")
 MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is
@@ -344,11 +344,9 @@ class EstimationFigures:
 
 
 def _learned(parameters: tuple[SlowParameter, ...]) -> dict[str, float | None]:
-    """Return value and 95 % interval of each slow parameter that there can be, None of those that are not learned."""
-    found = {each.name: each for each in parameters}
-    names = [kind.name for kinds in KINDS.values() for kind in kinds]
+    """Return value and 95 % interval of the stiffness over drag, None where it is not learned."""
+    found = parameters[0] if parameters else None
     return {
-        f"{name}{suffix}": getattr(found[name], of) if name in found else None
-        for name in names
+        f"{STIFFNESS_OVER_DRAG}{suffix}": getattr(found, of) if found else None
         for suffix, of in (("", "value"), ("_95_low", "low"), ("_95_high", "high"))
     }

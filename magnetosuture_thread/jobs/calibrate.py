@@ -8,15 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.output import to_yaml
 from magnetosuture_thread.calibration.parameters import choose_parameters
 from magnetosuture_thread.calibration.plot import draw_calibration
-from magnetosuture_thread.calibration.pool import pool
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
-from magnetosuture_thread.calibration.residuals import BestSettings
+from magnetosuture_thread.calibration.residuals import BestSettings, replay_pool
 from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate as fit
 from magnetosuture_thread.calibration.search import unfinished_result
@@ -86,7 +85,7 @@ def calibrate_bags(
     )
     best = BestSettings()
     try:
-        with pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:
+        with replay_pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:
             calibration, fits = fit(
                 passages,
                 settings,
@@ -104,16 +103,12 @@ def calibrate_bags(
     with whole_file(output) as partial:
         partial.write_text(to_yaml(calibration), encoding="utf-8")
     if json_file is not None:
-        write_figures(json_file, calibration.to_json())
+        with whole_file(json_file) as partial:
+            text = json.dumps(calibration.to_json(), indent=1, allow_nan=False)
+            partial.write_text(f"{text}\n", encoding="utf-8")
     with whole_file(picture or output.with_suffix(".png")) as partial:
         draw_calibration(partial, calibration, fits)
     return calibration
-
-
-def write_figures(file: Path, figures: dict[str, Any]) -> None:
-    """Write figures as JSON, whole or not at all."""
-    with whole_file(file) as partial:
-        partial.write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_runs(

@@ -46,7 +46,7 @@ from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
 from magnetosuture_thread.nodes.timeline import Timeline
-from magnetosuture_thread.offline.changes import CHANGING
+from magnetosuture_thread.offline.observations import CHANGING
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.scene import write_scene
 

@@ -13,7 +13,7 @@ import numpy as np
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.errors import BagError, InvalidInputError, MagnetosutureError
-from magnetosuture_thread.evaluation.frames import Array, Observation
+from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import (
@@ -21,11 +21,11 @@ from magnetosuture_thread.interface import (
     COMPRESSED_IMAGE,
     GROUND_TRUTH_PULL,
     GROUND_TRUTH_THREAD,
+    MATERIAL,
     MEASURED_THREAD,
     NEEDLE_POSE,
     SCENE,
     THREAD_OBSERVATION,
-    Channel,
 )
 from magnetosuture_thread.messages.reading import (
     pose_deviation,
@@ -37,7 +37,6 @@ from magnetosuture_thread.messages.reading import (
 )
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.session import MAX_WAITING_POSES
-from magnetosuture_thread.offline.changes import CHANGING
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -54,10 +53,17 @@ NOT_FOUND, BROKEN, NOT_NEWER, NO_POSE = (
     "a pose that is none",
 )
 Progress = Callable[[float], None]
+CHANGING = (SCENE, MATERIAL)  # channels on which a bag records changes of scene and thread
 _CHANGING = {channel.recorded for channel in CHANGING}
 _TRUE, _SEEN = GROUND_TRUTH_THREAD.recorded, MEASURED_THREAD.recorded
 _OBSERVED, _PULL = THREAD_OBSERVATION.recorded, GROUND_TRUTH_PULL.recorded
 _NOTHING, _NO_FORCE = np.empty((0, 2)), np.empty(0)
+_READERS: dict[str, tuple[Callable[[RecordedMessage], Any], Any]] = {
+    _TRUE: (read_path, _NOTHING),
+    _SEEN: (read_path, _NOTHING),
+    _OBSERVED: (read_observation, ThreadObservation()),
+    _PULL: (read_force, _NO_FORCE),
+}
 
 
 class ObservationReader(Iterator[Observation]):
@@ -68,9 +74,9 @@ class ObservationReader(Iterator[Observation]):
         count: camera frames, or poses, so far.
         found: of these with a needle.
         refused: the others, by why.
-        on_frame: called with stamp and what was seen in each frame, before its sight is given.
-        on_record: called with stamp and each recorded pose and seen thread, before its sight is given; and with each
-            scene that is taken.
+        on_frame: called with stamp and what was seen in each frame, before its observation is given.
+        on_record: called with stamp and each recorded pose and seen thread, before its observation is given; and
+            with each scene that is taken.
     """
 
     def __init__(
@@ -97,23 +103,24 @@ class ObservationReader(Iterator[Observation]):
         self._recording = recording
         begin = recording.start + round(start * 1e9)
         whole = max((recording.duration - start) if duration is None else min(duration, recording.duration - start), 0)
-        sources = (
+        own = (
             (recording.camera, CAMERA_INFO)
             if source == "camera"
             else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
         )
-        given = (GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, *CHANGING, *sources)
+        given = (GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, *CHANGING, *own)
         channels = [channel for channel in given if channel is not None and recording.counts.get(channel.recorded)]
-        records = recording.records(channels, start=start, duration=duration)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
         self._changes = [record for record in earlier if record.time < begin]
         for record in self._changes:
             self._follow(record)
-        awaited = {GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, MEASURED_THREAD, THREAD_OBSERVATION} & set(channels)
-        self._going = self._go(_telling(records, begin, whole, progress), awaited)
+        # What belongs to a frame, by topic and stamp.
+        self._parts: dict[str, dict[int, Any]] = {c.recorded: {} for c in channels if c.recorded in _READERS}
+        records = recording.records(channels, start=start, duration=duration)
+        self._going = self._go(_with_progress(records, begin, whole, progress))
 
     def __next__(self) -> Observation:
-        """Return the next sight.
+        """Return the next observation.
 
         Raises:
             BagError: a length is not in metres, or the bag is damaged.
@@ -137,13 +144,12 @@ class ObservationReader(Iterator[Observation]):
             f"shorter than {MIN_LENGTH_RATIO:g} times the setup's {self._length:g} m: is it another thread?"
         )
 
-    def _go(self, records: Iterator[RecordedMessage], awaited: set[Channel]) -> Iterator[Observation]:
-        """Give a sight once what belongs to it has come, or cannot be expected any more."""
+    def _go(self, records: Iterator[RecordedMessage]) -> Iterator[Observation]:
+        """Give an observation once what belongs to it has come, or cannot be expected any more."""
         waiting: deque[Observation | RecordedMessage] = deque()
-        parts: dict[str, dict[int, Any]] = {channel.recorded: {} for channel in awaited}
         for record in records:
-            if record.topic in parts:
-                self._keep(parts[record.topic], record)
+            if record.topic in self._parts:
+                self._keep(record)
             elif record.topic in _CHANGING:
                 self._follow(record)
                 waiting.append(record)
@@ -151,14 +157,28 @@ class ObservationReader(Iterator[Observation]):
                 self._take_lens(record)
             else:
                 waiting.append(self._pose(record) if self.source == "poses" else self._frame(record))
-            while waiting and (
-                len(waiting) > MAX_WAITING_POSES
-                or isinstance(head := waiting[0], RecordedMessage)
-                or all(head.stamp in known for known in parts.values())
-            ):
-                yield from self._next(waiting.popleft(), parts)
+            while waiting and (len(waiting) > MAX_WAITING_POSES or self._complete(waiting[0])):
+                yield from self._next(waiting.popleft())
         while waiting:
-            yield from self._next(waiting.popleft(), parts)
+            yield from self._next(waiting.popleft())
+
+    def _complete(self, head: Observation | RecordedMessage) -> bool:
+        return isinstance(head, RecordedMessage) or all(head.stamp in known for known in self._parts.values())
+
+    def _next(self, head: Observation | RecordedMessage) -> Iterator[Observation]:
+        """Keep a change until it is asked for; give an observation with its parts."""
+        if isinstance(head, RecordedMessage):
+            self._changes.append(head)
+            return
+        found = {topic: known[head.stamp] for topic, known in self._parts.items() if head.stamp in known}
+        truth, pull = found.get(_TRUE, _NOTHING), found.get(_PULL, _NO_FORCE)
+        if self.source != "poses":
+            yield replace(head, ground_truth=truth, true_pull=pull)
+            return
+        # As live, the centreline alone tells nothing where observations come.
+        observed = found.get(_OBSERVED, ThreadObservation()) if _OBSERVED in self._parts else None
+        measured = found.get(_SEEN, _NOTHING)
+        yield replace(head, measured=measured, ground_truth=truth, true_pull=pull, observation=observed)
 
     def _follow(self, record: RecordedMessage) -> None:
         """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
@@ -182,68 +202,32 @@ class ObservationReader(Iterator[Observation]):
             lens = None
         self._tracker.set_lens(lens)
 
-    def _next(self, head: Observation | RecordedMessage, parts: dict[str, dict[int, Any]]) -> Iterator[Observation]:
-        if isinstance(head, RecordedMessage):
-            self._changes.append(head)
-        else:
-            yield self._whole(head, parts)
-
-    def _keep(self, known: dict[int, Any], record: RecordedMessage) -> None:
-        stamp = stamp_of(record)
-        if record.topic in (_SEEN, _OBSERVED):
+    def _keep(self, record: RecordedMessage) -> None:
+        """Keep what belongs to a frame; nothing where it isn't valid."""
+        stamp, topic, known = stamp_of(record), record.topic, self._parts[record.topic]
+        if topic in (_SEEN, _OBSERVED):
             self.on_record(stamp, record)
-        if record.topic == _OBSERVED:
-            known[stamp] = self._observed(record)
-        elif record.topic == _PULL:
-            known[stamp] = self._pull(record)
-        else:
-            known[stamp] = self._path(record)
+        read, nothing = _READERS[topic]
+        try:
+            known[stamp] = part = read(record)
+        except InvalidInputError as error:
+            self.refused[f"{topic}: {error}"] += 1
+            known[stamp] = part = nothing
+        for points in [piece.points for piece in part.pieces] if topic == _OBSERVED else [part]:
+            if topic in (_SEEN, _OBSERVED) and len(points):
+                self._check_place(topic, points)
+        if topic == _SEEN and len(part):
+            self._count_length(part)
         if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
             del known[next(iter(known))]
 
-    def _observed(self, record: RecordedMessage) -> ThreadObservation:
-        """Return what a frame showed of the thread; nothing where that isn't valid."""
-        try:
-            observation = read_observation(record)
-        except InvalidInputError as error:
-            self.refused[f"{record.topic}: {error}"] += 1
-            return ThreadObservation()
-        for piece in observation.pieces:
-            self._check_place(record.topic, piece.points)
-        return observation
-
-    def _pull(self, record: RecordedMessage) -> Array:
-        try:
-            return read_force(record)
-        except InvalidInputError as error:
-            self.refused[f"{record.topic}: {error}"] += 1
-            return _NO_FORCE
-
-    def _path(self, record: RecordedMessage) -> Points:
-        try:
-            points = read_path(record)
-        except InvalidInputError as error:
-            self.refused[f"{record.topic}: {error}"] += 1
-            points = _NOTHING
-        if record.topic == _SEEN and len(points):
-            self._check_place(record.topic, points)
-            if self._threads % MEASURED == 0 and np.isfinite(points).all():
-                length = float(arc_lengths(points)[-1]) / self._length
-                self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
-                self._measured += 1
-            self._threads += 1
-        return points
-
-    def _whole(self, observation: Observation, parts: dict[str, dict[int, Any]]) -> Observation:
-        truth = parts.get(_TRUE, {}).get(observation.stamp, _NOTHING)
-        seen = parts.get(_SEEN, {}).get(observation.stamp, _NOTHING)
-        pull = parts.get(_PULL, {}).get(observation.stamp, _NO_FORCE)
-        if self.source != "poses":
-            return replace(observation, ground_truth=truth, true_pull=pull)
-        observed = observation.observation
-        if _OBSERVED in parts:  # As live, the centreline alone tells nothing where observations come.
-            observed = parts[_OBSERVED].get(observation.stamp, ThreadObservation())
-        return replace(observation, measured=seen, ground_truth=truth, true_pull=pull, observation=observed)
+    def _count_length(self, points: Points) -> None:
+        """Count every eighth measured thread, and those whose length is not of this setup."""
+        if self._threads % MEASURED == 0 and np.isfinite(points).all():
+            length = float(arc_lengths(points)[-1]) / self._length
+            self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
+            self._measured += 1
+        self._threads += 1
 
     def _pose(self, record: RecordedMessage) -> Observation:
         """Return what a recorded pose says."""
@@ -313,10 +297,10 @@ def pixels(message: Any, type_name: str) -> Any:
     return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
 
 
-def _telling(
+def _with_progress(
     records: Iterator[RecordedMessage], begin: int, whole: float, progress: Progress
 ) -> Iterator[RecordedMessage]:
-    """Go through records and tell how far, a thousand times at the most: showing it takes longer than a step."""
+    """Go through records and report progress, a thousand times at the most: showing it takes longer than a step."""
     following, pause = begin, max(round(whole * 1e6), 1)
     for record in records:
         if record.time >= following:

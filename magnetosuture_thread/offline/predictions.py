@@ -7,24 +7,25 @@ last bit; but as fast as the machine can, and with nothing that depends on time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.errors import BagError, MagnetosutureError
 from magnetosuture_thread.evaluation.frames import Observation
-from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE
+from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE, SCENE
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.model.margins import Margins
 from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.offline.changes import changed
-from magnetosuture_thread.offline.observations import ObservationReader
+from magnetosuture_thread.model.settings import ThreadModelSettings, parse_material
+from magnetosuture_thread.offline.observations import ObservationReader, Progress
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
 SOURCES = ("auto", "camera", "poses")
-Progress = Callable[[float], None]
 
 
 def read_observations(
@@ -97,9 +98,9 @@ class Step:
 def predictions(given: Iterable[Observation], settings: ThreadModelSettings, scene: Scene | None) -> Iterator[Step]:
     """Predict and estimate the thread over one run, as `thread_model` does.
 
-    What the bag of `sights` says of scene and thread is taken as it comes. A pose before the thread is first seen
-    gives a step that waits, as live, and is not predicted later unless its own thread is seen; sights without a
-    needle give none.
+    Changes of scene and thread that the bag records apply as they come. A pose before the thread is first measured
+    gives a step that waits, as live, and is not predicted later unless its own thread is measured; observations
+    without a needle give none.
 
     Args:
         given: by time.
@@ -109,10 +110,7 @@ def predictions(given: Iterable[Observation], settings: ThreadModelSettings, sce
     Raises:
         ConfigurationError: a shape of the scene cannot be used.
     """
-    return _steps(given, ThreadSession(settings, scene))
-
-
-def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Step]:
+    session = ThreadSession(settings, scene)
     waiting: dict[int, Observation] = {}
 
     def step(observation: Observation, result: PredictionResult, taken: float) -> Step:
@@ -145,6 +143,22 @@ def _steps(given: Iterable[Observation], session: ThreadSession) -> Iterator[Ste
             yield step(observation, late, 0.0)
         while len(waiting) > 2 * MAX_WAITING_POSES:
             del waiting[next(iter(waiting))]
+
+
+def changed(
+    settings: ThreadModelSettings, scene: Scene | None, record: RecordedMessage
+) -> tuple[ThreadModelSettings, Scene | None]:
+    """Return settings and scene after a recorded message on one of these channels.
+
+    Raises:
+        BagError: it cannot be decoded.
+        ConfigurationError: it cannot be used.
+        InvalidInputError: it is of another frame, or damaged.
+    """
+    if record.topic == SCENE.recorded:
+        return settings, parse_scene_message(record.decode())
+    values = parse_material(record.decode())
+    return from_mapping(ThreadModelSettings, {**to_mapping(settings), **values}), scene
 
 
 def _change(session: ThreadSession, given: ObservationReader) -> None:

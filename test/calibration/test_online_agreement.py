@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from magnetosuture_thread.calibration.recorded_run import read_run
 from magnetosuture_thread.calibration.search import calibrate
 from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
@@ -14,20 +12,17 @@ from test.calibration.runs import LENGTH, SETTINGS, noisy, rig_run, stiff
 TRUE, NOISE = 1.3e-9, 2e-5  # m^4/s, m
 
 
-@pytest.mark.parametrize("start", [0.2, 5.0])
-def test_calibration_and_estimator_agree_on_the_same_run(start: float) -> None:
-    told, frames = stiff(start * TRUE), list(noisy(rig_run(TRUE), NOISE))
-    fit, _ = calibrate([read_run("run", frames, SETTINGS)], told, ["elastic_modulus", "drag_anisotropy"])
-    options = EstimatorOptions(slow_parameters=("stiffness_over_drag", "drag_anisotropy"))
+def test_calibration_and_estimator_agree_on_the_same_run() -> None:
+    told, frames = stiff(5.0 * TRUE), list(noisy(rig_run(TRUE), NOISE))
+    fit, _ = calibrate([read_run("run", frames, SETTINGS)], told, ["elastic_modulus"])
+    options = EstimatorOptions(slow_parameters=("stiffness_over_drag",))
     session = EstimatorSession(ThreadEstimator(told.predictor(None), options))
     for frame in frames:
         stamp = frame.stamp * 1e-9
         session.on_observation(stamp, observation_of(frame.measured, LENGTH, NOISE))
         result = session.on_pose(NeedlePose(stamp, frame.tail, frame.heading))
     assert result.estimate is not None
-    for batch, online in zip(fit.estimates, result.estimate.slow_parameters, strict=True):
-        assert batch.name == online.name.replace("_", " ")
-        assert online.low <= batch.value <= online.high
-        assert batch.low <= online.value <= batch.high
-    stiffness = result.estimate.slow_parameters[0]
-    assert stiffness.low <= TRUE <= stiffness.high
+    (batch,), (online,) = fit.estimates, result.estimate.slow_parameters
+    assert online.low <= batch.value <= online.high
+    assert batch.low <= online.value <= batch.high
+    assert online.low <= TRUE <= online.high

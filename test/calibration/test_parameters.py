@@ -9,12 +9,10 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table, to_yaml
+from magnetosuture_thread.calibration.output import parameter_table, to_yaml
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
-    choose_parameters,
-    known_settings,
     stiffness_over_drag,
     with_stiffness_over_drag,
 )
@@ -25,7 +23,6 @@ from magnetosuture_thread.calibration.result import (
     CalibrationResult,
     Estimate,
 )
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import load_setup
 
@@ -54,17 +51,6 @@ def test_only_the_ratio_of_stiffness_and_drag_counts():
     for thread in (one, other):
         assert thread.bending_stiffness / thread.medium.drag_across == pytest.approx(2e-9)
     assert other.bending_stiffness > 2.5 * one.bending_stiffness
-
-
-def test_names_of_settings_are_checked():
-    assert choose_parameters("rod", ["attachment"]) == ((), True)
-    assert [parameter.name for parameter in choose_parameters("rod", ["attachment_offset"])[0]] == [
-        "offset along",
-        "offset left",
-    ]
-    assert known_settings("paper") == ("paper_damping", "paper_stiffness_weight")
-    with pytest.raises(ConfigurationError, match="did you mean drag_anisotropy"):
-        choose_parameters("rod", ["drag_anisotopy"])
 
 
 def found(**changes: Any) -> CalibrationResult:
@@ -120,15 +106,6 @@ def test_the_file_is_what_thread_model_loads(tmp_path: Path):
         assert len(line) <= 120
 
 
-def test_a_whole_number_is_written_with_its_point(tmp_path: Path):
-    settings = replace(SETTINGS, elastic_modulus=2e9, rest_curvature=12.0)
-    text = to_yaml(found(settings=settings, estimates=found().estimates[:3], attachment=None))
-    assert "elastic_modulus: 2.0e+09 #" in text
-    assert "rest_curvature: 12.0 #" in text
-    assert "attachment: pinned # as in the setup" in text
-    assert loaded(text, tmp_path) == settings
-
-
 def test_an_attachment_that_cannot_be_told_is_left_out():
     verdict = AttachmentDecision("pinned", "pinned", {"pinned": 0.4, "clamped": 0.41}, "clamped is worse by 0.01 only")
     text = to_yaml(found(attachment=verdict))
@@ -152,21 +129,6 @@ def test_what_is_not_finished_says_so():
     assert to_yaml(unfinished).startswith("# BEST SO FAR, NOT FINISHED")
     assert unfinished.to_json()["finished"] is False
     assert "not finished" in str(parameter_table(unfinished.to_json()).title)
-
-
-def test_tables_and_lines_say_what_is_there():
-    values = found().to_json()
-    assert parameter_table(values).row_count == 6
-    table = bag_table(values)
-    assert [" ".join(str(column.header).split()) for column in table.columns] == [
-        *("bag", "frames", "before", "after", "held out"),
-        *("ground truth before", "ground truth after", "ground truth held out"),
-    ]
-    lines = calibration_lines(values)
-    assert lines[0] == "warning: drag anisotropy cannot be identified in this data: too wide to be of use"
-    assert lines[-1] == "simulated: a/bag"
-    assert math.isclose(values["bags"][0]["held_out"], 0.5)
-    assert values["bags"][1]["held_out"] is None
 
 
 def test_nodes_that_are_farther_off_after_the_fit_are_a_warning():

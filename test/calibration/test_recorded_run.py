@@ -90,23 +90,6 @@ def test_a_leg_starts_from_a_part_where_no_more_was_measured_for_a_second(observ
     assert len(passage.initials[0]) == 40
 
 
-def test_a_frame_that_does_not_show_the_tail_starts_no_leg(observations: Observations):
-    away = [
-        replace(observed(sight, 64), observation=ThreadObservation()) if k < 5 else sight
-        for k, sight in enumerate(observations)
-    ]
-    assert read_run("bag", away, SETTINGS).stamps[0] == observations[5].stamp
-
-
-def test_what_is_not_measured_is_not_known(observations: Observations):
-    part = [replace(sight, measured=sight.measured[:40]) for sight in observations]
-    passage = read_run("bag", part, SETTINGS)
-    seen = 39.0 / 63.0 * SETTINGS.segments
-    assert (passage.known.sum(axis=1) == int(seen)).all()
-    vertices = replay_with_parameters(passage, SETTINGS)
-    assert not across_residuals(vertices, passage, LENGTH)[~passage.known].any()
-
-
 def test_errors_are_those_of_the_score(observations: Observations):
     passage = read_run("bag", observations, SETTINGS)
     vertices = replay_with_parameters(passage, SETTINGS)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,11 +17,9 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.errors import BagError, ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.jobs import calibrate_fleet as fleet_job
 from magnetosuture_thread.jobs.calibrate import calibrate_bags, material_named, settings_of
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.workers import WorkerDiedError
 from test.bags.bags import copy_with_notes
 from test.calibration.runs import LENGTH, rig_run
 
@@ -198,91 +195,3 @@ def test_another_material_comes_with_its_own_numbers():
     assert settings_of(own, "polyamide", "") == own.model
     silk = settings_of(own, "silk", "paper")
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")
-
-
-def fleet_bags(folder: Path, factors: tuple[float, ...]) -> list[str]:
-    """Render bags of one thread in liquids of different viscosity, over the mean; return their paths."""
-    (folder / "lab.yaml").write_text(SETUP)
-    paths = []
-    for index, factor in enumerate(factors):
-        paths.append(str(folder / f"bag_{index}"))
-        run_of = trajectory(0.4 * index, TRUE / factor)
-        setup = read_setup(str(folder / "lab.yaml"))
-        render_bag(run_of, setup, Path(paths[-1]), rate=15.0, poses=True, noise=2e-5, seed=index)
-    return paths
-
-
-def test_a_fleet_shares_its_stiffness_and_each_bag_has_its_viscosity(tmp_path: Path):
-    factors = (0.8, 1.0, 1.25, 0.9)
-    bags = fleet_bags(tmp_path, factors)
-    texts = []
-    for workers in ("1", "2"):
-        output, figures = tmp_path / f"{workers}.yaml", tmp_path / f"{workers}.json"
-        options = ("--fleet", *ONE, "--workers", workers, "--output", str(output), "--json", str(figures))
-        assert run(tmp_path, *bags, *options) == 0
-        texts.append((output.read_bytes(), figures.read_bytes()))
-    assert texts[0] == texts[1]
-    found = json.loads(texts[0][1])
-    mean = TRUE / math.exp(float(np.mean(np.log(factors))))
-    shared = found["stiffness_over_drag"]
-    assert shared["low"] < mean < shared["high"]
-    assert shared["value"] == pytest.approx(mean, rel=0.05)
-    relative = [factor * mean / TRUE for factor in factors]
-    for bag, true in zip(found["bags"], relative, strict=True):
-        value, low, high = bag["viscosity"]
-        assert low < true < high
-        assert value == pytest.approx(true, rel=0.06)
-    text = texts[0][0].decode()
-    assert "viscosities scatter by" in text.lower()
-    both = read_setup(str(tmp_path / "lab.yaml")).model
-    modulus = float(text.split("elastic_modulus: ")[1].split()[0])
-    assert stiffness_over_drag(replace(both, elastic_modulus=modulus)) == pytest.approx(shared["value"], rel=1e-4)
-
-
-def test_a_fleet_goes_on_without_a_bag_that_cannot_be_read_or_ends_its_worker(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
-):
-    first, *others = fleet_bags(tmp_path, (0.8, 1.0, 1.25))
-    broken, fatal = tmp_path / "broken.mcap", tmp_path / "fatal"
-    broken.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    fit_bag = fleet_job._fit_bag
-
-    def ended_by_one(*given: Any) -> Any:
-        return WorkerDiedError("its process ended with -9") if fatal in given else fit_bag(*given)
-
-    monkeypatch.setattr(fleet_job, "_fit_bag", ended_by_one)
-    output, figures = tmp_path / "found.yaml", tmp_path / "found.json"
-    bags = [first, str(broken), *others, str(fatal)]
-    assert run(tmp_path, *bags, "--fleet", *ONE, "--output", str(output), "--json", str(figures)) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "is left out: its process ended with -9" in shown
-    found = json.loads(figures.read_text())["bags"]
-    assert [bag["name"] for bag in found] == bags
-    assert [bag["viscosity"] is None for bag in found] == [False, True, False, False, True]
-    assert "nothing intact" in found[1]["reason"]
-    assert (found[4]["reason"], found[4]["error"]) == ("its process ended with -9", None)
-    text = " ".join(line.strip("# ") for line in output.read_text().splitlines())
-    assert f"{fatal}: not used: its process ended with -9." in text
-
-
-def test_a_fleet_of_which_too_few_bags_are_left_names_the_others(folder: Path, tmp_path: Path, capsys):
-    broken = [tmp_path / "broken.mcap", tmp_path / "nowhere.mcap"]
-    broken[0].write_bytes(b"\x89MCAP0\r\n" + bytes(100))
-    output = tmp_path / "x.yaml"
-    bags = [*broken, folder / "one", folder / "two"]
-    assert run(folder, *map(str, bags), *ONE, "--fleet", "--output", str(output), "--workers", "2") == 1
-    shown = capsys.readouterr().err
-    assert "2 that tell the stiffness over drag, expected at least 3: " in shown
-    assert f"{broken[0]}: " in shown
-    assert f"{broken[1]}: does not exist" in shown
-    assert not output.exists()
-
-
-def test_a_fleet_of_too_few_bags_or_without_what_they_share_is_refused(folder: Path, tmp_path: Path, capsys):
-    bags = [str(folder / name) for name in ("one", "two")]
-    output = ("--fleet", "--output", str(tmp_path / "x.yaml"))
-    assert run(folder, *bags, *ONE, *output) == 1
-    assert "2 that tell the stiffness over drag, expected at least 3" in capsys.readouterr().err
-    assert run(folder, *bags, *output, "--parameters", "drag_anisotropy") == 2
-    assert "elastic_modulus among them" in capsys.readouterr().err
-    assert not (tmp_path / "x.yaml").exists()

@@ -77,14 +77,6 @@ def test_every_frame_has_an_estimate_beside_the_prediction_of_the_model_alone():
     np.testing.assert_array_equal(last.margins["wall"].clearance, estimated(last).margins["wall"].clearance)
 
 
-def test_without_a_measured_thread_there_is_no_estimate_and_the_margins_are_of_the_prediction():
-    session = ThreadSession(made(initial_shape="straight"), None)
-    for pose in WAY:
-        result = session.on_pose(stamp_of(pose), at(pose))
-        assert (result.estimate, result.estimate_problem) == (None, None)
-        assert result.margins is not None
-
-
 @pytest.mark.parametrize("values", [{"formulation": "paper"}, {"medium": "air"}])
 def test_other_threads_are_predicted_only(values: dict[str, Any]):
     session = ThreadSession(made(**values), None)
@@ -102,15 +94,6 @@ def test_a_part_of_the_thread_is_estimated_before_the_prediction_starts():
         result = session.on_pose(stamp_of(WAY[k]), at(WAY[k]))
         assert result.waiting
         assert estimated(result).hidden == pytest.approx(0.5, abs=0.1)
-
-
-def test_paths_that_end_early_are_estimated():
-    session = ThreadSession(made(initial_shape="straight"), None)
-    for k, pose in enumerate(WAY):
-        list(session.on_measured_thread(stamp_of(pose), NODES[k, :14]))
-        estimate = estimated(session.on_pose(stamp_of(pose), at(pose)))
-    assert estimate.corrected
-    assert error_percent(estimate.positions[:14], NODES[-1, :14]) < 0.1
 
 
 def test_late_observations_take_the_place_of_the_estimates_there_were():
@@ -204,7 +187,7 @@ def test_time_set_back_restarts_the_estimate():
 
 
 @pytest.mark.parametrize(
-    "values", [{"viscosity": 1.1}, {"segments": 40}, {"estimator_noise_time": 2.0}, {"thread_length": 0.0191}]
+    "values", [{"viscosity": 1.1}, {"segments": 40}, {"estimator_history": 2.0}, {"thread_length": 0.0191}]
 )
 def test_other_settings_keep_the_estimate(values: dict[str, Any]):
     session = ThreadSession(made(), None)
@@ -254,14 +237,6 @@ def test_a_scene_that_appears_pushes_the_estimate_out():
     assert result.margins is not None
     assert result.margins.scene_version == scene.version
     assert result.margins["obstacle"].minimum > -1e-6
-
-
-def test_an_observation_waits_for_its_pose_while_settings_change():
-    session = ThreadSession(made(), None)
-    follow(session, 0, 10)
-    assert not show(session, 10)
-    session.change(made(viscosity=1.1), None)
-    assert estimated(session.on_pose(stamp_of(WAY[10]), at(WAY[10]))).corrected
 
 
 @pytest.mark.parametrize("offset", [-0.002, 0.001])

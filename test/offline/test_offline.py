@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -27,6 +28,7 @@ from magnetosuture_thread.interface import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     ESTIMATED_THREAD,
+    GROUND_TRUTH_PULL,
     GROUND_TRUTH_THREAD,
     MARGINS,
     MATERIAL,
@@ -37,10 +39,10 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.jobs.replay_offline import replay_offline
-from magnetosuture_thread.messages.packing import packed_margins, packed_path, packed_pose, packed_prediction
-from magnetosuture_thread.messages.reading import margins_of, read_path, read_pose, stamp_of
+from magnetosuture_thread.messages.packing import packed_path, packed_pose, packed_wrench
+from magnetosuture_thread.messages.reading import read_path, stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
-from magnetosuture_thread.model.margins import UNKNOWN, Friction, FrictionState
+from magnetosuture_thread.offline.observations import ObservationReader
 from magnetosuture_thread.offline.predictions import predictions, read_observations
 from magnetosuture_thread.scene import SceneShape
 from magnetosuture_thread.setups import read_setup
@@ -121,14 +123,6 @@ def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_pa
     assert errors[1] > 2.0 * errors[0]
 
 
-def test_a_window_is_a_part_of_the_whole(pose_bag: Path):
-    recording = Recording(Bag(pose_bag))
-    whole = [s.stamp for s in read_observations(recording, SETUP)]
-    assert [s.stamp for s in read_observations(recording, SETUP, start=0.5, duration=0.25)] == [
-        stamp for stamp in whole if 0.5e9 <= stamp - whole[0] <= 0.75e9
-    ]
-
-
 def test_the_source_must_be_there(pose_bag: Path, tmp_path: Path):
     with pytest.raises(BagError, match="camera/image_raw/compressed"):
         read_observations(Recording(Bag(pose_bag)), SETUP, source="camera")
@@ -195,19 +189,6 @@ def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_thread_of_another_length_is_said(pose_bag: Path, tmp_path: Path):
-    def short(old: RecordedMessage, message: Any) -> Any:
-        if old.topic == MEASURED_THREAD.recorded:
-            message.poses = message.poses[:8]
-        return message
-
-    bag = changed(pose_bag, tmp_path / "short", short)
-    said: list[str] = []
-    summary = replay_offline(bag, tmp_path / "out", log=said.append)
-    assert "is it another thread?" in summary.remark
-    assert summary.remark in said
-
-
 def test_stamps_that_go_back_are_refused_and_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
     def back(old: RecordedMessage, message: Any) -> Any:
         stamp = stamp_of(old)
@@ -272,16 +253,6 @@ def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_pat
     assert any(str(damage) in line for line in said)
 
 
-def test_poses_may_wait_for_their_thread(pose_bag: Path):
-    """The thread is seen late: poses before are answered, and not predicted."""
-    recording = Recording(Bag(pose_bag))
-    seen = list(read_observations(recording, SETUP))
-    late = [replace(s, measured=np.empty((0, 2))) if k < 5 else s for k, s in enumerate(seen)]
-    steps = list(predictions(late, SETUP.model, SETUP.scene))
-    assert [step.result.waiting for step in steps] == [True] * 5 + [False] * 25
-    assert steps[5].result.stamp == steps[5].observation.stamp == seen[5].stamp
-
-
 @pytest.mark.parametrize("frame", ["dish", "another_frame", ""])
 @pytest.mark.parametrize("count", [0, 1, 2, 64])
 def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
@@ -300,58 +271,6 @@ def test_paths_are_read_as_the_type_store_reads_them(count: int, frame: str):
     for cut in range(0, len(data), 5):
         with pytest.raises(BagError):
             read_path(replace(given, data=data[:cut]))
-
-
-def test_poses_are_read_as_a_node_gets_them():
-    heading = np.array([np.cos(2.5), np.sin(2.5)])
-    covariance = np.diag([4e-10, 4e-10, 9e-6])
-    data = packed_pose(10**9, np.array([1e-3, -2e-3]), heading, covariance)
-    given = RecordedMessage(NEEDLE_POSE.recorded, NEEDLE_POSE.type_name, 3, data)
-    tail, along, deviation = read_pose(given)
-    assert tail.tolist() == [1e-3, -2e-3]
-    assert deviation == pytest.approx((2e-5, 3e-3))
-    assert along == pytest.approx(heading, abs=1e-15)
-    with pytest.raises(BagError):
-        read_pose(replace(given, data=data[:40]))
-
-
-def test_packed_messages_are_those_of_the_type_store(pose_bag: Path):
-    steps = list(predictions(list(read_observations(Recording(Bag(pose_bag)), SETUP))[:3], SETUP.model, SETUP.scene))
-    prediction, margins = steps[-1].result.prediction, steps[-1].margins
-    assert prediction is not None
-    assert margins is not None
-    store = typestore()
-    for material in ("polyamide_7_0", "", "x", "xyz"):
-        data = packed_prediction(12_000_000_034, prediction, material)
-        message: Any = store.deserialize_cdr(data, PREDICTED_THREAD.type_name)
-        assert bytes(store.serialize_cdr(message, PREDICTED_THREAD.type_name)) == data
-        assert (message.material, message.header.stamp.nanosec, message.step_time) == (material, 34, 0.0)
-        assert message.scene_version == SETUP.scene.version
-        assert np.array_equal([[p.x, p.y] for p in message.positions], prediction.positions)
-        assert np.array_equal(message.strain, prediction.strain)
-    squeezed = Friction(FrictionState.SLIDING, (2, 5, 6), 0.729)
-    for given in (margins, replace(margins, in_contact=(3, 4)), replace(margins, friction=squeezed), None):
-        data = packed_margins(7, given, "" if given else "for a reason", "" if given else "0123456789abcdef")
-        message = store.deserialize_cdr(data, MARGINS.type_name)
-        assert bytes(store.serialize_cdr(message, MARGINS.type_name)) == data
-        assert message.valid == (given is not None)
-        assert message.scene_version == (SETUP.scene.version if given else "0123456789abcdef")
-        assert message.contact_state == (0 if given is None else 2 if given.in_contact else 1)
-        friction = given.friction if given else UNKNOWN
-        assert (message.friction_state, tuple(message.friction_nodes)) == (friction.state, friction.nodes)
-        assert message.slowdown == friction.slowdown
-        if given is not None:
-            assert message.barrier_names == list(given)
-            for index, (name, barrier) in enumerate(given.items()):
-                of_barrier = message.barrier == index
-                assert np.array_equal(message.clearance[of_barrier], barrier.clearance)
-                assert np.array_equal(message.node[of_barrier], barrier.node)
-                assert name in [entry.barrier for entry in message.minimum] or not len(barrier)
-            assert [entry.obstacle for entry in message.minimum] == [int(row.obstacle[0]) for row in given.minima]
-            read = margins_of(message)
-            assert list(read) == list(given)
-            assert read["obstacle"].value.tolist() == given["obstacle"].value.tolist()
-            assert (read.in_contact, read.friction) == (given.in_contact, given.friction)
 
 
 def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
@@ -414,3 +333,26 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
     said = [render_bag.decode().version for render_bag in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
     # So that what comes of it can be replayed in its turn.
     assert said[:2] == [SETUP.scene.version, scene.version]
+
+
+def test_the_true_pull_comes_with_the_pose_of_its_stamp(tmp_path: Path):
+    stamps = [k * 10**8 for k in range(1, 5)]
+    with BagWriter(tmp_path / "bag", {}) as bag:
+        for channel in (NEEDLE_POSE, GROUND_TRUTH_PULL):
+            bag.add_topic(channel.recorded, channel.type_name)
+        for k, stamp in enumerate(stamps):
+            pose = packed_pose(stamp, np.zeros(2), np.array([1.0, 0.0]))
+            bag.write(NEEDLE_POSE.recorded, stamp, pose)
+            pull = packed_wrench(stamp, np.array([1e-6 * k, math.nan if k == 1 else -2e-6]), 3e-9)
+            if k == 2:
+                pull = pull.replace(b"dish", b"else")
+            if k < 3:
+                bag.write(GROUND_TRUTH_PULL.recorded, stamp, pull)
+    reader = ObservationReader(
+        Recording(Bag(tmp_path / "bag")), read_setup("petri_35mm_polyamide"), "poses", 0.0, None, lambda share: None
+    )
+    first, *others = reader
+    assert first.true_pull == pytest.approx([0.0, -2e-6])
+    assert [len(each.true_pull) for each in others] == [0, 0, 0]
+    assert sum("thread_pull" in why for why in reader.refused) >= 1
+    assert [each.stamp for each in (first, *others)] == stamps

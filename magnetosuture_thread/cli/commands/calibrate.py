@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.cli.arguments import (
     DONE,
     Subparsers,
@@ -59,8 +59,6 @@ def add(subparsers: Subparsers) -> None:
         metavar="A,B",
         help="settings of thread_model to fit (default: all that can be)",
     )
-    fleet = "one stiffness over drag for all bags, and the viscosity of each (three bags or more)"
-    option("--fleet", action="store_true", help=fleet)
     cores = len(os.sched_getaffinity(0))
     workers = "processes (default: one for each processor, %(default)s); the result does not depend on it"
     option("--workers", type=whole_number, default=cores, metavar="N", help=workers)
@@ -92,52 +90,29 @@ def run_calibrate(options: argparse.Namespace) -> int:
     The parameters are the thread's bending stiffness over the liquid's drag, the drag's anisotropy, the intrinsic
     curvature, how and where the thread is fixed to the needle; with --formulation paper, kappa and W_stiff. Each
     comes with a 95 % interval. Unidentifiable parameters are reported with the reason, and left as in the setup.
-    Several bags are one fit, and each is predicted by a fit to the others besides.
-
-    With --fleet each bag is fitted by itself, and all are taken to show one thread in liquids whose viscosity differs:
-    FILE gets the stiffness over drag that they share, with an interval over the bags, and as comments the viscosity of
-    each over their mean. There is no picture.
+    Several bags are one fit, and each bag is also cross-validated against the rest.
 
     Bags with camera frames are tracked once; --source poses uses needle poses and measured threads as recorded. Only
     the ratio of stiffness and drag moves a thread, so elastic_modulus is written as the one that has the fitted ratio
     at the setup's viscosity.
 
     FILE gets the section thread_model, with what it rests on as comments. Put its lines into the setup's own section,
-    or give a node both files. Beside it a picture shows fit, residuals and intervals.
+    or give a node both files. Beside it a picture shows residuals and intervals.
 
     Ctrl-C ends it at any moment: the best so far is written, marked as such and without intervals, and the exit code
     is 130. Before there is any, nothing is written, and it is 1.
     """
     from magnetosuture_thread import calibrate_bags
-    from magnetosuture_thread.calibration.output import bag_table, calibration_lines, fleet_table, parameter_table
+    from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table
 
     console = make_console()
     log = make_log(console)
-    names = ("material", "formulation", "against", "parameters", "workers", "scheduler")
+    names = ("material", "formulation", "against", "parameters", "workers", "scheduler", "picture")
     given = {name: getattr(options, name) for name in names}
-    if options.fleet:
-        from magnetosuture_thread.jobs.calibrate_fleet import calibrate_fleet_bags
-
-        if options.picture is not None:
-            raise ConfigurationError("--picture", str(options.picture), "nothing: --fleet draws none")
-        with progress(console, "calibrate") as advance:
-            fleet = calibrate_fleet_bags(
-                options.bags,
-                options.output,
-                json_file=options.json,
-                log=log,
-                progress=advance,
-                **given,
-                **bag_selection(options),
-            )
-        console.print(fleet_table(fleet))
-        log(f"parameters: {options.output}")
-        return DONE
     with progress(console, "calibrate") as advance:
         found = calibrate_bags(
             options.bags,
             options.output,
-            picture=options.picture,
             json_file=options.json,
             log=log,
             progress=advance,

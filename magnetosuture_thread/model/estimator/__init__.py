@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from magnetosuture_thread.model.estimator.disturbance import Disturbance
 from magnetosuture_thread.model.estimator.estimate import ThreadEstimate
-from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
-from magnetosuture_thread.model.estimator.options import EstimatorOptions
+from magnetosuture_thread.model.estimator.estimator import EstimatorOptions, ThreadEstimator
 from magnetosuture_thread.model.estimator.session import EstimatorSession
-from magnetosuture_thread.model.estimator.slow_parameters import SlowParameter
+from magnetosuture_thread.model.estimator.stiffness import SlowParameter
 
 __all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "SlowParameter", "ThreadEstimate", "ThreadEstimator"]

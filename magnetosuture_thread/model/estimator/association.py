@@ -1,28 +1,45 @@
-"""Association: at which arc length of the thread each measured point lies.
+"""Association: at which arc length of the thread each measured point lies, or why a piece is refused.
 
 A piece is as long as the stretch of thread that it shows, so that all of its points follow from one number, the arc
 length at which it begins: that is given, or searched for along the prior. Each point is then projected onto the
-prior next to where its arc length says, in order along the piece.
+prior next to where its arc length says, in order along the piece. Lengths are in units of the segment length D.
 """
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 
+MAX_PIECES = 64  # of an observation
+MAX_POINTS = 4  # of a piece, for each segment that it could cover; of more, every so many is taken
+MIN_POINTS = 2  # of a piece
+MAX_COORDINATE = 10.0  # m; also the largest deviation
+MIN_DEVIATION = 5e-6  # m; standard deviation of a measured point, however good the camera says it is
+POINT_CORRELATION = 2.5e-4  # m along a piece; points closer than this err alike and share one point's information
+DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
+PATH_STEP = 20.0  # standard deviations; steps of a path over which its length is measured
 MAX_SKIPPED = 8  # points in a row that may be outliers
 PATH_ERROR = 0.005  # of an arc length that is measured along a piece
+LENGTH_ERROR = 0.005  # of the length, by which a thread is known to be longer or shorter than told
+WHOLE = 0.05  # of the length, by which a piece from the tail to the free end may differ and still be the thread
 SEARCH_POINTS = 24  # of a piece, which the search for its beginning compares
+GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
+OVERLAP = 0.5  # of a piece; where another piece shows so much of it already, it is a duplicate or of another thread
 
 
 @compiled
-def path_without_outliers(points: Points, spacing: float, penalty: float, kept: NDArray[np.bool_]) -> None:
-    """Mark the points of a piece that lie on its path.
+def path_without_outliers(points: Points, spacing: float, penalty: float) -> NDArray[np.bool_]:
+    """Return which points of a piece lie on its path, shape (m,).
 
     The path goes through the points in their order. A step costs what it is longer than twice the spacing of the
     points it leads over, a point left out costs `penalty`: a point far aside costs two long ways, one on the path
@@ -32,7 +49,6 @@ def path_without_outliers(points: Points, spacing: float, penalty: float, kept: 
         points: shape (m, 2).
         spacing: of the points, same unit.
         penalty: less than the distance of an outlier.
-        kept: written, shape (m,).
     """
     count = len(points)
     cost, before = np.empty(count), np.empty(count, dtype=np.int64)
@@ -46,98 +62,75 @@ def path_without_outliers(points: Points, spacing: float, penalty: float, kept: 
                 cost[i], before[i] = value, j
         if cost[i] + penalty * (count - 1 - i) <= best:
             best, last = cost[i] + penalty * (count - 1 - i), i
-    kept[:] = False
+    kept = np.zeros(count, dtype=np.bool_)
     while last >= 0:
         kept[last] = True
         last = before[last]
+    return kept
 
 
 @compiled
-def usable_points(
-    points: Points, deviation: Vector, largest: float, min_deviation: float, unit: float, max_points: int
-) -> tuple[Points, Vector, int]:
-    """Return the points of a piece that are finite, at most so many, and how many of all are.
+def path_lengths(points: Points, spacing: float) -> Vector:
+    """Return the arc length of each point of a noisy path, shape (m,).
 
-    Args:
-        points: shape (m, 2) [m].
-        deviation: of each, shape (m,) [m].
-        largest: coordinate and deviation [m].
-        min_deviation: what is less is taken as this [m].
-        unit: D, the unit of what is returned [m].
-        max_points: that are returned; of more, so many are taken evenly, with both ends.
-    """
-    good = np.empty(len(points), dtype=np.int64)
-    count = 0
-    for p in range(len(points)):
-        inside = abs(points[p, 0]) <= largest and abs(points[p, 1]) <= largest
-        if inside and 0.0 <= deviation[p] <= largest:
-            good[count] = p
-            count += 1
-    stride = max(1, -(-count // max_points))
-    taken = -(-count // stride)
-    places, deviations = np.empty((taken, 2)), np.empty(taken)
-    for k in range(taken):
-        p = good[k * (count - 1) // (taken - 1) if taken > 1 else 0]  # both ends are among them
-        places[k, 0], places[k, 1] = points[p, 0] / unit, points[p, 1] / unit
-        deviations[k] = max(deviation[p], min_deviation) / unit
-    return places, deviations, count
-
-
-@compiled
-def clean_path(
-    points: Points, deviation: Vector, detour: float, step: float, correlation: float
-) -> tuple[Points, Vector, Vector, Vector]:
-    """Return the points of a piece that lie on its path, their deviations, arc lengths and shares of information.
+    It is measured over steps of at least `spacing`, in which noise adds little; between their ends it is shared out.
 
     Args:
         points: shape (m, 2).
-        deviation: of each, shape (m,), same unit.
-        detour: deviations that noise may lengthen the path by at a point.
-        step: deviations, over which the path's length is measured.
-        correlation: length over which points err alike; those closer share one point's information.
+        spacing: same unit.
     """
-    count = len(points)
-    spacing = np.empty(count - 1)
-    for k in range(count - 1):
-        spacing[k] = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-    kept = np.ones(count, dtype=np.bool_)
-    usual = np.median(spacing)
-    if spacing.max() > 2.0 * usual:  # else the path through all points costs nothing
-        path_without_outliers(points, usual, detour * np.median(deviation), kept)
-    if not kept.all():
-        points, deviation = points[kept], deviation[kept]
-        count = len(points)
-    arcs, share = np.zeros(count), np.ones(count)
-    path_lengths(points, step * np.median(deviation), arcs)
-    for k in range(count):
-        own = 0.5 * (arcs[min(k + 1, count - 1)] - arcs[max(k - 1, 0)])
-        own *= 2.0 if k in (0, count - 1) else 1.0
-        share[k] = min(1.0, own / correlation)
-    return points, deviation, arcs, share
+    count, last = len(points), 0
+    arcs = np.zeros(count)
+    for p in range(1, count):
+        step = np.hypot(points[p, 0] - points[last, 0], points[p, 1] - points[last, 1])
+        if step < spacing and p < count - 1:
+            continue
+        total = 0.0
+        for k in range(last + 1, p + 1):
+            arcs[k] = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
+            total += arcs[k]
+        for k in range(last + 1, p + 1):
+            arcs[k] = arcs[k - 1] + (step * arcs[k] / total if total > 0.0 else 0.0)
+        last = p
+    return arcs
 
 
 @compiled
 def read_piece(
-    points: Points,
-    deviation: Vector,
-    largest: float,
-    min_deviation: float,
-    unit: float,
-    max_points: int,
-    detour: float,
-    step: float,
-    correlation: float,
-) -> tuple[Points, Vector, Vector, Vector, float, int]:
-    """Return `clean_path` of the `usable_points` of a piece, with variances for deviations.
+    points: Points, deviation: Vector, unit: float, max_points: int
+) -> tuple[Points, Vector, Vector, Vector]:
+    """Return the points of a piece that lie on its path, their deviations, arc lengths and shares of information.
 
-    Besides the mean of the deviations, and how many points are finite; with fewer than two of them nothing is cleaned.
-    The arguments are those of the two functions.
+    Args:
+        points: shape (m, 2) [m]; those that are not finite or out of bounds are left out.
+        deviation: of each, shape (m,) [m].
+        unit: D, the unit of what is returned [m].
+        max_points: that are returned; of more, so many are taken evenly, with both ends.
     """
-    places, deviations, count = usable_points(points, deviation, largest, min_deviation, unit, max_points)
-    arcs, share = np.zeros(len(places)), np.ones(len(places))
-    if count >= 2:
-        places, deviations, arcs, share = clean_path(places, deviations, detour, step, correlation)
-    return places, deviations**2, arcs, share, deviations.mean() if len(deviations) else 0.0, count
+    finite = np.empty(len(points), dtype=np.int64)
+    count = 0
+    for p in range(len(points)):
+        inside = abs(points[p, 0]) <= MAX_COORDINATE and abs(points[p, 1]) <= MAX_COORDINATE
+        if inside and 0.0 <= deviation[p] <= MAX_COORDINATE:
+            finite[count] = p
+            count += 1
+    taken = -(-count // max(1, -(-count // max_points)))
+    chosen = finite[np.arange(taken) * (count - 1) // max(taken - 1, 1)]
+    path, deviations = points[chosen] / unit, np.maximum(deviation[chosen], MIN_DEVIATION) / unit
+    if taken >= MIN_POINTS:
+        spacing = np.hypot(path[1:, 0] - path[:-1, 0], path[1:, 1] - path[:-1, 1])
+        usual = np.median(spacing)
+        if spacing.max() > 2.0 * usual:  # else the path through all points costs nothing
+            kept = path_without_outliers(path, usual, DETOUR * np.median(deviations))
+            path, deviations = path[kept], deviations[kept]
+    last = len(path) - 1
+    if last < 1:
+        return path, deviations, np.zeros(last + 1), np.ones(last + 1)
+    arcs, share = path_lengths(path, PATH_STEP * np.median(deviations)), np.empty(last + 1)
+    for k in range(last + 1):
+        own = 0.5 * (arcs[min(k + 1, last)] - arcs[max(k - 1, 0)]) * (2.0 if k in (0, last) else 1.0)
+        share[k] = min(1.0, own * unit / POINT_CORRELATION)
+    return path, deviations, arcs, share
 
 
 @compiled
@@ -197,32 +190,6 @@ def search_start(
 
 
 @compiled
-def path_lengths(points: Points, spacing: float, arcs: Vector) -> None:
-    """Write the arc length of each point of a noisy path.
-
-    It is measured over steps of at least `spacing`, in which noise adds little; between their ends it is shared out.
-
-    Args:
-        points: shape (m, 2).
-        spacing: same unit.
-        arcs: written, shape (m,).
-    """
-    count, last = len(points), 0
-    arcs[0] = 0.0
-    for p in range(1, count):
-        step = np.hypot(points[p, 0] - points[last, 0], points[p, 1] - points[last, 1])
-        if step < spacing and p < count - 1:
-            continue
-        total = 0.0
-        for k in range(last + 1, p + 1):
-            arcs[k] = np.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
-            total += arcs[k]
-        for k in range(last + 1, p + 1):
-            arcs[k] = arcs[k - 1] + (step * arcs[k] / total if total > 0.0 else 0.0)
-        last = p
-
-
-@compiled
 def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: float) -> tuple[Vector, Vector, int]:
     """Project a piece's points onto the thread, each next to where its arc length says.
 
@@ -275,3 +242,202 @@ def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: fl
         innovation[p] = value
         count += 1
     return place, innovation, count
+
+
+class PlacedPiece(NamedTuple):
+    """A piece on the thread, in units of the segment length D.
+
+    Attributes:
+        points: that are no outliers, shape (m, 2) [D].
+        variance: across the thread, shape (m,) [D^2].
+        share: of its information that is a point's own, shape (m,).
+        arcs: from the first point, shape (m,) [D].
+        start: arc length of the first point [D].
+        slack: how far from its arc length the first point may lie [D].
+        attached: whether it begins at the needle's tail.
+        free_end: whether it ends where the thread ends.
+        square: mean squared distance from the prior [D^2].
+    """
+
+    points: Points
+    variance: Vector
+    share: Vector
+    arcs: Vector
+    start: float
+    slack: float
+    attached: bool
+    free_end: bool
+    square: float
+
+    def projected(self, nodes: Points) -> tuple[Vector, Vector, int]:
+        """Return what `project` makes of its points on a thread."""
+        return project(nodes, self.points, self.arcs, self.start, self.slack)
+
+
+def place_pieces(
+    observation: ThreadObservation, nodes: Points, variance: Vector, unit: float
+) -> tuple[list[PlacedPiece], list[str]]:
+    """Return the pieces that are of this thread, and the reason for each that is refused.
+
+    Args:
+        observation: from the camera.
+        nodes: of the predicted thread, shape (n + 1, 2) [D].
+        variance: of each across the thread, shape (n + 1,) [D^2].
+        unit: D [m].
+    """
+    segments, pieces = len(nodes) - 1, observation.pieces
+    covered = np.zeros(segments, dtype=np.bool_)
+    placed: list[PlacedPiece] = []
+    problems: list[str] = []
+    if len(pieces) > MAX_PIECES:
+        problems.append(f"{len(pieces)} pieces, more than {MAX_PIECES}; the others are ignored")
+    # Pieces whose place is known come first, whatever the order in which they were given.
+    for piece in sorted(pieces[:MAX_PIECES], key=_order):
+        found = _place(piece, nodes, variance, unit)
+        if isinstance(found, str):
+            problems.append(found)
+            continue
+        low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
+        if placed and high > low and np.count_nonzero(covered[low:high]) > OVERLAP * (high - low):
+            problems.append("a piece lies where another one shows the thread already")
+            continue
+        covered[low:high] = True
+        placed.append(found)
+    return placed, problems
+
+
+def _order(piece: ThreadPiece) -> tuple[bool, bool, float]:
+    known = _known(piece)
+    return piece.first_end is not PieceEnd.TAIL, not known, piece.arc_length[0] if known else math.inf
+
+
+def _known(piece: ThreadPiece) -> bool:
+    return math.isfinite(piece.arc_length[0]) and math.isfinite(piece.arc_length[1])
+
+
+def _place(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float) -> PlacedPiece | str:
+    """Return a piece on the thread, or why it is none of it."""
+    points, segments = np.ascontiguousarray(piece.points, dtype=np.float64), len(nodes) - 1
+    deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
+        return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
+    points, deviation, arcs, share = read_piece(points, deviation, unit, MAX_POINTS * segments)
+    if len(points) < MIN_POINTS:
+        return "a piece has fewer than two finite points on a path"
+    length = float(arcs[-1])
+    if not length > 0.0:
+        return "a piece has no length"
+    if length * (1.0 - WHOLE) > segments:
+        return f"a piece {length * unit * 1e3:.1f} mm long, longer than the thread"
+    first, last = piece.first_end, piece.last_end
+    if {first, last} == {PieceEnd.TAIL, PieceEnd.FREE} and abs(length / segments - 1.0) < WHOLE:
+        arcs *= segments / length
+    attached, known = first is PieceEnd.TAIL, _known(piece)
+    low, high = 0.0, 0.0 if attached else max(segments - float(arcs[-1]), 0.0)
+    if known:
+        low, high = sorted(value / unit for value in piece.arc_length)
+    cap = (0.25 * segments) ** 2
+    start, square = search_start(nodes, points, arcs, low, high, cap)
+    if not piece.direction_known:
+        turned = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
+        other, other_square = search_start(nodes, *turned, low, high, cap)
+        if other_square < square:
+            (points, arcs), deviation, share, last = turned, deviation[::-1].copy(), share[::-1].copy(), first
+            start, square = other, other_square
+    # A place that was searched for is as good as the prior lets it be.
+    slack = 2.0 * float(deviation.mean()) + (0.25 if high > low else 0.0)
+    found = PlacedPiece(points, deviation**2, share, arcs, start, slack, attached, last is PieceEnd.FREE, square)
+    return found if known or attached else _problem_of(found, nodes, variance) or found
+
+
+def _problem_of(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
+    """Return why a piece of unknown arc length cannot be of this thread, or nothing."""
+    place, innovation, _ = piece.projected(nodes)
+    on = np.isfinite(place)
+    if on.sum() < max(MIN_POINTS, 0.5 * len(place)):
+        return "a piece lies beyond the thread's ends"
+    prior = np.interp(place[on], np.arange(len(nodes)), variance)
+    # Whether as much of it as could be is in the gate: one or two far points are outliers.
+    off = innovation[on] ** 2 / (prior + piece.variance[on])
+    if float(np.median(off)) > GATE**2 or float((off > GATE**2).mean()) > 0.3:
+        return "a piece lies too far from the predicted thread: it is of another one"
+    return ""
+
+
+class MeasuredPoints(NamedTuple):
+    """Points that are associated with the thread.
+
+    Attributes:
+        place: arc length, shape (m,) [D].
+        innovation: across the thread, shape (m,) [D].
+        variance: of each point across the thread, shape (m,) [D^2].
+        share: part of its information that is its own, shape (m,).
+        weight: robust weight of each, at most 1, shape (m,); rewritten by each use.
+        end: innovation of the free end along the thread and the variance of it, inf if it is not seen [D], [D^2].
+    """
+
+    place: Vector
+    innovation: Vector
+    variance: Vector
+    share: Vector
+    weight: Vector
+    end: tuple[float, float] = (0.0, math.inf)
+
+
+class AssociationInput(NamedTuple):
+    """The predicted thread that points are associated with.
+
+    Attributes:
+        nodes: shape (n + 1, 2) [D].
+        end_variance: of the last node [D^2].
+        unit: D [m].
+        workspace: the obstacles.
+        margin: how deep the way from a point to the thread must lead into one to be refused [m].
+        scale: factor on the points' variance.
+    """
+
+    nodes: Points
+    end_variance: float
+    unit: float
+    workspace: Workspace
+    margin: float
+    scale: float
+
+
+def measured_points(placed: list[PlacedPiece], given: AssociationInput) -> tuple[MeasuredPoints | None, list[str]]:
+    """Return the points of all pieces on the thread, None if there is none, and why points are refused."""
+    nodes, unit, workspace = given.nodes, given.unit, given.workspace
+    found, problems = [], []
+    for piece in placed:
+        place, innovation, count = piece.projected(nodes)
+        good = np.isfinite(place)
+        far = np.flatnonzero(good & (np.abs(innovation) > 0.5)) if len(workspace.shapes) else ()
+        if len(far):
+            at = np.minimum(place[far].astype(np.int64), len(nodes) - 2)
+            part = (place[far] - at)[:, None]
+            start = ((1.0 - part) * nodes[at] + part * nodes[at + 1]) * unit
+            for share in (0.25, 0.5, 0.75):  # of the way from the thread to the point
+                near = workspace.near(start + share * (piece.points[far] * unit - start))
+                good[far[near.node[near.distance < -given.margin]]] = False
+            if (refused := count - int(good.sum())) > 0:
+                problems.append(f"{refused} points lie beyond an obstacle")
+        if good.any():
+            found.append([each[good] for each in (place, innovation, given.scale * piece.variance, piece.share)])
+    if not found:
+        return None, problems
+    place, innovation, variance, share = (np.concatenate(each) for each in zip(*found, strict=True))
+    end = _free_end(placed, nodes, given.end_variance)
+    return MeasuredPoints(place, innovation, variance, share, np.ones(len(place)), end), problems
+
+
+def _free_end(placed: list[PlacedPiece], nodes: Points, variance: float) -> tuple[float, float]:
+    """Return by how much farther along the thread its free end is seen [D], and the variance of it [D^2]."""
+    for piece in placed:
+        if piece.free_end:
+            (ax, ay), (bx, by) = nodes[-2:].tolist()
+            px, py = piece.points[-1].tolist()
+            off = ((px - bx) * (bx - ax) + (py - by) * (by - ay)) / math.hypot(bx - ax, by - ay)
+            deviation = LENGTH_ERROR * (len(nodes) - 1)
+            if abs(off) < 6.0 * (deviation + math.sqrt(variance)):
+                return off, deviation**2 + float(piece.variance[-1])
+    return 0.0, math.inf

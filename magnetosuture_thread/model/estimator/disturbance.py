@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator.relaxation import relax, significance
 from magnetosuture_thread.model.thread import Attachment, Thread
 
 Vector = NDArray[np.float64]
 
+AVERAGING_TIME = 0.4  # s; over which corrections are added up
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
-STRAIGHT = np.zeros(2)  # a heading that is right
 CONFIRMED = 0.25  # of the averaging time, for which it must last
 CONTACT_TIME = 3.0  # averaging times, in which what a known contact did is forgotten
 
@@ -68,6 +68,77 @@ def _way(x: float, y: float) -> str:
     words = ["to the right" if x > 0.0 else "to the left"] if abs(x) > math.sin(math.pi / 8.0) else []
     words += ["up" if y > 0.0 else "down"] if abs(y) > math.sin(math.pi / 8.0) else []
     return " and ".join(reversed(words))
+
+
+class BendingRelaxation:
+    """What the rod's own bending makes of a displacement across it.
+
+        (1 + a C' C) e' = e,    a = dt EI / (zeta D^4),    (C e)_i = e_{i-1} - 2 e_i + e_{i+1}
+
+    is an implicit step of a straight rod in a viscous liquid, without tension, from the displacement e. The node at the
+    needle is given; where the thread is clamped, so is its direction there.
+
+    Args:
+        segments: n.
+        clamped: whether the direction at the needle is given.
+    """
+
+    def __init__(self, segments: int, clamped: bool) -> None:
+        curvature = np.diff(np.eye(segments + 1), 2, axis=0)
+        if clamped:  # half a segment of curvature 2 (e_1 - e_0 - slope)
+            first = math.sqrt(2.0) * (np.eye(1, segments + 1, 1) - np.eye(1, segments + 1))
+            curvature = np.vstack([first, curvature])
+        matrix = curvature.T @ curvature
+        self._at_needle, self._clamped = matrix[1:, :1], clamped
+        self._eigenvalues, self._modes = np.linalg.eigh(matrix[1:, 1:])
+
+    def relaxed(self, amount: float, displacement: Points, slope: Vector | float = 0.0) -> Points:
+        """Return e'.
+
+        Args:
+            amount: a.
+            displacement: e, with that of the needle as its first row, shape (n + 1, k).
+            slope: by how much the first node is displaced farther than the needle, if clamped, shape (k,).
+        """
+        right = displacement[1:] - amount * self._at_needle * displacement[0]
+        if self._clamped:
+            right[0] += 2.0 * amount * slope
+        modes = (self._modes.T @ right) / (1.0 + amount * np.maximum(self._eigenvalues, 0.0))[:, None]
+        return np.vstack([displacement[:1], self._modes @ modes])
+
+
+@compiled
+def significance(
+    displacement: Points, normals: Points, variance: Vector, response: Points, deviations: Vector
+) -> float:
+    """Return how significant a displacement is in its worst window, against what needs no disturbance.
+
+        z = |mean displacement| / (2 r + sum_j (g_j s_j)^2)^(1/2)
+
+    Of a right model the displacement is a difference of two errors of the estimate, and neither is larger than that of
+    the points alone, r; and g_j s_j are what errors of the needle's pose displace it by.
+
+    Args:
+        displacement: shape (n + 1, 2).
+        normals: of the nodes, shape (n + 1, 2).
+        variance: r of the mean of a window's points, inf where nothing is measured, shape (w,).
+        response: g, displacement of each node across the thread by each error of the pose, shape (n + 1, 2).
+        deviations: s, standard deviation of each error of the pose, shape (2,).
+    """
+    windows, nodes = len(variance), len(displacement)
+    sums, count = np.zeros((windows, 3)), np.zeros(windows)
+    for i in range(1, nodes):
+        w = i * windows // nodes
+        sums[w, 0] += normals[i, 0] * displacement[i, 0] + normals[i, 1] * displacement[i, 1]
+        sums[w, 1] += response[i, 0] * deviations[0]
+        sums[w, 2] += response[i, 1] * deviations[1]
+        count[w] += 1.0
+    largest = 0.0
+    for w in range(windows):
+        if count[w] > 0.0:
+            mean = sums[w] / count[w]
+            largest = max(largest, abs(mean[0]) / np.sqrt(2.0 * variance[w] + mean[1] ** 2 + mean[2] ** 2))
+    return largest
 
 
 def force_density(
@@ -143,10 +214,12 @@ def strongest(force: Vector, positions: Points, unit: float, significance: float
 class DisturbanceTest:
     """Tests whether the camera moves the thread farther than model, camera and needle can be wrong.
 
+    Arrays are replaced and never written to, so that a shallow copy keeps a state.
+
     What corrections move the thread by is added up, and relaxes by bending meanwhile, as a thread does that is
     displaced:
 
-        (1 + a C' C) e_k = exp(-dt / T) e_{k-1} + d_k        see `relax`
+        (1 + a C' C) e_k = exp(-dt / T) e_{k-1} + d_k        see `BendingRelaxation`
 
     so e is by how much a model that was left alone over the time T would have gone another way. Of a pose of the
     needle, a shape or a camera that is a little off, that stays about as much: a sum of the corrections alone would
@@ -159,44 +232,25 @@ class DisturbanceTest:
 
     Args:
         thread: the thread.
-        time: T, over which corrections are added up [s].
     """
 
-    def __init__(self, thread: Thread, time: float) -> None:
-        self._use(thread, time)
-        self._displacement = np.zeros((thread.segments + 1, 2))  # e [m]
-        self._explained = np.zeros_like(self._displacement)  # of it, by forces of known contacts [m]
-        self._untouched = np.full(thread.segments + 1, np.inf)  # time since a contact pushed each node [s]
+    def __init__(self, thread: Thread) -> None:
+        nodes = thread.segments + 1
+        self._thread = thread
+        self._rate = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)  # 1/s
+        self._bending = BendingRelaxation(thread.segments, thread.attachment is Attachment.CLAMPED)
+        # Displacement of the nodes over that of the tail, and over an error of the heading [m/rad].
+        slope, tail = np.array([0.0, thread.segment_length]), np.zeros((nodes, 2))
+        tail[0, 0] = 1.0
+        self._response = self._bending.relaxed(AVERAGING_TIME * self._rate, tail, slope)
+        self._displacement = self._explained = np.zeros((nodes, 2))  # e, and of it by forces of known contacts [m]
+        self._untouched = np.full(nodes, np.inf)  # time since a contact pushed each node [s]
         self._since, self._significance = math.nan, 0.0
         self._gap = False
 
-    def _use(self, thread: Thread, time: float) -> None:
-        self._thread, self._time = thread, time
-        self._clamped = thread.attachment is Attachment.CLAMPED
-        self._stiffness = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)  # 1/s
-        # Displacement of the nodes over that of the tail, and over an error of the heading [m/rad].
-        self._response = np.zeros((thread.segments + 1, 2))
-        self._response[0, 0] = 1.0
-        relax(time * self._stiffness, self._clamped, np.array([0.0, thread.segment_length]), self._response)
-
     def copied(self) -> DisturbanceTest:
         """Return a copy."""
-        other = copy.copy(self)
-        other._displacement, other._explained = self._displacement.copy(), self._explained.copy()
-        other._untouched = self._untouched.copy()
-        return other
-
-    def resampled(self, thread: Thread, time: float) -> DisturbanceTest:
-        """Return the same test of another thread, or with another averaging time [s]."""
-        other = copy.copy(self)
-        other._use(thread, time)
-        nodes = self._thread.segment_length * np.arange(self._thread.segments + 1)
-        at = thread.segment_length * np.arange(thread.segments + 1)
-        other._displacement = np.column_stack([np.interp(at, nodes, along) for along in self._displacement.T])
-        other._explained = np.column_stack([np.interp(at, nodes, along) for along in self._explained.T])
-        nearest = np.rint(at / self._thread.segment_length).astype(np.int64)
-        other._untouched = self._untouched[np.minimum(nearest, self._thread.segments)]
-        return other
+        return copy.copy(self)
 
     def decay(self, interval: float, in_contact: NDArray[np.bool_]) -> None:
         """Let time pass.
@@ -206,11 +260,10 @@ class DisturbanceTest:
             in_contact: nodes that known shapes or the wall pushed meanwhile, shape (n + 1,).
         """
         # Nobody knows which way the needle went in a gap between poses, so the next correction says nothing.
-        self._gap = self._gap or interval > self._time
-        self._displacement *= math.exp(-interval / self._time)
-        relax(interval * self._stiffness, self._clamped, STRAIGHT, self._displacement)
-        self._untouched += interval
-        self._untouched[in_contact] = 0.0
+        self._gap = self._gap or interval > AVERAGING_TIME
+        decayed = math.exp(-interval / AVERAGING_TIME) * self._displacement
+        self._displacement = self._bending.relaxed(interval * self._rate, decayed)
+        self._untouched = np.where(in_contact, 0.0, self._untouched + interval)
 
     def add(self, moved: Points, normals: Points, variance: Vector, stamp: float, deviations: Vector) -> None:
         """Add a correction.
@@ -225,8 +278,7 @@ class DisturbanceTest:
         if self._gap:
             self._gap = False
             return
-        self._displacement += moved
-        self._explained[:] = 0.0
+        self._displacement, self._explained = self._displacement + moved, np.zeros_like(moved)
         self._significance = significance(self._displacement, normals, variance, self._response, deviations)
         if self._significance > LOST:
             explained = self._by_contacts(normals)
@@ -241,9 +293,9 @@ class DisturbanceTest:
     def _by_contacts(self, normals: Points) -> Points:
         """Return the displacement by forces at the nodes of known contacts that comes closest to e, shape (n + 1, 2).
 
-        A force on node c displaces as `relax` says of a load there.
+        A force on node c displaces as `BendingRelaxation` says of a load there.
         """
-        touched = np.flatnonzero(self._untouched <= CONTACT_TIME * self._time)
+        touched = np.flatnonzero(self._untouched <= CONTACT_TIME * AVERAGING_TIME)
         touched = touched[touched > 0]
         if not len(touched):
             return np.zeros_like(normals)
@@ -252,7 +304,7 @@ class DisturbanceTest:
         for node in sorted({int(end) for run in runs for end in (run[0], run[-1])}):
             loads = np.zeros_like(normals)
             loads[node] = 1.0
-            relax(self._time * self._stiffness, self._clamped, STRAIGHT, loads)
+            loads = self._bending.relaxed(AVERAGING_TIME * self._rate, loads)
             columns += [loads * (1.0, 0.0), loads * (0.0, 1.0)]
         responses = np.array(columns)
         responses /= np.maximum(np.linalg.norm(responses, axis=(1, 2)), 1e-12)[:, None, None]
@@ -263,14 +315,14 @@ class DisturbanceTest:
 
     def confirmed(self, stamp: float) -> bool:
         """Return whether the camera has moved the thread too far for long."""
-        return stamp - self._since >= CONFIRMED * self._time
+        return stamp - self._since >= CONFIRMED * AVERAGING_TIME
 
     def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
         """Return the forces that explain what the camera moves the thread by, if it does so for long."""
         if not self.confirmed(stamp):
             return ()
         thread = self._thread
-        drag, bending = thread.medium, thread.bending_stiffness * self._time
-        rate = (self._displacement - self._explained) / self._time
+        drag, bending = thread.medium, thread.bending_stiffness * AVERAGING_TIME
+        rate = (self._displacement - self._explained) / AVERAGING_TIME
         force = force_density(rate, positions, drag.drag_across, drag.drag_along, bending)
         return (strongest(force, positions, thread.segment_length, self._significance, self._since),)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -12,10 +13,8 @@ from numpy.typing import NDArray
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.model.estimator.disturbance import Disturbance, DisturbanceTest
-from magnetosuture_thread.model.estimator.innovations import Innovations
-from magnetosuture_thread.model.estimator.noise_model import NoiseModel
-from magnetosuture_thread.model.estimator.options import EstimatorOptions
-from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameter
+from magnetosuture_thread.model.estimator.noise import Innovations, NoiseModel
+from magnetosuture_thread.model.estimator.stiffness import LearnedState, SlowParameter
 from magnetosuture_thread.model.formulations import ThreadState
 from magnetosuture_thread.model.formulations.step import WarmStart
 from magnetosuture_thread.model.margins import SOLID, Margins
@@ -121,40 +120,31 @@ def _bound(rows: BarrierRows, covariance: NDArray[np.float64], of_segments: bool
     return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
 
 
-@dataclass(frozen=True)
+@dataclass
 class FilterState:
-    """Everything that the next step and correction depend on."""
+    """Everything that the next step and correction depend on.
 
-    prediction: Prediction
-    converged: bool
-    pose: NeedlePose
-    thread: ThreadState
-    warm_start: WarmStart
-    density: Vector
-    variance: Vector
+    Attributes:
+        errors: variance and density of each node, see `noise`, shape (2, n + 1) [D^2].
+        noise: what is learned of the noise.
+        test: for disturbances.
+        measured_at: stamp of the last measurement, -inf before the first [s].
+        gross: number of frames in a row that showed the thread somewhere else.
+        unknown: whether nobody has seen the thread's shape.
+        converged: whether the barriers themselves hold.
+        prediction: the last step.
+        pose, thread, warm_start, learned: of predictor, formulation and `StiffnessLearner`; set in a snapshot.
+    """
+
+    errors: Points
     noise: NoiseModel
     test: DisturbanceTest
-    measured_at: float
-    gross: int
-    unknown: bool
-    slow: LearnedState
-
-    def resampled(self, before: Thread, thread: Thread, options: EstimatorOptions) -> FilterState:
-        """Return the state of the filter of another thread that takes this one's place.
-
-        Args:
-            before: the thread that this is the state of.
-            thread: the thread that takes its place.
-            options: of its estimator.
-        """
-        old, new = before.segment_length, thread.segment_length
-        nodes, at = old * np.arange(before.segments + 1), new * np.arange(thread.segments + 1)
-        scale = (old / new) ** 2
-        return replace(
-            self,
-            thread=self.thread.resampled(before, thread),
-            density=scale * np.interp(at, nodes, self.density),
-            variance=scale * np.interp(at, nodes, self.variance),
-            noise=self.noise.copied(options.noise_time),
-            test=self.test.resampled(thread, options.disturbance_time),
-        )
+    measured_at: float = -math.inf
+    gross: int = 0
+    unknown: bool = True
+    converged: bool = False
+    prediction: Prediction | None = None
+    pose: NeedlePose | None = None
+    thread: ThreadState | None = None
+    warm_start: WarmStart | None = None
+    learned: LearnedState | None = None

@@ -3,44 +3,78 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.arguments import checked_arguments
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.barrier import BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.model.estimator.correction import MeasuredPoints
-from magnetosuture_thread.model.estimator.corrector import Corrector
-from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
-from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
-from magnetosuture_thread.model.estimator.innovations import Innovations, WindowSums, weigh
-from magnetosuture_thread.model.estimator.noise import WINDOWS, interpolate_to_nodes
-from magnetosuture_thread.model.estimator.noise_model import NoiseModel, propagate_errors, take_correction
-from magnetosuture_thread.model.estimator.options import EstimatorOptions
-from magnetosuture_thread.model.estimator.pieces import (
+from magnetosuture_thread.model.estimator.association import (
+    MIN_DEVIATION,
+    POINT_CORRELATION,
+    AssociationInput,
+    MeasuredPoints,
     PlacedPiece,
-    continued,
-    free_end,
     measured_points,
     place_pieces,
-    smoothed_line,
 )
-from magnetosuture_thread.model.estimator.slow_parameters import LearnedState, SlowParameters
+from magnetosuture_thread.model.estimator.correction import CorrectionResult, Corrector, Prior
+from magnetosuture_thread.model.estimator.disturbance import DisturbanceTest
+from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
+from magnetosuture_thread.model.estimator.noise import Innovations, NoiseModel, at_nodes, propagate_errors, weigh
+from magnetosuture_thread.model.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
-from magnetosuture_thread.model.prediction import NeedlePose, Prediction
+from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 
+ERROR_CORRELATION = 0.1  # of the length, over which the model's errors are alike
+INITIAL_ERROR = 0.2  # standard deviation of the free end of a thread whose shape nobody has seen, of the length
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
 SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 MIN_VARIANCE = 1e-12  # D^2
 MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
+
+
+@checked_arguments("estimator")
+@dataclass(frozen=True)
+class EstimatorOptions:
+    """What a laboratory may choose of the estimator.
+
+    Attributes:
+        history: how late an observation may come [s].
+        slow_parameters: what is learned of the thread on line: nothing, `stiffness_over_drag`, or `auto`: stiffness
+            over drag, from the first time on that the thread moves as the model cannot explain.
+
+    Raises:
+        ConfigurationError: a value is out of bounds, or a parameter is unknown.
+    """
+
+    history: Annotated[float, bounded("s", 1e-3, 1e5)] = 1.0
+    slow_parameters: tuple[str, ...] = (AUTOMATIC,)
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        if self.slow_parameters not in ((), (AUTOMATIC,), (STIFFNESS_OVER_DRAG,)):
+            expected = f"{STIFFNESS_OVER_DRAG} or {AUTOMATIC} alone, or nothing"
+            raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
+
+
+class _Correction(NamedTuple):
+    """What came of a frame's points; see `ThreadEstimate`."""
+
+    result: CorrectionResult
+    innovations: Innovations
+    points: int
+    hidden: float = 1.0
 
 
 class ThreadEstimator:
@@ -54,7 +88,7 @@ class ThreadEstimator:
 
     Args:
         predictor: steps the thread; formulation `rod`, in the plane. The estimator moves its state.
-        options: how much camera and model are trusted.
+        options: what may be chosen.
 
     Raises:
         ConfigurationError: the predictor's formulation is not `rod`, or it is not in the plane.
@@ -69,29 +103,16 @@ class ThreadEstimator:
             raise ConfigurationError("dimension", formulation.dimension, "2: a camera measures in the plane")
         self.predictor, self.thread = predictor, predictor.thread
         self.options = options or EstimatorOptions()
-        self._formulation = formulation
-        self._unit = self.thread.segment_length
-        self._length = max(self.options.error_correlation * self.thread.segments, 0.5)
-        self._corrector = Corrector(predictor, formulation, self._length)
-        self._slow = SlowParameters(predictor, self.options)
-        self._prediction: Prediction | None = None
-        self._converged = False
-        self._sums = WindowSums.of(WINDOWS)
-        self._forget()
+        self._formulation, self._unit = formulation, self.thread.segment_length
+        self._length = max(ERROR_CORRELATION * self.thread.segments, 0.5)  # l [D]
+        self._corrector = Corrector(predictor, formulation)
+        self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
+        self._now = self._forgotten()
 
-    def _forget(self) -> None:
-        nodes = self.thread.segments + 1
-        self._density, self._variance = np.zeros(nodes), np.zeros(nodes)  # D^2
-        self._noise = NoiseModel(self.options.noise_time)
-        self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
-        self._measured_at = -math.inf
-        self._gross, self._unknown = 0, True
-        self._slow.reset()
-
-    @property
-    def learned(self) -> LearnedState:
-        """What is known of the slow parameters."""
-        return self._slow.state
+    def _forgotten(self) -> FilterState:
+        self._stiffness.reset()
+        errors = np.zeros((2, self.thread.segments + 1))
+        return FilterState(errors, NoiseModel(), DisturbanceTest(self.thread))
 
     @property
     def started(self) -> bool:
@@ -106,6 +127,7 @@ class ThreadEstimator:
         piece = ThreadPiece(points, np.full(50, 1e-5), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), False)
         pose = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
         self.start(pose, path)
+        self.correct(ThreadObservation((piece,), True))
         self.step(replace(pose, stamp=0.01), ThreadObservation((piece,), True))
         self.reset()
         self.predictor.added.first_time = math.inf
@@ -113,8 +135,7 @@ class ThreadEstimator:
     def reset(self) -> None:
         """Forget the thread; the next call must be `start`."""
         self.predictor.reset()
-        self._prediction = None
-        self._forget()
+        self._now = self._forgotten()
 
     def start(
         self, pose: NeedlePose, centreline: Points | None = None, deviation: float | None = None
@@ -125,23 +146,27 @@ class ThreadEstimator:
             pose: the needle.
             centreline: measured, from the needle's tail on, shape (m, 2) [m]; it may end early. None is a thread that
                 lies straight behind the needle, of which nothing is known.
-            deviation: of the centreline [m]; None for `initial_error`, which grows along the thread.
+            deviation: of the centreline [m]; None for that of a measured one.
 
         Raises:
             InvalidInputError: see `ThreadPredictor.start`.
         """
-        self._prediction = self.predictor.start(pose, centreline, strict=False)
-        self._converged = self._prediction.converged
-        self._forget()
-        arcs = np.arange(self.thread.segments + 1.0)
-        variance = (self.options.initial_error * arcs) ** 2
+        prediction = self.predictor.start(pose, centreline, strict=False)
+        seen, known = 0.0, 0.0
         if centreline is not None:
-            seen = arc_lengths(centreline)[-1] / self._unit
-            known = (LAID_DEVIATION * self.options.min_deviation if deviation is None else deviation) / self._unit
-            variance = known**2 + (self.options.initial_error * np.maximum(arcs - seen, 0.0)) ** 2
-        self._set_variance(variance)
-        self._unknown = centreline is None
-        return self._estimate(())
+            seen = float(arc_lengths(centreline)[-1]) / self._unit
+            known = (LAID_DEVIATION * MIN_DEVIATION if deviation is None else deviation) / self._unit
+        self._now = now = self._forgotten()
+        now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
+        now.errors = self._errors_of(seen, known**2)
+        return self._estimate([])
+
+    def _errors_of(self, seen: float, variance: float) -> Points:
+        """Return the errors of a shape that is known up to an arc length [D] with a variance [D^2]."""
+        beyond = np.maximum(np.arange(self.thread.segments + 1.0) - seen, 0.0)
+        found = variance + (INITIAL_ERROR * beyond) ** 2
+        found[0] = 0.0
+        return np.array([found, 2.0 * self._length * found])
 
     def start_observed(self, pose: NeedlePose, observation: ThreadObservation) -> ThreadEstimate:
         """Set the thread's shape along the piece that leaves the needle; without one, straight behind it."""
@@ -159,64 +184,58 @@ class ThreadEstimator:
             InvalidInputError: see `ThreadPredictor.step`.
             SolverError: see `ThreadPredictor.step`.
         """
-        before = self.predictor.state
-        self._prediction = self._slow.step(pose)
-        self._converged = self._prediction.converged
+        before, now = self.predictor.state, self._now
+        now.prediction = prediction = self._stiffness.step(pose)
+        now.converged = prediction.converged
         state = self.predictor.state
         assert before is not None
         assert state is not None
-        propagate_errors(
-            np.ascontiguousarray(state.positions),
-            np.ascontiguousarray(before.positions),
-            self._unit,
-            self._noise.bank.intensity,
-            self._prediction.interval,
-            2.0 * self._length,
-            self._variance,
-            self._density,
-        )
-        self._test.decay(self._prediction.interval, self._formulation.nodes_in_contact)
-        return self.correct(observation) if observation is not None else self._estimate(())
+        noise = at_nodes(now.noise.intensity, self.thread.segments + 1)
+        noise[0] = 0.0
+        added = noise * np.array([[1.0], [2.0 * self._length]]) * (prediction.interval / self._unit**2)
+        here, there = np.ascontiguousarray(state.positions), np.ascontiguousarray(before.positions)
+        now.errors = propagate_errors(here, there, self._unit, added, now.errors)
+        now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        return self.correct(observation) if observation is not None else self._estimate([])
 
     def correct(self, observation: ThreadObservation) -> ThreadEstimate:
         """Correct the thread at the last pose by an observation of the same instant."""
-        state, pose = self.predictor.state, self.predictor.pose
+        state, pose, unit = self.predictor.state, self.predictor.pose, self._unit
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
-        unit = self._unit
-        problems: list[str] = []
-        nodes = state.positions / unit
-        placed = place_pieces(observation, nodes, self._variance, unit, self.options, problems)
+        placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
         if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
             state = laid
-            nodes = state.positions / unit
-            placed = place_pieces(observation, nodes, self._variance, unit, self.options, problems := [])
-        workspace, scale = self._formulation.workspace, self._noise.scale
-        points = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems)
+            placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
+        points, refused = self._points_of(placed, state)
         if points is None:
-            return self._estimate(tuple(problems))
-        end = free_end(placed, nodes, float(self._variance[-1]))
-        if (moved := self._learn_parameters(points, end, pose, state)) is not state:
-            state, nodes = moved, moved.positions / unit
-            end = free_end(placed, nodes, float(self._variance[-1]))
-            again = measured_points(placed, nodes, unit, workspace, 0.5 * self.thread.diameter, scale, problems := [])
-            points = again if again is not None else points
-        return self._corrected(points, end, pose, nodes, state, problems)
+            return self._estimate(problems + refused)
+        if self._stiffness.state.active:
+            weigh(points, self._now.errors[0])
+            noise = at_nodes(self._now.noise.raised, self.thread.segments + 1)
+            if not self._corrector.solve(self._prior(state, pose, noise), points).problem:
+                state = self._stiffness.learn(self._corrector, state, pose.stamp)
+                again, refused = self._points_of(placed, state)
+                points = again or points
+        return self._corrected(points, pose, state, problems + refused)
 
-    def _learn_parameters(
-        self, points: MeasuredPoints, end: tuple[float, float], pose: NeedlePose, state: ThreadState
-    ) -> ThreadState:
-        """Learn the slow parameters; return where the thread is predicted with them."""
-        if not self._slow.active:
-            return state
-        weights, noise = np.ones(len(points.place)), np.empty(self.thread.segments + 1)
-        interpolate_to_nodes(self._noise.intensity, len(noise), noise)
-        weigh(points, self._variance, weights, self._sums)
-        density, start = np.maximum(self._density, MIN_VARIANCE), np.ascontiguousarray(state.positions / self._unit)
-        done = self._corrector.solve(start, pose.heading, density, noise / self._unit**2, points, weights, end)
-        if not done.solved:
-            return state
-        return self._slow.learn(self._corrector, state, pose.stamp)
+    def _points_of(self, placed: list[PlacedPiece], state: ThreadState) -> tuple[MeasuredPoints | None, list[str]]:
+        now, nodes = self._now, state.positions / self._unit
+        margin, workspace = 0.5 * self.thread.diameter, self._formulation.workspace
+        given = AssociationInput(nodes, float(now.errors[0, -1]), self._unit, workspace, margin, now.noise.scale)
+        return measured_points(placed, given)
+
+    def _prior(self, state: ThreadState, pose: NeedlePose, noise: Vector) -> Prior:
+        """Return the prior of a correction; noise as intensity at each node [m^2/s]."""
+        unit, rod = self._unit, self._formulation.rod
+        return Prior(
+            np.ascontiguousarray(state.positions / unit),
+            np.ascontiguousarray(pose.heading, dtype=np.float64),
+            np.maximum(self._now.errors[1], MIN_VARIANCE),
+            noise / unit**2,
+            self._length,
+            rod.bending_stiffness / (rod.drag_across * unit**4),
+        )
 
     def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
@@ -224,168 +243,158 @@ class ThreadEstimator:
         At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
         so too. What the piece does not show goes on as it lay.
         """
-        fresh = self._unknown
-        if not piece.attached or (not fresh and piece.square < LARGE_ERROR**2):
-            self._gross = 0
+        now, unit, segments = self._now, self._unit, self.thread.segments
+        if not piece.attached or (not now.unknown and piece.square < LARGE_ERROR**2):
+            now.gross = 0
             return None
-        self._gross += 1
-        end = piece.start + piece.arcs[-1]
-        prior = float(np.interp(0.5 * end, np.arange(len(self._variance)), self._variance))
-        measured = math.isfinite(self._measured_at)
-        if not fresh and measured and self._gross < 2 and piece.square > 9.0 * prior:
+        now.gross += 1
+        end = piece.start + float(piece.arcs[-1])
+        prior = float(np.interp(0.5 * end, np.arange(segments + 1), now.errors[0]))
+        measured = math.isfinite(now.measured_at)
+        if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
             return None
-        self._gross = 0
-        unit, segments = self._unit, self.thread.segments
-        seen = smoothed_line(piece.points, piece.arcs, SMOOTHING * self.options.point_correlation / unit) * unit
+        seen = smoothed_line(piece.points, piece.arcs, SMOOTHING * POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
-        chain = chain_inside(path, segments, unit, radius)
-        laid = ThreadState.at_rest(chain)
-        # Whether it lies outside of obstacles is not known before it is corrected.
-        self._unknown = self._converged = False
+        laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
         self.predictor.pose, self.predictor.state = pose, laid
-        arcs = np.arange(segments + 1.0)
-        known = LAID_DEVIATION**2 * float(np.median(piece.variance))
-        self._set_variance(known + (self.options.initial_error * np.maximum(arcs - end, 0.0)) ** 2)
-        self._noise = NoiseModel(self.options.noise_time)
-        self._test = DisturbanceTest(self.thread, self.options.disturbance_time)
-        self._slow.restart()
+        # Whether it lies outside of obstacles is not known before it is corrected.
+        now.gross, now.unknown, now.converged = 0, False, False
+        now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
+        now.noise, now.test = NoiseModel(), DisturbanceTest(self.thread)
+        self._stiffness.restart()
         return laid
 
     def _corrected(
-        self,
-        points: MeasuredPoints,
-        end: tuple[float, float],
-        pose: NeedlePose,
-        nodes: Points,
-        state: ThreadState,
-        problems: list[str],
+        self, points: MeasuredPoints, pose: NeedlePose, state: ThreadState, problems: list[str]
     ) -> ThreadEstimate:
-        unit, segments = self._unit, self.thread.segments
-        weights = np.empty(len(points.place))
-        elapsed = pose.stamp - self._measured_at if math.isfinite(self._measured_at) else 0.0
-        innovations, noise = self._noise.learn(
-            points, weights, self._sums, unit, elapsed, 2.0 * self._length, self._variance, self._density
-        )
-        density = np.maximum(self._density, MIN_VARIANCE)
-        start = np.ascontiguousarray(nodes)
-        done = self._corrector.solve(start, pose.heading, density, noise, points, weights, end)
-        if not done.solved:
-            problems.append(f"the correction was not solved: residual {done.residual:.1e}, off by {done.off:.1g}")
-            return self._estimate(tuple(problems), innovations=innovations, points=len(weights))
-        self._density, self._variance = density, np.empty(segments + 1)
-        work = self._corrector.work
-        hidden = take_correction(points, weights, work, unit, self._noise.bank, density, self._variance)
-        self._slow.correct(self._corrector, self._variance)
-        positions = work.about * unit
-        # What of a point's variance does not change from frame to frame is of the dish's place in the image: the points
-        # of a window share it, and so do both times that the test compares.
-        shared = max(1.0 - self._noise.scale, MIN_SHARED) / self._noise.scale * self._sums.independent
-        variance = self._sums.own * (1.0 + 0.5 * shared) * unit**2
-        if math.isfinite(self._measured_at):  # else there is no earlier time to compare with
-            deviations = np.asarray(pose.deviation)
-            self._test.add(work.moved * unit, work.normals, variance, pose.stamp, deviations)
-            if self._test.confirmed(pose.stamp):
-                self._slow.activate()
-        corrected = ThreadState(positions, state.velocities, state.interval)
-        self.predictor.pose, self.predictor.state = pose, corrected
-        self._converged = True
-        self._unknown = False
-        self._measured_at = pose.stamp
-        return self._estimate(
-            tuple(problems),
-            corrected=True,
-            innovations=innovations,
-            residual=done.residual,
-            solves=done.solves,
-            points=len(weights),
-            hidden=hidden,
-        )
+        now, unit, work = self._now, self._unit, self._corrector.work
+        measured = math.isfinite(now.measured_at)
+        elapsed = pose.stamp - now.measured_at if measured else 0.0
+        innovations, now.errors = now.noise.learn(points, now.errors, unit, elapsed, 2.0 * self._length)
+        prior = self._prior(state, pose, at_nodes(now.noise.raised, self.thread.segments + 1))
+        result = self._corrector.solve(prior, points)
+        if result.problem:
+            return self._estimate([*problems, result.problem], _Correction(result, innovations, len(points.place)))
+        now.errors, hidden = now.noise.take_correction(points, work, np.array([now.errors[0], prior.density]), unit)
+        self._stiffness.correct(self._corrector, float(now.errors[0].mean()))
+        if measured:  # else there is no earlier time to compare with
+            # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
+            # points of a window share it, and so do both times that the test compares.
+            scale, sums = now.noise.scale, now.noise.sums
+            variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
+            now.test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
+            if now.test.confirmed(pose.stamp):
+                self._stiffness.activate()
+        self.predictor.pose = pose
+        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
+        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
+        return self._estimate(problems, _Correction(result, innovations, len(points.place), hidden))
 
-    def _set_variance(self, variance: Vector) -> None:
-        self._variance = np.array(variance)
-        self._variance[0] = 0.0
-        self._density = 2.0 * self._length * self._variance
-
-    def _estimate(
-        self,
-        problems: tuple[str, ...],
-        *,
-        corrected: bool = False,
-        innovations: Innovations | None = None,
-        residual: float = 0.0,
-        solves: int = 0,
-        points: int = 0,
-        hidden: float = 1.0,
-    ) -> ThreadEstimate:
-        prediction, pose, state = self._prediction, self.predictor.pose, self.predictor.state
-        assert prediction is not None
+    def _estimate(self, problems: Sequence[str], correction: _Correction | None = None) -> ThreadEstimate:
+        now, pose, state = self._now, self.predictor.pose, self.predictor.state
+        assert now.prediction is not None
         assert pose is not None
         assert state is not None
         formulation, positions = self._formulation, state.positions
+        corrected = correction is not None and not correction.result.problem
         # Where innovations are larger than expected, so are the errors that are left.
-        scale = self._unit**2 * max(self._noise.ratio, 1.0)
+        scale = self._unit**2 * max(now.noise.ratio, 1.0)
         if corrected:
             covariance = scale * self._corrector.work.covariance
         else:
             along = np.gradient(positions, axis=0)
             normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
-            covariance = scale * self._variance[:, None, None] * normal[:, :, None] * normal[:, None, :]
+            covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
         formulation.added.set_time(pose.stamp)
-        added, tolerance = formulation.added.rows(positions), self.predictor.contact_tolerance
+        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
         def compute_rows() -> list[BarrierRows]:
             return [*formulation.margins(positions, pose.heading), *added]
 
         return ThreadEstimate(
-            prediction=prediction,
+            prediction=now.prediction,
             positions=positions,
             covariance=covariance,
-            deviation=np.sqrt(scale * np.maximum(self._variance, 0.0)),
+            deviation=np.sqrt(scale * np.maximum(now.errors[0], 0.0)),
             corrected=corrected,
-            unmeasured_for=pose.stamp - self._measured_at,
-            converged=self._converged,
-            residual=residual,
-            solves=solves,
-            points=points,
-            hidden=hidden,
-            innovations=innovations,
-            noise=self._noise.bank.intensity.copy(),
-            disturbances=self._test.found(pose.stamp, positions),
-            problems=problems,
-            slow_parameters=self._slow.report(),
-            thread=self._slow.thread,
+            unmeasured_for=pose.stamp - now.measured_at,
+            converged=now.converged,
+            residual=correction.result.residual if correction is not None and corrected else 0.0,
+            solves=correction.result.solves if correction is not None and corrected else 0,
+            points=correction.points if correction is not None else 0,
+            hidden=correction.hidden if correction is not None else 1.0,
+            innovations=correction.innovations if correction is not None else None,
+            noise=now.noise.intensity,
+            disturbances=now.test.found(pose.stamp, positions),
+            problems=tuple(problems),
+            slow_parameters=self._stiffness.report(),
+            thread=self._stiffness.thread,
             compute_rows=compute_rows,
-            contact_tolerance=tolerance,
+            contact_tolerance=self.predictor.contact_tolerance,
         )
 
-    def snapshot(self) -> FilterState | None:
-        """Return everything that the next step depends on; None before the start."""
-        state, pose = self.predictor.state, self.predictor.pose
-        if state is None or pose is None or self._prediction is None:
-            return None
-        return FilterState(
-            self._prediction,
-            self._converged,
-            pose,
-            state,
-            self._formulation.warm_start(),
-            self._density.copy(),
-            self._variance.copy(),
-            self._noise.copied(),
-            self._test.copied(),
-            self._measured_at,
-            self._gross,
-            self._unknown,
-            self._slow.state,
+    def snapshot(self) -> FilterState:
+        """Return everything that the next step depends on."""
+        return replace(
+            self._now,
+            noise=self._now.noise.copied(),
+            test=self._now.test.copied(),
+            pose=self.predictor.pose,
+            thread=self.predictor.state,
+            warm_start=self._formulation.warm_start(),
+            learned=self._stiffness.state,
         )
 
     def restore(self, kept: FilterState) -> None:
-        """Go back to a snapshot; what follows is the same again to the last bit."""
+        """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
+        assert kept.warm_start is not None
+        assert kept.learned is not None
+        self._now = replace(kept, noise=kept.noise.copied(), test=kept.test.copied())
         self.predictor.pose, self.predictor.state = kept.pose, kept.thread
-        self._prediction, self._converged = kept.prediction, kept.converged
         self._formulation.restore(kept.warm_start)
-        self._density, self._variance = kept.density.copy(), kept.variance.copy()
-        self._noise, self._test = kept.noise.copied(), kept.test.copied()
-        self._measured_at, self._gross, self._unknown = kept.measured_at, kept.gross, kept.unknown
-        self._slow.restore(kept.slow)
+        self._stiffness.restore(kept.learned)
+
+    def follow_on(self, other: ThreadEstimator) -> None:
+        """Continue from the estimate of another thread, in another scene or with other options.
+
+        What was learned of the stiffness and added up for disturbances stays with the thread that it is of.
+        """
+        self.reset()
+        self.predictor.follow_on(other.predictor)
+        kept, now, (old, new) = other.snapshot(), self._now, (other._unit, self._unit)
+        at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
+        now.errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
+        now.noise, now.measured_at, now.prediction = kept.noise, kept.measured_at, kept.prediction
+        now.gross, now.unknown, now.converged = kept.gross, kept.unknown, kept.converged
+        if self.thread == other.thread:
+            now.test = kept.test
+            if self.options.slow_parameters == other.options.slow_parameters and kept.learned is not None:
+                self._stiffness.restore(kept.learned)
+
+
+def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:
+    """Return a path averaged over a length along it, by a normal distribution of that standard deviation."""
+    apart = np.abs(arcs[:, None] - arcs[None, :])
+    # Towards an end the average is taken over less, evenly to both sides, so that the end stays where it is.
+    room = np.minimum(arcs, arcs[-1] - arcs)
+    weights = np.exp(-0.5 * (apart / length) ** 2) * (apart <= room[:, None] + 1e-12)
+    return np.asarray(weights @ points / weights.sum(axis=1, keepdims=True))
+
+
+def continued(path: Points, positions: Points, node: int) -> Points:
+    """Return a path that goes on as a thread lay from a node on, turned so that it goes on straight.
+
+    Args:
+        path: shape (m, 2), m >= 2.
+        positions: of the thread, shape (n + 1, 2).
+        node: at the end of the path.
+    """
+    path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 0.0])]
+    if node >= len(positions) - 2 or len(path) < 2:
+        return path
+    rest = positions[node + 1 :] - positions[node]
+    old, new = positions[node + 1] - positions[max(node - 1, 0)], path[-1] - path[-min(len(path), 4)]
+    turn = math.atan2(new[1], new[0]) - math.atan2(old[1], old[0])
+    c, s = math.cos(turn), math.sin(turn)
+    return np.vstack([path, path[-1] + rest @ np.array([[c, s], [-s, c]])])

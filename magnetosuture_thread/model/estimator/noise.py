@@ -1,4 +1,4 @@
-"""Process noise, learned from innovations: how fast the model goes wrong, in each window of arc length.
+"""Process noise and measurement noise, learned from innovations in windows of equal arc length.
 
 Each window has a bank of scalar Kalman filters of the estimate's mean error e in it, one for each intensity q of the
 noise that could be at work:
@@ -8,17 +8,24 @@ noise that could be at work:
 with nu the mean innovation of the window's points. The weights of the bank are the likelihoods of the q, forgotten
 over time; the process noise is their geometric mean. So it falls to nothing where the model is right, and rises
 within a frame or two where something happens that the model does not know.
+
+The variance of each node and the density v of `correction` are kept together as an array of shape (2, n + 1) [D^2];
+the second is 2 l times the first where nothing was measured.
 """
 
 from __future__ import annotations
 
+import copy
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.model.estimator.innovations import WindowSums
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.model.estimator.association import MeasuredPoints
+from magnetosuture_thread.model.estimator.correction import CorrectionBuffers, robust_weights
 
 Vector = NDArray[np.float64]
 
@@ -26,217 +33,324 @@ WINDOWS = 16
 GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
+NOISE_TIME = 1.0  # s; over which likelihoods of intensities are forgotten
 SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
 RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
-MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in that
-LEARNING_PRIOR = 0.2  # s of measurements, that what is assumed to begin with is worth
+LEARNING_PRIOR = 0.2  # s of measurements, that the scale to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
+MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in the ratio
 SURE = 3.0  # standard deviations
 SURE_OF_ALL = 2.0  # mean square of all windows' errors over their variances: 99 % of right ones are less
 MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 SWITCHING = 1e-4  # share of the weights that every intensity gets anew each second: the noise may change at once
 
 
-class NoiseBank(NamedTuple):
-    """The filters of all windows.
+@dataclass(frozen=True)
+class Innovations:
+    """What a frame says against the prediction, by windows of equal arc length from the needle to the free end.
 
     Attributes:
-        error: e of each, shape (w, g) [m].
-        variance: of it, shape (w, g) [m^2].
-        weight: likelihood of each intensity, rows sum to 1, shape (w, g).
-        intensity: q of each window, shape (w,) [m^2/s].
+        mean: of the points' innovations across the thread, positive to the left; nan where nothing is measured [m].
+        variance: that the filter expects of it [m^2].
     """
 
-    error: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    intensity: Vector
+    mean: Vector
+    variance: Vector
 
-    @classmethod
-    def of(cls, windows: int) -> NoiseBank:
-        """Return a bank that knows nothing but that the model is usually right."""
-        prior = -np.abs(np.log10(GRID / QUIET))
-        weight = np.exp(prior) / np.exp(prior).sum()
-        shape = (windows, len(GRID))
-        return cls(np.zeros(shape), np.zeros(shape), np.tile(weight, (windows, 1)), np.full(windows, QUIET))
+    @property
+    def normalised_squared(self) -> Vector:
+        """Normalised innovation squared of each window, 1 in the mean; nan where nothing is measured."""
+        return np.asarray(self.mean**2 / self.variance)
 
-    def copied(self) -> NoiseBank:
+    @property
+    def total(self) -> tuple[float, int]:
+        """Sum of the windows' normalised innovations squared, and its degrees of freedom: those that are measured."""
+        squares = self.normalised_squared
+        return float(np.nansum(squares)), int(np.isfinite(squares).sum())
+
+
+class WindowSums(NamedTuple):
+    """Sums over the points of each window, shape (w,).
+
+    Attributes:
+        mean: mean innovation of its points, nan where there is none [D].
+        own: variance of it by the points' own, inf where there is none [D^2].
+        known: variance of the prior, in the points' mean [D^2].
+        independent: number of its points that err independently.
+    """
+
+    mean: Vector
+    own: Vector
+    known: Vector
+    independent: Vector
+
+
+@compiled
+def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
+    """Write the robust weights of the points against the prior; return the sums of the windows.
+
+    Args:
+        points: the points.
+        variance: of the prior at each node across the thread, shape (n + 1,) [D^2].
+    """
+    prior = np.interp(points.place, np.arange(len(variance)) * 1.0, variance)
+    robust_weights(points.innovation, points.variance + prior, points.weight)
+    own, mean, known, independent = np.zeros(WINDOWS), np.zeros(WINDOWS), np.zeros(WINDOWS), np.zeros(WINDOWS)
+    for p in range(len(prior)):
+        w = min(int(points.place[p] * WINDOWS / (len(variance) - 1)), WINDOWS - 1)
+        information = points.weight[p] * points.share[p]
+        own[w] += information / points.variance[p]
+        independent[w] += information
+        mean[w] += information / points.variance[p] * points.innovation[p]
+        known[w] += information / points.variance[p] * prior[p]
+    total = np.where(own > 0.0, own, np.nan)
+    return WindowSums(mean / total, 1.0 / own, known / total, independent)
+
+
+@compiled
+def at_nodes(values: Vector, nodes: int) -> Vector:
+    """Return at each node the windows' values, interpolated in their logarithms between the windows' middles."""
+    places = len(values) * np.arange(nodes) / (nodes - 1.0) - 0.5
+    return np.asarray(np.exp(np.interp(places, np.arange(len(values)) * 1.0, np.log(values))))
+
+
+@compiled
+def propagate_errors(positions: Points, before: Points, unit: float, added: Vector, errors: Points) -> Points:
+    """Return variance and density after a step: errors across the thread stay where they are, and grow.
+
+    The thread slides along itself when it is pulled: a node comes to where another part of the thread was, and has
+    that part's error. Behind the needle, whose place is known, comes thread without error.
+
+    Args:
+        positions: after the step, shape (n + 1, 2) [m].
+        before: before it [m].
+        unit: D [m].
+        added: noise over the step, of variance and density at each node, shape (2, n + 1) [D^2].
+        errors: variance and density before, shape (2, n + 1) [D^2].
+    """
+    last, slid = len(positions) - 1, np.zeros(len(positions))
+    for i in range(last + 1):
+        a, b = max(i - 1, 0), min(i + 1, last)
+        tx, ty = before[a, 0] - before[b, 0], before[a, 1] - before[b, 1]  # towards the needle
+        size = np.hypot(tx, ty)
+        if size > 0.0:
+            slid[i] = ((positions[i, 0] - before[i, 0]) * tx + (positions[i, 1] - before[i, 1]) * ty) / (size * unit)
+    nodes, result = np.arange(last + 1.0), added.copy()
+    for k in range(2):
+        result[k] += np.interp(nodes - slid, nodes, errors[k])
+    return result
+
+
+class NoiseModel:
+    """What is learned of process noise and measurement noise over a run.
+
+    Arrays are replaced and never written to, so that a shallow copy keeps a state.
+
+    Attributes:
+        error: e of each filter, shape (w, g) [m].
+        variance: of it, shape (w, g) [m^2].
+        likelihood: of each intensity, rows sum to 1, shape (w, g).
+        intensity: geometric mean of the intensities in each window, shape (w,) [m^2/s].
+        raised: the same at the last measurement, with what must have come at once, shape (w,) [m^2/s].
+        scale: of the points' variance over what the camera says.
+        ratio: of squared innovations over what is expected.
+        sums: of the windows of the last frame.
+    """
+
+    def __init__(self) -> None:
+        prior = np.exp(-np.abs(np.log10(GRID / QUIET)))
+        self.error = self.variance = np.zeros((WINDOWS, len(GRID)))
+        self.likelihood = np.tile(prior / prior.sum(), (WINDOWS, 1))
+        self.intensity = self.raised = np.full(WINDOWS, QUIET)
+        self.scale = self.ratio = 1.0
+        self.sums = WindowSums(*np.full((4, WINDOWS), np.nan))
+        self._learned_for = 0.0  # s
+        self._last_mean = self._last_variance = np.full(WINDOWS, np.nan)  # of the frame before, as the camera says
+
+    def copied(self) -> NoiseModel:
         """Return a copy."""
-        return NoiseBank(*(array.copy() for array in self))
+        return copy.copy(self)
+
+    def learn(
+        self, points: MeasuredPoints, errors: Points, unit: float, elapsed: float, factor: float
+    ) -> tuple[Innovations, Points]:
+        """Test the innovations of a frame, learn from them, and let the prior grow where the noise rose.
+
+        Args:
+            points: of the frame; the robust weights against the prior that has grown are written.
+            errors: variance and density of the prior, shape (2, n + 1) [D^2].
+            unit: D [m].
+            elapsed: since the last measurement [s].
+            factor: of the density over the variance.
+
+        Returns:
+            The innovations, and the errors that have grown.
+        """
+        sums = weigh(points, errors[0])
+        mean, own = sums.mean * unit, sums.own * unit**2
+        ratio, expected = self._match(mean, own, sums.known * unit**2, elapsed)
+        before, settled = self.intensity, self._learned_for >= NOISE_TIME
+        state = self.error, self.variance, self.likelihood, self.intensity
+        self.error, self.variance, self.likelihood, self.intensity = learn(*state, mean, own, elapsed)
+        interval = max(elapsed, MIN_INTERVAL)
+        state = self.error, self.variance, self.likelihood, self.intensity
+        self.raised = raised_intensity(*state, np.isfinite(mean), interval, settled)
+        nodes = errors.shape[1]
+        extra = at_nodes(np.maximum(before, self.raised), nodes) - at_nodes(before, nodes)
+        extra[0] = 0.0
+        errors = errors + np.array([[1.0], [factor]]) * extra * (interval / unit**2)
+        self.sums = weigh(points, errors[0])
+        if self._learned_for == 0.0:
+            # Of the first step after a start no noise was known: it is tested with the noise that it shows.
+            ratio, expected = self.ratio, self.ratio * (self.sums.own + self.sums.known) * unit**2
+        self.ratio = ratio
+        self._learned_for += elapsed
+        return Innovations(mean, expected), errors
+
+    def _match(self, mean: Vector, own: Vector, known: Vector, elapsed: float) -> tuple[float, Vector]:
+        """Match what is expected of innovations to those of a frame.
+
+            E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
+            E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames do not
+
+        Args:
+            mean: nu of each window, nan where nothing is measured, shape (w,) [m].
+            own: r, inf where nothing is measured [m^2].
+            known: p [m^2].
+            elapsed: since the last measurement [s].
+
+        Returns:
+            The new ratio, and what was expected with the ratio before, shape (w,) [m^2].
+        """
+        expected, ratio, camera = self.ratio * (own + known), self.ratio, own / self.scale
+        seen = np.isfinite(mean)
+        if seen.any():
+            off = min(float((mean[seen] ** 2 / expected[seen]).mean()), MAX_SQUARE) - 1.0
+            ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * off))
+        both = seen & np.isfinite(self._last_mean)
+        if both.any():
+            change = (mean - self._last_mean)[both] ** 2 / (camera + self._last_variance)[both]
+            share = min(elapsed / (min(self._learned_for, SCALE_TIME) + LEARNING_PRIOR), 1.0)
+            self.scale += share * (float(np.minimum(change, MAX_SCALE).mean()) - self.scale)
+            self.scale = min(max(self.scale, MIN_SCALE), MAX_SCALE)
+        self._last_mean, self._last_variance = mean, camera
+        return ratio, expected
+
+    def take_correction(
+        self, points: MeasuredPoints, work: CorrectionBuffers, errors: Points, unit: float
+    ) -> tuple[Points, float]:
+        """Take over a correction: the information gained, what is left of the variance, and what is no error any more.
+
+        Args:
+            points: the points, with their robust weights.
+            work: of the correction.
+            errors: variance and density before, shape (2, n + 1) [D^2].
+            unit: D [m].
+
+        Returns:
+            Variance and density after, shape (2, n + 1) [D^2], and the part of the thread that no point shows.
+        """
+        left, applied, hidden = take_correction(points, work.normals, work.moved, work.covariance, errors[1])
+        self.error = self.error - unit * applied[:, None]
+        return left, hidden
 
 
 @compiled
 def learn(
-    bank: NoiseBank, grid: Vector, innovation: Vector, variance: Vector, interval: float, time_constant: float
-) -> None:
-    """Take the windows' mean innovations.
+    error: Points, variance: Points, likelihood: Points, intensity: Vector, mean: Vector, own: Vector, elapsed: float
+) -> tuple[Points, Points, Points, Vector]:
+    """Return the filters and intensities of all windows after a frame.
 
     Args:
-        bank: written.
-        grid: q of each filter, shape (g,) [m^2/s].
-        innovation: nu of each window, shape (w,) [m].
-        variance: r of each, inf where nothing is measured, shape (w,) [m^2].
-        interval: since the last measurement [s].
-        time_constant: over which likelihoods are forgotten [s].
-    """
-    keep, share = np.exp(-interval / time_constant), min(1.0, SWITCHING * interval) / len(grid)
-    logs, log_grid = np.empty(len(grid)), np.log(grid)
-    for w in range(len(innovation)):
-        if not np.isfinite(variance[w]):
-            for g in range(len(grid)):
-                bank.variance[w, g] += grid[g] * interval
-            continue
-        best = -np.inf
-        for g in range(len(grid)):
-            prior = bank.variance[w, g] + grid[g] * interval
-            expected = prior + variance[w]
-            off = innovation[w] - bank.error[w, g]
-            logs[g] = keep * np.log(bank.weight[w, g]) - 0.5 * (np.log(expected) + off * off / expected)
-            best = max(best, logs[g])
-            bank.error[w, g] += prior / expected * off
-            bank.variance[w, g] = prior * variance[w] / expected
-        total = 0.0
-        for g in range(len(grid)):
-            bank.weight[w, g] = np.exp(logs[g] - best)
-            total += bank.weight[w, g]
-        mean = 0.0
-        for g in range(len(grid)):
-            bank.weight[w, g] = max(bank.weight[w, g] / total * (1.0 - share * len(grid)) + share, 1e-30)
-            mean += bank.weight[w, g] * log_grid[g]
-        bank.intensity[w] = np.exp(mean)
-
-
-@compiled
-def share_of(elapsed: float, learned_for: float, time_constant: float) -> float:
-    """Return the share of a new value in a mean: of all values at first, later of those of some time."""
-    return float(min(elapsed / (min(learned_for, time_constant) + LEARNING_PRIOR), 1.0))
-
-
-@compiled
-def match_innovations(
-    sums: WindowSums,
-    unit: float,
-    scale: float,
-    ratio: float,
-    elapsed: float,
-    learned_for: float,
-    last_mean: Vector,
-    last_variance: Vector,
-    mean: Vector,
-    variance: Vector,
-    expected: Vector,
-) -> tuple[float, float]:
-    """Match what is expected of innovations to those of a frame; return the new scale and ratio.
-
-        E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
-        E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames are independent
-
-    Args:
-        sums: of the windows.
-        unit: D [m].
-        scale: s, by which the points' variance r of `sums` is larger than the camera says.
-        ratio: c.
+        error: see `NoiseModel`, as are the following, which are returned.
+        variance: of the errors.
+        likelihood: of each intensity.
+        intensity: of each window.
+        mean: nu of each window, shape (w,) [m].
+        own: r of each, inf where nothing is measured, shape (w,) [m^2].
         elapsed: since the last measurement [s].
-        learned_for: time of all measurements before [s].
-        last_mean: of the frame before, nan where nothing was measured, shape (w,) [m].
-        last_variance: r of it, as the camera says [m^2].
-        mean: nu of each window, written, shape (w,) [m].
-        variance: r of each as the camera says, written, shape (w,) [m^2].
-        expected: c (r + p) of each, with the ratio before, written, shape (w,) [m^2].
     """
-    squares, seen, changes, both = 0.0, 0, 0.0, 0
-    for w in range(len(mean)):
-        mean[w] = sums.mean[w] * unit
-        variance[w] = sums.own[w] * unit**2 / scale
-        total = (sums.own[w] + sums.known[w]) * unit**2
-        expected[w] = ratio * total
-        if not np.isfinite(mean[w]):
-            continue
-        squares += mean[w] ** 2 / total
-        seen += 1
-        if np.isfinite(last_mean[w]):
-            change = (mean[w] - last_mean[w]) ** 2
-            changes += min(change / (variance[w] + last_variance[w]), MAX_SCALE)
-            both += 1
-    if seen:
-        off = min(squares / (seen * ratio), MAX_SQUARE) - 1.0
-        ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * off)
-    if both:
-        scale += share_of(elapsed, learned_for, SCALE_TIME) * (changes / both - scale)
-        scale = min(max(scale, MIN_SCALE), MAX_SCALE)
-    return scale, ratio
+    keep, switched = np.exp(-elapsed / NOISE_TIME), min(1.0, SWITCHING * elapsed)
+    error, variance, likelihood, intensity = (
+        error.copy(),
+        variance + GRID * elapsed,
+        likelihood.copy(),
+        intensity.copy(),
+    )
+    for w in np.flatnonzero(np.isfinite(own)):
+        prior, off = variance[w].copy(), mean[w] - error[w]
+        expected = prior + own[w]
+        logs = keep * np.log(likelihood[w]) - 0.5 * (np.log(expected) + off * off / expected)
+        weight = np.exp(logs - logs.max())
+        weight = (1.0 - switched) * weight / weight.sum() + switched / len(GRID)
+        error[w] += prior / expected * off
+        variance[w] = prior * own[w] / expected
+        likelihood[w] = np.maximum(weight, 1e-30)
+        intensity[w] = np.exp((likelihood[w] * np.log(GRID)).sum())
+    return error, variance, likelihood, intensity
 
 
 @compiled
-def intensity_with_excess(bank: NoiseBank, mean: Vector, interval: float, settled: bool, intensity: Vector) -> None:
-    """Write the process noise of each window, and what must have come in one interval of what it did not explain.
+def raised_intensity(
+    error: Points,
+    variance: Points,
+    likelihood: Points,
+    intensity: Vector,
+    seen: NDArray[np.bool_],
+    interval: float,
+    settled: bool,
+) -> Vector:
+    """Return the process noise of each window, with what must have come at once where it did not explain an error.
 
     Args:
-        bank: the filters.
-        mean: innovation of each window, nan where nothing is measured, shape (w,) [m].
+        error: see `NoiseModel`, as are the following.
+        variance: of the errors.
+        likelihood: of each intensity.
+        intensity: of each window.
+        seen: windows in which something is measured, shape (w,).
         interval: since the last measurement [s].
         settled: whether the filters no longer show the error of the first shape.
-        intensity: written, shape (w,) [m^2/s].
     """
-    windows = len(mean)
-    left, doubt = np.zeros(windows), np.zeros(windows)  # error that the filters expect, and their variance of it
-    total, measured = 0.0, 0
-    for w in range(windows):
-        if not np.isfinite(mean[w]):
-            continue
-        for g in range(bank.error.shape[1]):
-            left[w] += bank.weight[w, g] * bank.error[w, g]
-            doubt[w] += bank.weight[w, g] * bank.variance[w, g]
-        if doubt[w] > 0.0:
-            total += left[w] ** 2 / doubt[w]
-            measured += 1
+    left = np.where(seen, (likelihood * error).sum(axis=1), 0.0) ** 2
+    doubt = np.where(seen, (likelihood * variance).sum(axis=1), 0.0)  # the variance that the filters expect of it
+    tested = doubt > 0.0
     # What the thread is wrong by as a whole is little in each window, but not in all of them together: a thread that
     # is braced between needle and wall bends as a whole under forces that hardly differ, and a rigid prior holds it.
-    common = 0.0
-    if settled and total > SURE_OF_ALL * measured:
-        for w in range(windows):
-            common += max(left[w] ** 2 - doubt[w], 0.0) / measured
-    for w in range(windows):
-        intensity[w] = bank.intensity[w] + max(left[w] ** 2 - SURE**2 * doubt[w], 0.0) / interval
-        intensity[w] = max(intensity[w], common / interval)
+    common, count = 0.0, tested.sum()
+    if settled and (left[tested] / doubt[tested]).sum() > SURE_OF_ALL * count:
+        common = np.maximum(left - doubt, 0.0).sum() / count
+    return np.maximum(intensity + np.maximum(left - SURE**2 * doubt, 0.0) / interval, common / interval)
 
 
 @compiled
-def grow(before: Vector, after: Vector, amount: float, factor: float, variance: Vector, density: Vector) -> None:
-    """Grow a prior by process noise that has turned out to be larger.
+def take_correction(
+    points: MeasuredPoints, normals: Points, moved: Points, covariance: NDArray[np.float64], density: Vector
+) -> tuple[Points, Vector, float]:
+    """Return variance and density after a correction, what each window was moved by, and the part that is hidden.
 
     Args:
-        before: intensity of each window that the prior grew by, shape (w,) [m^2/s].
-        after: what it should have been [m^2/s].
-        amount: the interval, in the units of the variance.
-        factor: of the density over the variance.
-        variance: of each node, written, shape (n + 1,).
-        density: of each node, written, shape (n + 1,).
+        points: the points, with their robust weights.
+        normals: of the nodes, shape (n + 1, 2).
+        moved: by the correction, shape (n + 1, 2) [D].
+        covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
+        density: v of each node before, shape (n + 1,) [D^2].
     """
-    nodes = len(variance)
-    less, more = np.empty(nodes), np.empty(nodes)
-    interpolate_to_nodes(before, nodes, less)
-    interpolate_to_nodes(np.maximum(before, after), nodes, more)
-    for i in range(1, nodes):
-        extra = max(more[i] - less[i], 0.0) * amount
-        variance[i] += extra
-        density[i] += factor * extra
-
-
-@compiled
-def shift_errors(bank: NoiseBank, correction: Vector) -> None:
-    """Take what the estimate was moved by in each window, shape (w,) [m]: it is no error any more."""
-    for w in range(len(correction)):
-        for g in range(bank.error.shape[1]):
-            bank.error[w, g] -= correction[w]
-
-
-@compiled
-def interpolate_to_nodes(values: Vector, nodes: int, result: Vector) -> None:
-    """Write at each node the windows' values, interpolated in their logarithms between the windows' middles."""
-    windows, logs = len(values), np.log(values)
-    for i in range(nodes):
-        at = windows * i / (nodes - 1.0) - 0.5
-        low = int(min(max(np.floor(at), 0.0), windows - 2.0))
-        part = min(max(at - low, 0.0), 1.0)
-        result[i] = np.exp((1.0 - part) * logs[low] + part * logs[low + 1])
+    segments = len(density) - 1
+    gained, seen = np.zeros(segments + 1), np.zeros(segments, dtype=np.bool_)
+    total, applied = np.zeros(WINDOWS), np.zeros(WINDOWS)
+    left, across = np.zeros((2, segments + 1)), (normals * moved).sum(axis=1)
+    for i in range(segments + 1):
+        n, c = normals[i], covariance[i]
+        left[0, i] = n[0] * n[0] * c[0, 0] + 2.0 * n[0] * n[1] * c[0, 1] + n[1] * n[1] * c[1, 1]
+    for p in range(len(points.place)):
+        low = min(int(points.place[p]), segments - 1)
+        part = points.place[p] - low
+        precision = points.weight[p] * points.share[p] / points.variance[p]
+        gained[low] += precision * (1.0 - part)
+        gained[low + 1] += precision * part
+        w = min(int(points.place[p] * WINDOWS / segments), WINDOWS - 1)
+        total[w] += precision
+        applied[w] += precision * ((1.0 - part) * across[low] + part * across[low + 1])
+        seen[low] = True
+    left[1, 1:] = 1.0 / (1.0 / density[1:] + gained[1:])
+    return left, np.where(total > 0.0, applied / np.maximum(total, 1e-300), 0.0), 1.0 - seen.sum() / segments

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from magnetosuture_thread.arguments import checked_arguments
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.model.estimator.association import LENGTH_ERROR
 from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEstimate
 from magnetosuture_thread.model.estimator.estimator import ThreadEstimator
-from magnetosuture_thread.model.estimator.pieces import LENGTH_ERROR
-from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose, Prediction
-from magnetosuture_thread.model.predictor import ThreadPredictor
+from magnetosuture_thread.model.prediction import MAX_COORDINATE, NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back
 MAX_POSES = 400  # that are kept, however many come in the time for which history is kept
-DOUBLED = "a second observation of the same frame"
 
 
 @dataclass
@@ -28,8 +25,8 @@ class _Moment:
     """A pose, what was measured at it, and the state of the filter after both."""
 
     pose: NeedlePose
-    observation: ThreadObservation | None = None
-    after: FilterState | None = None
+    observation: ThreadObservation | None
+    after: FilterState
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ class EstimatorSession:
 
     @checked_arguments("estimator session")
     def __init__(self, estimator: ThreadEstimator) -> None:
-        self._estimator = estimator
+        self._estimator, self._history = estimator, estimator.options.history
         self._moments: deque[_Moment] = deque(maxlen=MAX_POSES)
         self._early: dict[float, ThreadObservation] = {}
 
@@ -74,32 +71,18 @@ class EstimatorSession:
     def follow_on(self, other: EstimatorSession) -> None:
         """Continue from the estimate of another session, of another thread, scene or other options.
 
-        Observations of frames before its last pose are too late from then on.
+        Observations of frames up to its last pose are too late from then on.
         """
         self.reset()
         self._early = dict(other._early)
-        before, now = other._estimator, self._estimator
-        now.predictor.added.first_time = before.predictor.added.first_time
-        kept = before.snapshot()
-        if kept is None:
-            return
-        moment = other._moments[-1]
-        state = kept.resampled(before.thread, now.thread, now.options)
-        if (before.thread, before.options.slow_parameters) != (now.thread, now.options.slow_parameters):
-            state = replace(state, slow=now.learned)  # of a thread of which something else is told
-        prediction = _carried_over(state, now.predictor)
-        # What was learned of another thread, or of other parameters, says nothing of this one; and the multipliers of
-        # other rows are no warm start.
-        same = now.thread == before.thread and now.options.slow_parameters == before.options.slow_parameters
-        slow, warm_start = kept.slow if same else now.learned, now.predictor.formulation.warm_start()
-        now.restore(replace(state, prediction=prediction, warm_start=warm_start, slow=slow))
-        self._moments.append(_Moment(moment.pose, moment.observation, now.snapshot()))
+        if other._estimator.started:
+            self._estimator.follow_on(other._estimator)
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
         """Start from a shape that is given; without it, straight behind the needle."""
         self.reset()
         estimate = self._estimator.start(pose, centreline)
-        self._moments.append(_Moment(pose, after=self._estimator.snapshot()))
+        self._moments.append(_Moment(pose, None, self._estimator.snapshot()))
         return EstimationResult(estimate, estimate)
 
     def on_pose(self, pose: NeedlePose) -> EstimationResult:
@@ -107,18 +90,19 @@ class EstimatorSession:
 
         The first pose starts the thread: from the observation of its frame, or straight behind the needle.
         """
-        if self._moments and pose.stamp < self._moments[-1].pose.stamp - MAX_LATENESS:
+        last = self._estimator.predictor.pose
+        if last is not None and pose.stamp < last.stamp - MAX_LATENESS:
             self.reset()
-        moment = _Moment(pose, self._early.pop(pose.stamp, None))
+        observation = self._early.pop(pose.stamp, None)
         try:
-            estimate = self._take(moment)
+            estimate = self._take(pose, observation)
         except (InvalidInputError, SolverError) as error:
             return EstimationResult(None, problem=error)
-        self._moments.append(moment)
-        while self._moments[0].pose.stamp < pose.stamp - self._estimator.options.history:
+        self._moments.append(_Moment(pose, observation, self._estimator.snapshot()))
+        while self._moments[0].pose.stamp < pose.stamp - self._history:
             self._moments.popleft()
-        latest = pose.stamp + self._estimator.options.history
-        problem = self._too_early(max(self._early)).problem if any(stamp > latest for stamp in self._early) else None
+        latest = pose.stamp + self._history
+        problem = next((self._too_early(stamp) for stamp in self._early if stamp > latest), None)
         self._early = {stamp: early for stamp, early in self._early.items() if pose.stamp < stamp <= latest}
         return EstimationResult(estimate, estimate, problem)
 
@@ -130,84 +114,51 @@ class EstimatorSession:
         that is older than what is kept, of a frame without a pose, or of one that was observed already, is refused.
         """
         if not np.isfinite(stamp):
-            return self._refused(stamp, "a finite time [s]")
-        last = self._moments[-1].pose.stamp if self._moments else -np.inf
-        if stamp > last:
+            return EstimationResult(None, problem=_refusal(stamp, "a finite time [s]"))
+        last = self._estimator.predictor.pose
+        if last is None or stamp > last.stamp:
             self._early[stamp] = observation
             while len(self._early) > MAX_POSES:
                 del self._early[min(self._early)]
-            if self._moments and stamp > last + self._estimator.options.history:
-                return self._too_early(stamp)
-            return EstimationResult(None, waits=True)
+            early = last is not None and stamp > last.stamp + self._history
+            return EstimationResult(None, problem=self._too_early(stamp) if early else None, waits=True)
         index = next((k for k, moment in enumerate(self._moments) if moment.pose.stamp == stamp), None)
         if index is None:
-            return self._refused(stamp, "the stamp of a pose that is kept")
+            return EstimationResult(None, problem=_refusal(stamp, "the stamp of a pose that is kept"))
         if self._moments[index].observation is not None:
-            return self._refused(stamp, f"no {DOUBLED}")
-        before = self._moments[index - 1].after if index > 0 else None
-        if index == 0 and self._moments[0].after is None:
-            return self._refused(stamp, "a pose that was stepped to")
-        self._moments[index].observation = observation
-        return self._fold_in(index, before)
+            return EstimationResult(None, problem=_refusal(stamp, "no second observation of the same frame"))
+        return self._fold_in(index, observation)
 
-    def _fold_in(self, index: int, before: FilterState | None) -> EstimationResult:
-        """Take a moment and all after it again."""
-        measured: ThreadEstimate | None = None
-        estimate: ThreadEstimate | None = None
-        if before is None:
-            # The oldest moment that is kept: its own step cannot be taken again, but be corrected after it.
-            first = self._moments[index]
-            assert first.after is not None
-            assert first.observation is not None
-            self._estimator.restore(first.after)
-            measured = estimate = self._estimator.correct(first.observation)
-            first.after = self._estimator.snapshot()
-        else:
-            self._estimator.restore(before)
-            measured = estimate = self._take(self._moments[index])
-        problem = None
-        for later in list(self._moments)[index + 1 :]:
+    def _fold_in(self, index: int, observation: ThreadObservation) -> EstimationResult:
+        """Correct a moment by its observation, and take all after it again."""
+        moments, problem = list(self._moments), None
+        moment = moments[index]
+        self._estimator.restore(moment.after)
+        estimate = measured = self._estimator.correct(observation)
+        moment.observation, moment.after = observation, self._estimator.snapshot()
+        self._moments = deque(moments[: index + 1], maxlen=MAX_POSES)
+        for later in moments[index + 1 :]:
             try:
-                estimate = self._take(later)
+                estimate = self._take(later.pose, later.observation)
             except (InvalidInputError, SolverError) as error:
                 problem = error
+            else:
+                self._moments.append(_Moment(later.pose, later.observation, self._estimator.snapshot()))
         return EstimationResult(estimate, measured, problem)
 
-    def _take(self, moment: _Moment) -> ThreadEstimate:
-        if not self._estimator.started:
-            estimate = self._estimator.start(moment.pose)
-            if moment.observation is not None:
-                estimate = self._estimator.correct(moment.observation)
-        else:
-            estimate = self._estimator.step(moment.pose, moment.observation)
-        moment.after = self._estimator.snapshot()
-        return estimate
+    def _take(self, pose: NeedlePose, observation: ThreadObservation | None) -> ThreadEstimate:
+        if self._estimator.started:
+            return self._estimator.step(pose, observation)
+        if observation is not None:
+            return self._estimator.start_observed(pose, observation)
+        return self._estimator.start(pose)
 
-    def _too_early(self, stamp: float) -> EstimationResult:
-        expected = f"at most {self._estimator.options.history:g} s after the last pose"
-        return replace(self._refused(stamp, expected), waits=True)
-
-    def _refused(self, stamp: float, expected: str) -> EstimationResult:
-        return EstimationResult(None, problem=InvalidInputError("thread observation stamp", stamp, expected))
+    def _too_early(self, stamp: float) -> InvalidInputError:
+        return _refusal(stamp, f"at most {self._history:g} s after the last pose")
 
 
-def _carried_over(state: FilterState, predictor: ThreadPredictor) -> Prediction:
-    """Return the step that led to a state, as one of the predictor that goes on from there; it keeps no other alive."""
-    formulation, positions, heading = predictor.formulation, state.thread.positions, state.pose.heading
-    version = predictor.scene_version
-    along = np.diff(positions, axis=0)
-    return replace(
-        state.prediction,
-        scene_version=version,
-        positions=positions,
-        strain=np.hypot(*along.T) / formulation.rest_lengths(positions, heading) - 1.0,
-        compute_margins=lambda: Margins.of(
-            formulation.margins(positions, heading),
-            predictor.contact_tolerance,
-            version,
-        ),
-        compute_forces=lambda: None,
-    )
+def _refusal(stamp: float, expected: str) -> InvalidInputError:
+    return InvalidInputError("thread observation stamp", stamp, expected)
 
 
 def observation_of(centreline: Points, length: float, deviation: float) -> ThreadObservation:

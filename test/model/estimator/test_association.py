@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
+from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.model.estimator.association import (
-    clean_path,
+    MIN_DEVIATION,
+    POINT_CORRELATION,
+    AssociationInput,
+    measured_points,
     path_lengths,
     path_without_outliers,
+    place_pieces,
     project,
+    read_piece,
     search_start,
-    usable_points,
 )
-from magnetosuture_thread.model.estimator.options import EstimatorOptions
-from magnetosuture_thread.model.estimator.pieces import PlacedPiece, free_end, place_pieces
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.model.estimator.threads import (
     DEVIATION,
@@ -41,39 +44,28 @@ def test_points_far_aside_are_left_out_of_the_path() -> None:
     wrong = np.zeros(100, dtype=np.bool_)
     wrong[[0, 7, 8, 40, 41, 42, 77, 99]] = True
     points[wrong] += rng.choice([-1.0, 1.0], (8, 2)) * 4.0
-    kept = np.zeros(100, dtype=np.bool_)
-    path_without_outliers(points, 0.12, 0.3, kept)
-    np.testing.assert_array_equal(kept, ~wrong)
+    np.testing.assert_array_equal(path_without_outliers(points, 0.12, 0.3), ~wrong)
 
 
-@pytest.mark.parametrize("count", [99, 100, 119, 120, 350])
-def test_of_too_many_points_both_ends_are_kept(count: int) -> None:
+@pytest.mark.parametrize("count", [99, 120, 350])
+def test_a_piece_of_many_points_keeps_both_ends_and_its_points_share_information(count: int) -> None:
     points = np.column_stack([np.linspace(0.0, 0.019, count), np.zeros(count)])
-    kept, _, finite = usable_points(points, np.full(count, 1e-5), 10.0, 1e-6, 1e-3, 100)
-    assert finite == count
-    assert 50 <= len(kept) <= 100
-    np.testing.assert_allclose(kept[[0, -1], 0], [0.0, 19.0])
-    steps = np.diff(kept[:, 0])
-    assert steps.max() < 2.1 * steps.min()
+    points[5] = np.nan, 0.0
+    points[7] = 0.0, 20.0  # out of bounds
+    path, deviation, arcs, share = read_piece(points, np.full(count, 1e-7), 1e-3, 100)
+    assert 50 <= len(path) <= 100
+    np.testing.assert_allclose(path[[0, -1], 0], [0.0, 19.0])
+    np.testing.assert_allclose(deviation, MIN_DEVIATION / 1e-3)  # none is better than that
+    np.testing.assert_allclose(arcs, path[:, 0])
+    np.testing.assert_allclose(share, np.minimum(np.gradient(arcs) * 1e-3 / POINT_CORRELATION, 1.0))
 
 
-def test_points_that_are_out_of_bounds_or_no_numbers_are_left_out() -> None:
-    points = np.array(
-        [(1e-3, 2e-3), (-20.0, 0.0), (0.0, 20.0), (np.nan, 0.0), (0.0, -20.0), (3e-3, -4e-3), (5e-3, 0.0)]
-    )
-    deviation = np.array([1e-5, 1e-5, 1e-5, 1e-5, 1e-5, 0.0, -1e-5])
-    kept, deviations, finite = usable_points(points, deviation, 10.0, 2e-6, 1e-3, 100)
-    assert finite == 2
-    np.testing.assert_allclose(kept, [(1.0, 2.0), (3.0, -4.0)])
-    np.testing.assert_allclose(deviations, [1e-2, 2e-3])  # none is as good as 0
-
-
-@pytest.mark.parametrize(("correlation", "share"), [(0.25, 0.4), (0.05, 1.0)])
-def test_points_closer_than_they_err_alike_share_the_information_of_one(correlation: float, share: float) -> None:
-    points = np.column_stack([0.1 * np.arange(30), np.zeros(30)])
-    _, _, arcs, found = clean_path(points, np.full(30, 1e-3), 30.0, 3.0, correlation)
-    np.testing.assert_allclose(arcs, 0.1 * np.arange(30))
-    np.testing.assert_allclose(found, share)
+def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([np.linspace(0.0, 10.0, 200), rng.normal(0.0, 0.02, 200)])
+    arcs = path_lengths(points, 0.4)
+    assert abs(arcs[-1] - 10.0) < 0.05 < 0.2 < np.hypot(*np.diff(points, axis=0).T).sum() - 10.0
+    assert np.all(np.diff(arcs) >= 0.0)
 
 
 @pytest.mark.parametrize("turn", [0.1, -0.1])
@@ -102,15 +94,6 @@ def test_beside_a_kink_the_thread_is_straight_and_beyond_its_ends_is_nothing() -
     np.testing.assert_allclose(innovation, [0.01, -0.02, -0.03, 0.0, 0.0], atol=1e-12)
 
 
-def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:
-    rng = np.random.default_rng(2)
-    points = np.column_stack([np.linspace(0.0, 10.0, 200), rng.normal(0.0, 0.02, 200)])
-    arcs = np.empty(200)
-    path_lengths(points, 0.4, arcs)
-    assert abs(arcs[-1] - 10.0) < 0.05 < 0.2 < np.hypot(*np.diff(points, axis=0).T).sum() - 10.0
-    assert np.all(np.diff(arcs) >= 0.0)
-
-
 def test_start_of_a_piece_is_found_along_the_thread() -> None:
     nodes = np.column_stack([np.arange(30.0), 3.0 * np.sin(0.3 * np.arange(30.0))])
     at = np.arange(0.0, 8.0, 0.25)
@@ -123,6 +106,27 @@ def test_start_of_a_piece_is_found_along_the_thread() -> None:
     found, square = search_start(chain, points, at, 0.0, 21.0, 100.0)
     assert found == pytest.approx(11.3, abs=0.06)
     assert square < 0.01
+
+
+@pytest.mark.parametrize("beyond", [0.4, -0.3])
+def test_a_piece_is_placed_from_either_end_and_its_free_end_is_measured_along_the_thread(beyond: float) -> None:
+    turn = 0.1 * np.arange(25.0)
+    nodes = np.vstack([np.zeros(2), np.cumsum(np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)])
+    along = nodes[-1] - nodes[-2]
+    points = np.vstack([nodes[8:], nodes[-1] + beyond * along]) * 1e-3
+    found = []
+    for turned in (False, True):
+        ends = (PieceEnd.UNKNOWN, PieceEnd.FREE)
+        ends, given = (ends[::-1], points[::-1]) if turned else (ends, points)
+        piece = ThreadPiece(given, np.full(len(points), 1e-5), *ends, NAN, direction_known=False)
+        placed, problems = place_pieces(ThreadObservation((piece,)), nodes, np.ones(26), 1e-3)
+        assert not problems
+        measured, _ = measured_points(placed, AssociationInput(nodes, 0.01, 1e-3, Workspace((), 5e-3), 0.0, 1.0))
+        assert measured is not None
+        assert measured.end[0] == pytest.approx(beyond)
+        found.append(placed[0])
+    for name in ("points", "variance", "share", "arcs", "start"):
+        np.testing.assert_allclose(getattr(found[0], name), getattr(found[1], name), atol=1e-6, err_msg=name)
 
 
 def run_with(pieces_at, count: int = 60, **options):
@@ -200,33 +204,6 @@ def test_unknown_start_is_found_at_once(start: str) -> None:
     for k in range(41, 71):
         estimate = estimator.step(way[k], whole(truth[k], k))
     assert error_percent(estimate.positions, truth[70]) < 0.3
-
-
-def test_a_piece_given_from_its_other_end_is_placed_alike() -> None:
-    turn = 0.1 * np.arange(25.0)
-    nodes = np.vstack([np.zeros(2), np.cumsum(np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)])
-    points, unit, found = nodes[8:17] * 1e-3, 1e-3, []
-    for given in (points, points[::-1]):
-        piece = ThreadPiece(given, np.full(9, 1e-5), PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, direction_known=False)
-        problems: list[str] = []
-        found += place_pieces(ThreadObservation((piece,)), nodes, np.ones(26), unit, EstimatorOptions(), problems)
-        assert not problems
-    for name in ("points", "variance", "share", "arcs", "start"):
-        np.testing.assert_allclose(getattr(found[0], name), getattr(found[1], name), atol=1e-6, err_msg=name)
-    np.testing.assert_allclose(found[1].start + found[1].arcs, np.arange(8.0, 17.0), atol=0.05)
-
-
-@pytest.mark.parametrize("angle", [0.3, 2.0, -1.2])
-@pytest.mark.parametrize("beyond", [0.4, -0.3])
-def test_a_free_end_is_off_by_what_lies_along_the_last_segment(angle: float, beyond: float) -> None:
-    along = np.array([math.cos(angle), math.sin(angle)])
-    nodes = np.arange(26.0)[:, None] * along + (3.0, -2.0)
-    end = nodes[-1] + beyond * along + 0.2 * np.array([-along[1], along[0]])
-    piece = PlacedPiece(
-        np.vstack([nodes[20], end]), np.full(2, 1e-3), np.ones(2), np.zeros(2), 20.0, 0.1, False, True, 0.0
-    )
-    assert free_end([piece], nodes, 0.01)[0] == pytest.approx(beyond)
-    assert free_end([piece._replace(free_end=False)], nodes, 0.01) == (0.0, math.inf)
 
 
 def test_a_thread_that_lies_elsewhere_is_believed_when_a_second_frame_shows_it() -> None:

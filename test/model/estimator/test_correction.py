@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
+from magnetosuture_thread.model.estimator.association import MeasuredPoints
 from magnetosuture_thread.model.estimator.correction import (
     CORRECTED,
     CorrectionBuffers,
-    MeasuredPoints,
+    Corrector,
+    Prior,
     correct,
     measured_rows,
     normals_of,
     prior_information,
     robust_weights,
+    selected_inverse,
 )
-from magnetosuture_thread.model.estimator.covariance import propagate, selected_inverse
 from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.model.formulations.step_buffers import StepBuffers, program_of
-from magnetosuture_thread.model.solvers import BandedSolver
 from magnetosuture_thread.model.solvers.banded import assemble_matrix, factorise
 from magnetosuture_thread.model.solvers.osqp import as_quadratic_program
 from magnetosuture_thread.thread_observation import ThreadObservation
@@ -32,6 +33,7 @@ from test.model.estimator.threads import (
     estimator_of,
     piece_of,
     poses,
+    predictor_of,
     thread_of,
     true_shapes,
     whole,
@@ -51,6 +53,7 @@ def measured(rng: np.random.Generator, count: int) -> MeasuredPoints:
         rng.normal(0.0, 0.05, count),
         rng.uniform(1e-4, 1e-3, count),
         rng.uniform(0.3, 1.0, count),
+        np.ones(count),
     )
 
 
@@ -80,7 +83,8 @@ def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
     normals, buffers = np.zeros((NODES, 2)), StepBuffers.of(NODES, 2, 1)
     normals_of(nodes, normals)
     length, stiffness, scale = 2.0, 0.7, 3.0
-    prior_information(density, noise, length, stiffness, scale, clamped, normals, buffers)
+    prior = Prior(nodes, np.array([1.0, 0.0]), density, noise, length, stiffness)
+    prior_information(prior, scale, clamped, normals, buffers)
     found = dense_of(buffers, known, 0)
     for _ in range(5):
         d = rng.normal(0.0, 1.0, (NODES, 2))
@@ -97,13 +101,13 @@ def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
 
 def test_rows_of_a_segment_are_those_of_all_its_points() -> None:
     rng = np.random.default_rng(2)
-    nodes, points = bent_chain(rng), measured(rng, 60)
-    weights = rng.uniform(0.2, 1.0, 60)
+    nodes = bent_chain(rng)
+    points = measured(rng, 60)._replace(weight=rng.uniform(0.2, 1.0, 60))
     buffers, gram = StepBuffers.of(NODES, 2, 2 * NODES), np.zeros((NODES - 1, 5))
-    end = measured_rows(points, weights, 1.0, nodes, 0, gram, buffers)
+    end = measured_rows(points, 1.0, nodes, 0, gram, buffers)
     assert end <= 2 * (NODES - 1)
     full = dense_rows(points, nodes)
-    precision = weights * points.share / points.variance
+    precision = points.weight * points.share / points.variance
     matrix, right = np.zeros((2 * NODES, 2 * NODES)), np.zeros(2 * NODES)
     for r in range(end):
         row = np.zeros(2 * NODES)
@@ -122,8 +126,9 @@ def test_selected_inverse_matches_the_dense_one() -> None:
     buffers, points = StepBuffers.of(NODES, 2, 3 * NODES), measured(rng, 40)
     normals = np.zeros((NODES, 2))
     normals_of(nodes, normals)
-    prior_information(np.ones(NODES), np.ones(NODES), 1.5, 0.4, 1.0, False, normals, buffers)
-    rows = measured_rows(points, np.ones(40), 1.0, nodes, 0, np.zeros((NODES - 1, 5)), buffers)
+    prior = Prior(nodes, np.array([1.0, 0.0]), np.ones(NODES), np.ones(NODES), 1.5, 0.4)
+    prior_information(prior, 1.0, False, normals, buffers)
+    rows = measured_rows(points, 1.0, nodes, 0, np.zeros((NODES - 1, 5)), buffers)
     band = np.zeros((2 * NODES + 6, 7))
     program = program_of(buffers, known, rows)
     assemble_matrix((0, 1), program, 1.0 / program.compliance, np.ones(rows, dtype=np.bool_), band)
@@ -145,69 +150,48 @@ STRAIGHT = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
 
 def correct_straight(
     points: MeasuredPoints, density: float, discs: tuple[Disc, ...] = ()
-) -> tuple[int, float, float, CorrectionBuffers, np.ndarray]:
-    """Correct a straight thread; return how it ended, how far off the constraints are, residual, memory, weights."""
-    segments = NODES - 1
-    estimator = estimator_of(thread_of(segments), discs)
-    estimator.start(poses(1)[0])
-    buffers, memory = StepBuffers.of(NODES, 2, 3 * segments + 1), CorrectionBuffers.of(NODES)
-    memory.known[0] = True
-    formulation, solver, weights = estimator.predictor.formulation, BandedSolver(), np.ones(len(points.place))
+) -> tuple[int, float, float, CorrectionBuffers]:
+    """Correct a straight thread; return how it ended, how far off the constraints are, residual and memory."""
+    formulation = predictor_of(thread_of(NODES - 1), discs).formulation
     assert isinstance(formulation, RodFormulation)
-    code, _, off, residuals, _ = correct(
-        (0, 1),
-        formulation.rod,
-        buffers,
-        formulation.workspace.data,
-        solver.buffers(NODES, 2, len(buffers.first)),
-        memory,
-        STRAIGHT,
-        np.array([1.0, 0.0]),
-        np.full(NODES, density),
-        np.full(NODES, 1.0),
-        2.0,
-        0.5,
-        points,
-        weights,
-        (0.0, np.inf),
-        1e-6,
-    )
-    return code, off, max(residuals), memory, weights
+    memory = CorrectionBuffers.of(NODES)
+    memory.known[0] = True
+    prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, density), np.ones(NODES), 2.0, 0.5)
+    code, _, off, residual, _ = correct(formulation.rod, formulation.workspace.data, memory, prior, points)
+    return code, off, residual, memory
 
 
 def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     """A straight thread has no constraint across it, so that across it the update is the plain one."""
-    rng, nodes = np.random.default_rng(4), STRAIGHT
-    points = MeasuredPoints(
-        np.sort(rng.uniform(0.5, NODES - 1.0, 40)), rng.normal(0.0, 1e-4, 40), np.full(40, 1e-4), np.ones(40)
-    )
-    density, noise = np.full(NODES, 3e-4), np.full(NODES, 1.0)
-    code, off, residual, memory, _ = correct_straight(points, 3e-4)
+    rng = np.random.default_rng(4)
+    points = measured(rng, 40)
+    points = points._replace(innovation=1e-3 * points.innovation, variance=np.full(40, 1e-4), share=np.ones(40))
+    code, off, residual, memory = correct_straight(points, 3e-4)
     assert code == CORRECTED
     assert off <= 1.0
     assert residual < 1e-6
     check = StepBuffers.of(NODES, 2, 1)
-    prior_information(density, noise, 2.0, 0.5, 1.0, False, memory.normals, check)
+    prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, 3e-4), np.ones(NODES), 2.0, 0.5)
+    prior_information(prior, 1.0, False, memory.normals, check)
     information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
-    rows = dense_rows(points, nodes)[:, 3::2]
-    prior = np.linalg.inv(information)
-    spread = rows @ prior @ rows.T + np.diag(points.variance)
-    gain = prior @ rows.T @ np.linalg.inv(spread)
+    rows = dense_rows(points, STRAIGHT)[:, 3::2]
+    covariance = np.linalg.inv(information)
+    spread = rows @ covariance @ rows.T + np.diag(points.variance)
+    gain = covariance @ rows.T @ np.linalg.inv(spread)
     np.testing.assert_allclose(memory.moved[1:, 1], gain @ points.innovation, rtol=1e-3, atol=1e-8)
-    covariance = prior - gain @ rows @ prior
-    np.testing.assert_allclose(memory.covariance[1:, 1, 1], np.diag(covariance), rtol=1e-3)
+    left = covariance - gain @ rows @ covariance
+    np.testing.assert_allclose(memory.covariance[1:, 1, 1], np.diag(left), rtol=1e-3)
     assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
 
 
 def test_points_that_the_correction_explains_count_fully() -> None:
     """Five deviations from the prediction, to both sides, and next to nothing once the thread is corrected."""
-    points = MeasuredPoints(
-        np.array([2.0, 5.0, 8.0, 11.0]), 0.05 * np.array([1, -1, 1, -1.0]), np.full(4, 1e-4), np.ones(4)
-    )
-    code, _, _, memory, weights = correct_straight(points, 10.0)
+    places, aside = np.array([2.0, 5.0, 8.0, 11.0]), 0.05 * np.array([1, -1, 1, -1.0])
+    points = MeasuredPoints(places, aside, np.full(4, 1e-4), np.ones(4), np.ones(4))
+    code, _, _, memory = correct_straight(points, 10.0)
     assert code == CORRECTED
     np.testing.assert_allclose(-memory.moved[[2, 5, 8, 11], 1], points.innovation, rtol=0.1)
-    np.testing.assert_array_equal(weights, 1.0)
+    np.testing.assert_array_equal(points.weight, 1.0)
 
 
 def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
@@ -215,8 +199,8 @@ def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
     thread = thread_of(NODES - 1)
     unit, radius = thread.segment_length, 2e-3
     disc = Disc((-6.0 * unit, radius + 0.5 * thread.diameter + 0.02 * unit), radius)
-    points = MeasuredPoints(np.linspace(3.0, 9.0, 25), np.full(25, -0.1), np.full(25, 1e-2), np.ones(25))
-    code, off, _, memory, _ = correct_straight(points, 1e-2, (disc,))
+    points = MeasuredPoints(np.linspace(3.0, 9.0, 25), np.full(25, -0.1), np.full(25, 1e-2), *np.ones((2, 25)))
+    code, off, _, memory = correct_straight(points, 1e-2, (disc,))
     assert (code, off <= 1.0) == (CORRECTED, True)
     away = np.linalg.norm(unit * (STRAIGHT + memory.moved) - np.array(disc.centre), axis=1)
     assert -2e-7 < away.min() - radius - 0.5 * thread.diameter < 2e-6
@@ -225,23 +209,59 @@ def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
 def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:
     residual, variance, weights = np.zeros(20), np.full(20, 1e-4), np.full(20, 0.5)
     residual[4], residual[10:17] = 0.1, -0.1
-    points = MeasuredPoints(np.linspace(0.5, 10.0, 20), residual, variance, np.ones(20))
-    change = robust_weights(points, residual, variance, weights)
+    change = robust_weights(residual, variance, weights)
     assert weights[4] == pytest.approx(5.0 / (4.0 + 0.1**2 / 1e-4))
     np.testing.assert_allclose(np.delete(weights, 4), 1.0)
     assert change == pytest.approx(0.5)
 
 
-def test_errors_stay_where_they_are_while_the_thread_slides_along_itself() -> None:
-    nodes = np.column_stack([-np.arange(10.0), np.zeros(10)])
-    variance = np.zeros(10)
-    variance[5] = 1.0
-    propagate(nodes + np.array([1.0, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
-    np.testing.assert_allclose(variance, np.eye(10)[6], atol=1e-12)
-    propagate(nodes + np.array([0.0, 1.0]), nodes, np.full(10, 0.1), variance, np.empty(10))
-    np.testing.assert_allclose(variance, np.eye(10)[6] + 0.1, atol=1e-12)
-    propagate(nodes + np.array([0.3, 0.0]), nodes, np.zeros(10), variance, np.empty(10))
-    np.testing.assert_allclose(variance, 0.7 * np.eye(10)[6] + 0.3 * np.eye(10)[7] + 0.1, atol=1e-12)
+@pytest.mark.parametrize("end", [(0.0, np.inf), (2e-5, 3e-4)])
+def test_sensitivity_information_and_score_are_those_of_a_dense_filter(end: tuple[float, float]) -> None:
+    thread, rng = thread_of(NODES - 1), np.random.default_rng(7)
+    predictor = predictor_of(thread)
+    formulation = predictor.formulation
+    assert isinstance(formulation, RodFormulation)
+    start, points = bent_chain(rng), measured(rng, 40)
+    points = points._replace(innovation=2e-4 * points.innovation, end=end)
+    density, noise = rng.uniform(0.5e-3, 2e-3, NODES), rng.uniform(0.5e-3, 2e-3, NODES)
+    stiffness = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)
+    prior = Prior(start, np.array([-1.0, 0.0]), density, noise, 1.3, stiffness)
+    corrector = Corrector(predictor, formulation)
+    assert not corrector.solve(prior, points).problem
+    derivative = rng.normal(0.0, 1.0, (NODES, 2))
+    derivative[0] = 0.0
+    found = corrector.sensitivity(derivative)
+    # The chain's chords are not quite those of its arcs, which moves it without innovations too.
+    turned = points._replace(innovation=-points.innovation, weight=np.ones(40), end=(-end[0], end[1]))
+    corrector.solve(prior, turned)
+    other = corrector.sensitivity(derivative)
+    score, square = 0.5 * (found.score - other.score), 0.5 * (found.square + other.square)
+
+    normals, buffers = np.zeros((NODES, 2)), StepBuffers.of(NODES, 2, 1)
+    normals_of(start, normals)
+    scale = max((1.0 / density[1:]).max(), (points.share / points.variance).max())
+    prior_information(prior, scale, False, normals, buffers)
+    information = scale * dense_of(buffers, np.zeros(NODES, dtype=np.bool_), 0)
+    along = np.diff(start, axis=0)
+    for i in range(NODES - 1):  # chords that do not change
+        row = np.zeros(2 * NODES)
+        row[2 * i : 2 * i + 2], row[2 * i + 2 : 2 * i + 4] = -along[i], along[i]
+        information += 1e9 * np.outer(row, row)
+    rows, innovation, variance = dense_rows(points, start), points.innovation, points.variance / points.share
+    if np.isfinite(end[1]):
+        last = np.append(np.zeros(2 * NODES - 2), along[-1])
+        rows, innovation, variance = np.vstack([rows, last]), np.append(innovation, end[0]), np.append(variance, end[1])
+    covariance = np.zeros((2 * NODES, 2 * NODES))
+    covariance[2:, 2:] = np.linalg.inv(information[2:, 2:])
+    of_innovations = rows @ covariance @ rows.T + np.diag(variance)
+    by = rows @ derivative.ravel()
+    gained = np.linalg.solve(of_innovations, by)
+    assert found.information == pytest.approx(by @ gained, rel=2e-3)
+    assert score == pytest.approx(gained @ innovation, rel=2e-3)
+    assert square == pytest.approx(innovation @ np.linalg.solve(of_innovations, innovation), rel=2e-3)
+    assert found.independent == pytest.approx(points.share.sum() + np.isfinite(end[1]))
+    corrected = derivative.ravel() - covariance @ rows.T @ gained
+    np.testing.assert_allclose(found.corrected.ravel(), corrected, atol=2e-3)
 
 
 def test_deviation_matches_the_spread_of_estimates() -> None:
@@ -250,7 +270,7 @@ def test_deviation_matches_the_spread_of_estimates() -> None:
     rest = poses(2, speed=0.0, turn=0.0)
     truth = np.column_stack([-np.linspace(0.0, LENGTH, 26), np.zeros(26)])
     found, told = [], []
-    for seed in range(60):
+    for seed in range(40):
         estimator = estimator_of(thread)
         estimator.start(rest[0], truth, deviation=1e-4)
         estimate = estimator.step(rest[1], ThreadObservation((piece_of(truth, seed),), True))
@@ -283,18 +303,6 @@ def test_constraints_hold_after_a_correction() -> None:
             ).max()
             < 1.5e-3
         )
-
-
-def test_without_observations_the_estimate_is_the_prediction_to_the_last_bit() -> None:
-    thread, way = thread_of(), poses(40)
-    estimator, alone = estimator_of(thread), estimator_of(thread).predictor
-    estimator.start(way[0])
-    alone.start(way[0])
-    for pose in way[1:]:
-        estimate = estimator.step(pose)
-        assert not estimate.corrected
-        assert estimate.unmeasured_for == np.inf
-        np.testing.assert_array_equal(estimate.positions, alone.step(pose).positions)
 
 
 def test_a_wrong_model_is_corrected() -> None:

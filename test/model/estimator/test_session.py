@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,21 +59,6 @@ def test_late_observations_give_the_estimate_of_those_in_time() -> None:
     np.testing.assert_array_equal(found.positions, expected.positions)
     np.testing.assert_array_equal(found.covariance, expected.covariance)
     np.testing.assert_array_equal(found.noise, expected.noise)
-
-
-def test_the_same_run_is_the_same_to_the_last_bit() -> None:
-    way = poses(50)
-    truth = true_shapes(thread_of(viscosity=2.0), way)
-    last = []
-    for _ in range(2):
-        session = session_of()
-        for k, pose in enumerate(way):
-            session.on_pose(pose)
-            result = session.on_observation(pose.stamp, whole(truth[k], k))
-        assert result.estimate is not None
-        last.append((result.estimate.positions, result.estimate.covariance))
-    np.testing.assert_array_equal(last[0][0], last[1][0])
-    np.testing.assert_array_equal(last[0][1], last[1][1])
 
 
 def test_observations_that_cannot_be_used_are_refused() -> None:
@@ -211,32 +197,28 @@ def test_an_obstacle_nobody_told_of_is_found() -> None:
     assert later.force > 0.0
 
 
-def test_nothing_is_found_where_the_model_is_right() -> None:
-    way = poses(200)
-    truth = true_shapes(thread_of(), way)
-    estimator = estimator_of(thread_of())
-    estimator.start(way[0])
-    estimates = [estimator.step(pose, whole(truth[k], k)) for k, pose in enumerate(way[1:], 1)]
-    assert not any(each.disturbances for each in estimates)
-    assert error_percent(estimates[-1].positions, truth[-1]) < 0.03
-
-
 def test_what_the_estimator_cannot_correct_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="rod"):
         ThreadEstimator(ThreadPredictor(thread_of(), formulation="paper"))
     with pytest.raises(ConfigurationError, match="plane"):
         ThreadEstimator(ThreadPredictor(thread_of(), Workspace((), 5e-3, dimension=3)))
-    with pytest.raises(ConfigurationError, match="noise_time"):
-        EstimatorOptions(noise_time=0.0)
+    with pytest.raises(ConfigurationError, match="history"):
+        EstimatorOptions(history=0.0)
 
 
-def test_a_given_shape_that_the_first_frame_contradicts_is_given_up_without_a_report() -> None:
+def test_another_thread_goes_on_from_the_estimate_and_older_frames_are_refused() -> None:
     way = poses(40)
-    truth = true_shapes(thread_of(), way)
-    estimator = estimator_of(thread_of())
-    wrong = truth[0] + np.column_stack([np.zeros(26), 0.2 * LENGTH * np.linspace(0.0, 1.0, 26)])
-    estimator.start(way[0], wrong)
-    for k, pose in enumerate(way[1:], 1):
-        estimate = estimator.step(pose, whole(truth[k], k))
-        assert error_percent(estimate.positions, truth[k]) < 0.3
-        assert not estimate.disturbances
+    truth = true_shapes(thread_of(viscosity=1.5), way)
+    session, finer = session_of(), EstimatorSession(estimator_of(thread_of(40)))
+    for k in range(30):
+        session.on_observation(way[k].stamp, whole(truth[k], k))
+        session.on_pose(way[k])
+    session.on_observation(way[30].stamp, whole(truth[30], 30))  # which waits for its pose
+    finer.follow_on(session)
+    assert finer.on_observation(way[29].stamp, whole(truth[29], 29)).problem is not None
+    estimate = finer.on_pose(way[30]).estimate
+    assert estimate is not None
+    assert estimate.corrected
+    assert len(estimate.positions) == 41
+    assert np.linalg.norm(estimate.positions[-1] - truth[30, -1]) < 1e-4
+    assert finer.on_pose(replace(way[0], stamp=-5.0)).problem is None  # time was set back
