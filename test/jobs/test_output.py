@@ -53,8 +53,7 @@ def test_rows_become_a_parquet_table(tmp_path: Path):
     parquet = pytest.importorskip("pyarrow.parquet")
     rows: list[dict[str, Any]] = [
         {"bag": "a", "frames": 3, "error": 0.5, "problem": ""},
-        {"bag": "b", "frames": None, "error": None},
+        {"bag": "b", "frames": None, "error": None, "problem": "is damaged"},
     ]
-    rows[1]["problem"] = "is damaged"
     write_parquet(tmp_path / "table.parquet", rows)
     assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == rows
