@@ -74,7 +74,6 @@ def test_help_waits_for_no_package_of_a_command():
         ("reproduce thread-behavior", "--output"),
         ("track", "--overlay"),
         ("calibrate-camera", "--markers"),
-        ("calibrate-coils", "--model"),
         ("coils", "ACTION"),
         ("console", "--namespace"),
         ("console", "--replay"),

@@ -208,7 +208,7 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
     "ThreadForecaster": (
         FORECASTER,
         "thread scene safety law friction_averaging attachment_offset drag step margin_range "
-        "contact_tolerance residual_tolerance max_step max_substeps fixed_nodes workers",
+        "contact_tolerance residual_tolerance max_step max_substeps fixed_nodes",
     ),
     "ThreadPredictor": (
         CREATE,

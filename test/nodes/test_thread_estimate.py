@@ -190,7 +190,7 @@ def spoiled(name: str) -> tuple[float, ThreadObservation]:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("doubled", "a second observation of the same frame"),
+        ("doubled", "second observation of the same frame"),
         ("future", "after the last pose"),
         ("long ago", "the stamp of a pose that is kept"),
         ("not finite", "thread/observation"),

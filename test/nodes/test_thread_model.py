@@ -97,7 +97,7 @@ def test_friction_slows_the_needle_and_is_shown(graph):
     node = graph.add(ThreadModelNode, initial_shape="straight", friction_threshold=1.2e-3, friction_averaging=0.0)
     graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
     margins, markers = graph.listen(topics.MARGINS), graph.listen(topics.THREAD_MARKERS)
-    graph.wait(lambda: node._outputs._markers.get_subscription_count() > 0, "the markers to be wanted")
+    graph.wait(lambda: node._markers.get_subscription_count() > 0, "the markers to be wanted")
     for k, x in enumerate((0.0, 1e-4, 2e-4, 2e-4)):
         graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, x))
         graph.wait(lambda k=k: len(margins) == k + 1 and len(markers) == k + 1, "margins and markers")

@@ -139,7 +139,7 @@ def test_bad_currents_are_refused_and_the_last_stay(currents: np.ndarray):
         ({"needle_start": (0.0, 0.0)}, "a multiple of 3"),
         ({"needle_start": ()}, "x, y"),
         ({"needle_curvature": 500.0}, "a half circle"),
-        ({"needle_length": 7e-4, "needle_width": 5e-4}, "at least two widths"),
+        ({"needle_length": 1.5e-3, "needle_width": 1e-3}, "at least two widths"),
         ({"faults": ("sun 1 2",)}, "KIND START DURATION"),
         ({"faults": (3,)}, "a list of texts"),
         ({"obstacle_looks": ("gold",)}, "one of silicone, tissue, hernia"),
