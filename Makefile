@@ -6,7 +6,7 @@
 # make lint   check style and types
 # make colcon build both packages by colcon, into install/
 # make docs  build the documentation into output/docs
-# make peers  add the solvers and simulators of `python -m benchmarks solver --peers`
+# make peers  add the solvers of `python -m benchmarks solver --peers`
 # make clean  remove all that make made
 #
 # Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13
@@ -48,7 +48,7 @@ kernels: $(READY)
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
 coverage: $(READY)
 	@mkdir -p output
-	$(RUN)/python -m coverage run -m pytest -q $(addprefix test/,coils console geometry guidance model planning safety scene vision)
+	$(RUN)/python -m coverage run -m pytest -q $(addprefix test/,coils console geometry model planning safety scene vision)
 	$(RUN)/python -m coverage report --skip-covered --show-missing
 
 lint: $(READY)
@@ -66,7 +66,7 @@ colcon: $(READY)
 
 # From the extra `peers`, without building the package again.
 peers: $(READY)
-	$(INSTALL) clarabel 'mujoco<4' piqp pyelastica
+	$(INSTALL) clarabel piqp
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
