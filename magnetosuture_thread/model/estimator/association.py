@@ -425,9 +425,9 @@ def measured_points(placed: list[PlacedPiece], given: AssociationInput) -> tuple
             found.append([each[good] for each in (place, innovation, given.scale * piece.variance, piece.share)])
     if not found:
         return None, problems
-    columns = [np.concatenate(each) for each in zip(*found, strict=True)]
+    place, innovation, variance, shares = (np.concatenate(each) for each in zip(*found, strict=True))
     end = _free_end(placed, nodes, given.end_variance)
-    return MeasuredPoints(*columns, np.ones(len(columns[0])), end), problems
+    return MeasuredPoints(place, innovation, variance, shares, np.ones(len(place)), end), problems
 
 
 def _free_end(placed: list[PlacedPiece], nodes: Points, variance: float) -> tuple[float, float]:

@@ -135,7 +135,8 @@ def propagate_errors(positions: Points, before: Points, unit: float, added: Vect
         size = np.hypot(tx, ty)
         if size > 0.0:
             slid[i] = ((positions[i, 0] - before[i, 0]) * tx + (positions[i, 1] - before[i, 1]) * ty) / (size * unit)
-    nodes, result = np.arange(last + 1.0), added.copy()
+    nodes = np.arange(last + 1.0)
+    result: Points = added.copy()
     for k in range(2):
         result[k] += np.interp(nodes - slid, nodes, errors[k])
     return result
