@@ -17,11 +17,8 @@ from magnetosuture_thread.cli.commands.compile_kernels import kernel_steps
 from magnetosuture_thread.compiled import PACKAGE
 
 ROOT = Path(__file__).resolve().parent.parent
-# Tests with kernels that no setup has: in space and of PyElastica, which share hardly any with the setups, ...
-IN_SPACE = (
-    "test/benchmarks/test_solver.py::test_simulators_follow_the_rod",
-    "test/test_examples.py::test_an_example_runs[ball_in_space]",
-)
+# Tests with kernels that no setup has: in space, which share hardly any with the setups, ...
+IN_SPACE = ("test/test_examples.py::test_an_example_runs[ball_in_space]",)
 # ... and of the other formulations, of needle and rod, and of forecasts in batches, which share most.
 BESIDES = (
     "test/calibration/test_online_agreement.py",

@@ -87,6 +87,8 @@ class SqliteFile:
                 self.connections = _connections(database)
                 if lost := self._count_messages(database):
                     raise self._damaged(f"{lost} rows without a valid time, topic or data")
+        except sqlite3.OperationalError as error:  # locked, not to be opened, or too much work: that is no damage
+            raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         except sqlite3.DatabaseError as error:
             raise self._damaged(_reason_of(error)) from None
         except _ERRORS as error:

@@ -85,12 +85,16 @@ class BridgeOutput:
         return "; ".join(self.reasons)
 
 
+NO_VELOCITY: Vector = np.zeros(2)
+NO_VELOCITY.flags.writeable = False  # shared by all steps without a command
+
+
 class _SelectedInput(NamedTuple):
     """The input that is followed, or why there is none."""
 
     source: str = ""
     overridden: str = ""
-    velocity: Vector = np.zeros(2)
+    velocity: Vector = NO_VELOCITY
     problem: str = ""
 
 

@@ -74,6 +74,7 @@ class MotionObserver:
 
     def __init__(self, needle: NeedleKinematics, min_hold: float = math.inf, max_speed: float = math.inf) -> None:
         self._needle, self._min_hold, self._max_speed = needle, min_hold, max_speed
+        limit_pair(0.0, 0.0, max_speed)  # loaded now, and not within the loop
         self._velocity = np.zeros(2)
         self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
         self._seen: tuple[float, Vector] | None = None  # the last pose that the needle has visibly moved to

@@ -285,7 +285,7 @@ class ThreadForecaster:
         return RolloutBuffers(
             step=step,
             solver=BandedSolver().buffers(segments + 1, 2, len(step.first)),
-            contacts=ContactBuffers.of(segments + 1, 2),
+            contacts=ContactBuffers.of(segments + 1, 2, len(self.scene.shapes)),
             ends=np.zeros((3, prescribed, 2)),
             pose=np.zeros(6),
             tension=np.zeros(segments),

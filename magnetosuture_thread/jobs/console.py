@@ -180,13 +180,13 @@ class BagRecording:
             BagError: the disk is full or fails; what was recorded before is there.
         """
         self._ending.set()
-        try:
-            if self._writing is not None:
-                await self._writing
-        finally:
-            for inbox in self._inboxes:
-                inbox.close()
-            self._inboxes = []
+        if self._writing is not None:
+            await asyncio.wait([self._writing])  # which a cancellation of this does not end: the inboxes are in use
+        for inbox in self._inboxes:
+            inbox.close()
+        self._inboxes = []
+        if self._writing is not None:
+            self._writing.result()
 
     def _write(self, begun: Callable[[], object]) -> None:
         with (
@@ -291,14 +291,15 @@ class RecordingHost(GraphHost):
         recording = self._recording
         if recording is None:
             return ""
-        self._recording = None
+        problem = ""
         try:
             await recording.end()
         except MagnetosutureError as error:
-            self.log(f"the recording has ended: {error}")
-            return str(error)
-        self.log(f"recorded: {recording.output}")
-        return ""
+            problem = str(error)
+        if self._recording is recording:  # not before: whoever is cancelled meanwhile leaves it to `close`
+            self._recording = None
+            self.log(f"the recording has ended: {problem}" if problem else f"recorded: {recording.output}")
+        return problem
 
 
 class SimulatedHost(RecordingHost):

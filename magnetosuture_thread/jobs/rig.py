@@ -51,6 +51,11 @@ def score_rig(
 
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread = rig_thread(reference, path, segments or SEGMENTS)
+        first, unit = reference.threads[0], thread.length / (segments or SEGMENTS)
+        if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - reference.tails[0]) > 0.1 * unit:
+            raise BagError(path, "has a first thread of one point, or one that does not begin at the needle's tail")
+        if thread.diameter >= thread.length:
+            raise BagError(path, f"has a thread of {thread.diameter:g} m in diameter, expected less than its length")
         surface, heading = Surface(discs=reference.discs), float(reference.headings[0])
         rig = RigDynamics(NEEDLE_BODY, thread, surface, None, reference.tails[0], heading, reference.threads[0])
         speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)

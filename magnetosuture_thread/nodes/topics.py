@@ -38,13 +38,18 @@ QUALITIES = {
 # Bytes that a message may have, by its type or package; what is larger is not even decoded.
 MAX_BYTES = {
     "sensor_msgs/msg/CameraInfo": 1 << 16,
+    "magnetosuture_msgs/msg/Scene": 1 << 17,  # the largest has 120 kB
+    "magnetosuture_msgs/msg/ThreadMaterial": 1 << 18,
+    **{f"magnetosuture_msgs/msg/{name}": 1 << 16 for name in ("TrackerState", "FilterState", "CoilBridgeState")},
+    **{f"magnetosuture_msgs/msg/{name}": 1 << 16 for name in ("ProcedureState", "CoilCurrents")},
+    "diagnostic_msgs": 1 << 16,
     "sensor_msgs": MAX_BLOCK_BYTES,
     "visualization_msgs": 1 << 22,
     "geometry_msgs": 1 << 12,
     "std_msgs": 1 << 12,
     "rosgraph_msgs": 1 << 12,
 }
-MAX_OTHER_BYTES = 1 << 19  # the largest scene has 120 kB
+MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 

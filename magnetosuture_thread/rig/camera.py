@@ -428,11 +428,7 @@ def _circle(corners: int) -> Points:
 
 
 def still_outlines(obstacle: Obstacle) -> list[Points]:
-    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m].
-
-    Raises:
-        ValueError: a mesh has no outline in the plane.
-    """
+    """Return an obstacle's outline and those of its holes in the plane, each of shape (m, 2) [m]."""
     if isinstance(obstacle, Disc):
         return [np.asarray(obstacle.centre) + obstacle.radius * _circle(256)]
     return obstacle.rings

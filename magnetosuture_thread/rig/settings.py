@@ -134,6 +134,8 @@ class RigSettings(Configuration):
             raise ConfigurationError(f"{self.GROUP}.power_stage_ports", list(self.power_stage_ports), expectation)
         if self.needle_length < 2.0 * self.needle_width:
             raise ConfigurationError(f"{self.GROUP}.needle_length", self.needle_length, "at least two widths [m]")
+        if self.thread_diameter >= self.thread_length:
+            raise ConfigurationError(f"{self.GROUP}.thread_diameter", self.thread_diameter, "less than its length [m]")
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         for fault in self.faults:
             Fault.parse(fault)

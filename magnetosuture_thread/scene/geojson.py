@@ -109,6 +109,8 @@ def _feature(shape: SceneShape) -> dict[str, Any]:
 def _dish(properties: Mapping[str, Any], geometry: Mapping[str, Any], source: str) -> Dish:
     if geometry.get("type") != "Point" or _planar(geometry.get("coordinates")) != [0.0, 0.0]:
         raise scene_error(f"{DISH}.geometry", geometry, "a Point at 0, 0, the dish's centre", source)
+    if properties.get("diameter") is None and properties.get("radius") is not None:
+        raise scene_error(f"{DISH}.properties.radius", properties["radius"], "diameter, for a dish", source)
     return dish_from_mapping(
         {name: properties[name] for name in DISH_FIELDS if properties.get(name) is not None}, source
     )

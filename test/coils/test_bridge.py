@@ -639,3 +639,34 @@ def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
         tail, heading = needle.moved(tail, heading, along, left, PERIOD, found.drift)
         across.append(abs(found.drift))
     assert max(across) < 1e-3
+
+
+def test_after_a_stop_the_needle_starts_from_rest():
+    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
+    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
+    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
+    plant.run(1.0)
+    plant.bridge.latch.disarm()
+    plant.run(PERIOD)
+    plant.tail = None
+    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
+    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
+    assert at_rest is not None
+    assert later is not None
+    assert later.tail.tolist() == at_rest.tail.tolist()
+    plant.bridge.arm(READY)
+    plant.command((0.015, 0.0))
+    first = plant.run(PERIOD)[0]
+    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
+    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
+
+
+def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):
+    plant = Plant().ready()
+    plant.run(0.2)
+    zero = plant.bridge._coils.zero()
+    monkeypatch.setattr(plant.bridge._coils, "allocate", lambda *_: (zero, "wall"))
+    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no feasible currents",)
+    monkeypatch.undo()
+    assert all(still(output) for output in plant.run(0.08))
+    assert not still(plant.run(0.1)[-1])

@@ -15,10 +15,12 @@ import pytest
 from magnetosuture_thread import (
     Barrier,
     ConfigurationError,
+    Disc,
     Gradient,
     InvalidInputError,
     NeedlePose,
     Prediction,
+    Scene,
     ThreadPredictor,
     check_gradient,
 )
@@ -126,6 +128,45 @@ def test_a_gradient_that_is_wrong_is_named(barrier: Barrier, change: Callable[[G
     positions = np.cumsum(np.random.default_rng(5).uniform(-1e-3, 1e-3, (26, 2)), axis=0)
     with pytest.raises(InvalidInputError, match=f"barrier {barrier.name}: .*{words}"):
         check_gradient(skewed(barrier, change), positions)
+
+
+def test_several_barriers_hold_together_beside_the_wall_and_a_post():
+    scene = Scene.create(dish_diameter=0.045, shapes={"post": Disc((-0.004, -0.004), 0.002)})
+    barriers = [TipKeepIn(), MovingDisc()]
+    held = predicted(*barriers, scene=scene)
+    assert all(prediction.converged for prediction in held)
+    for barrier in barriers:
+        assert least(barrier, held) > -HOLDS
+    assert min(prediction.margins["obstacle"].minimum for prediction in held) > -HOLDS
+    assert list(held[-1].margins) == ["connectivity", "compression", "obstacle", "wall", "tip_keep_in", "moving_disc"]
+
+
+def test_the_banded_and_a_general_solver_find_the_same_thread():
+    barrier, way = WAYS[0]
+    banded, general = (predicted(barrier, way=way, solver=solver)[-1].positions for solver in ("banded", "osqp"))
+    np.testing.assert_allclose(banded, general, atol=1e-8)
+
+
+def test_a_failed_row_leaves_the_thread_where_it_was():
+    class Fragile(MovingDisc):  # type: ignore[misc, valid-type]
+        broken = False
+
+        def value(self, positions: np.ndarray) -> np.ndarray:
+            return np.full(3, math.nan) if self.broken else np.asarray(super().value(positions))
+
+    barrier = Fragile()
+    one, other = (
+        ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, barriers=[each])
+        for each in (barrier, MovingDisc())
+    )
+    for predictor in (one, other):
+        predictor.start(around(0))
+        predictor.step(around(1))
+    barrier.broken = True
+    with pytest.raises(InvalidInputError, match="moving_disc"):
+        one.step(around(2))
+    barrier.broken = False
+    np.testing.assert_array_equal(one.step(around(3)).positions, other.step(around(3)).positions)
 
 
 def test_a_gain_slows_how_fast_the_margin_falls():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from type_description_interfaces.srv import GetTypeDescription
 
@@ -142,3 +144,46 @@ def test_a_command_of_an_impossible_time_is_refused(graph, stamp):
     graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
     assert not driven(node)
     assert all(current.command != message.header.stamp for current in currents)
+
+
+def long_twist(graph) -> Any:
+    """Return a command whose frame has a name of 10 MB."""
+    message = wire.twist_message(graph.now(), np.array([0.001, 0.0]))
+    message.header.frame_id = "map" + "x" * 10_000_000
+    return message
+
+
+def long_scene(graph) -> Any:
+    """Return margins of a scene whose version has 10 MB."""
+    message = topics.MARGINS.message(valid=True, slowdown=1.0, scene_version="v" * 10_000_000)
+    message.header.stamp = graph.now()
+    return message
+
+
+@pytest.mark.parametrize(
+    ("topic", "make"),
+    [(topics.OPERATOR_COMMAND, long_twist), (topics.NEEDLE_COMMAND, long_twist), (topics.MARGINS, long_scene)],
+)
+def test_a_message_that_is_too_large_is_refused_unread(graph, topic: topics.Topic, make: Callable[[Any], Any]):
+    graph.add(CoilBridgeNode, scene="dish_35mm")
+    reports, states = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.BRIDGE_STATE)
+    graph.publish(topic, make(graph))
+    graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
+    graph.wait(lambda: "expected at most" in str(reports[-1].status[0].values), "the reason")
+    assert max(len(str(report)) for report in reports) < 5000
+
+
+def test_a_command_that_is_cut_off_is_refused(graph):
+    graph.add(CoilBridgeNode, scene="dish_35mm")
+    states = graph.listen(topics.BRIDGE_STATE)
+    publisher = graph.probe.create_publisher(
+        topics.OPERATOR_COMMAND.message, topics.OPERATOR_COMMAND.name, topics.OPERATOR_COMMAND.qos
+    )
+    graph.wait(lambda: publisher.get_subscription_count() > 0, "the bridge's subscription")
+    whole = serialize_message(wire.twist_message(graph.now(), np.array([0.001, 0.0])))
+
+    def refused() -> bool:
+        publisher.publish(whole[: len(whole) // 2])
+        return bool(states) and states[-1].refused > 0
+
+    graph.wait(refused, "the refusal")

@@ -109,7 +109,7 @@ def test_bytes_that_are_no_scene_are_refused():
     for length in (0, 4, 40, 100, len(whole) // 2, len(whole) - 9):
         with pytest.raises(InvalidInputError, match=r"^scene"):
             received_scene(whole[:length])
-    with pytest.raises(InvalidInputError, match=r"^scene: got 524289 bytes, expected at most 524288"):
+    with pytest.raises(InvalidInputError, match=r"^scene: got 131073 bytes, expected at most 131072"):
         received_scene(bytes(topics.SCENE.max_bytes + 1))
     with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
         received_scene(whole.replace(b"gripper", b"grip\xff\xfe\xfd"))

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, SmoothPath
 
 LENGTH = 0.007
 EAST = np.array([1.0, 0.0])
@@ -82,3 +83,22 @@ def test_curved_needle_is_controlled_at_its_tip():
     command = controller.compute_command(0.0, np.zeros(2), EAST)
     angle = 150.0 * LENGTH
     np.testing.assert_allclose(command.tip, [np.sin(angle) / 150.0, (1.0 - np.cos(angle)) / 150.0], atol=1e-9)
+
+
+CORNERS = np.array([[0.0, 0.0], [0.01, 0.002], [0.012, 0.01], [0.0, 0.012]])
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((1, 2)),
+        np.zeros((2, 2)),
+        np.array([[0.0, 0.0], [np.nan, 1.0]]),
+        CORNERS[[0, 1, 1, 2]],
+        CORNERS[[0, 1, 1]] + [[0.0, 0.0], [0.0, 0.0], [0.0, 4e-19]],
+    ],
+    ids=["one point", "no way", "not finite", "twice the same", "almost the same"],
+)
+def test_invalid_waypoints_are_rejected(points: np.ndarray):
+    with pytest.raises(InvalidInputError, match="waypoints"):
+        SmoothPath(points)

@@ -31,7 +31,7 @@ _MAX_CELLS = 80_000  # of all obstacles together, shared out by their numbers of
 _MIN_CELLS = 200
 _MAX_OVERVIEW_CELLS = 20_000  # of the grid that tells which obstacles are near
 MAX_FRICTION = 2.0  # a coefficient
-_MIN_ROWS, _ROWS_A_POINT = 4096, 16  # contacts that `near` has room for; a point in a narrow corner has two
+_ROWS_A_POINT = 16  # contacts that `near` has room for at first; a point in a narrow corner has two of one shape
 
 
 @dataclass(frozen=True)
@@ -315,12 +315,12 @@ class Workspace:
         points = np.array(points, dtype=np.float64, order="C")
         if points.ndim != 2 or points.shape[1] != self.dimension:
             raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
-        room = _MIN_ROWS + _ROWS_A_POINT * len(points)
-        node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
-        distance, normal = np.empty(room), np.empty((room, self.dimension))
-        count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
-        if count < 0:
-            raise ValueError(f"more than {room} contacts of {len(points)} points; expected a smaller reach")
+        room, count = _ROWS_A_POINT * (len(points) + 1), -1
+        while count < 0:  # in a scene of many shapes a point may be near all of them
+            room *= 2
+            node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
+            distance, normal = np.empty(room), np.empty((room, self.dimension))
+            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
         found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
         for array in found:
             array.setflags(write=False)

@@ -29,7 +29,8 @@ from magnetosuture_thread.model.estimator.estimate import FilterState, ThreadEst
 from magnetosuture_thread.model.estimator.noise import Innovations, NoiseModel, at_nodes, propagate_errors, weigh
 from magnetosuture_thread.model.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
 from magnetosuture_thread.model.formulations import RodFormulation, ThreadState
-from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.model.prediction import NeedlePose, Prediction
 from magnetosuture_thread.model.predictor import ThreadPredictor
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
@@ -365,12 +366,31 @@ class ThreadEstimator:
         kept, now, (old, new) = other.snapshot(), self._now, (other._unit, self._unit)
         at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
         now.errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
-        now.noise, now.measured_at, now.prediction = kept.noise, kept.measured_at, kept.prediction
+        now.noise, now.measured_at, now.prediction = kept.noise, kept.measured_at, self._carried_over(kept)
         now.gross, now.unknown, now.converged = kept.gross, kept.unknown, kept.converged
         if self.thread == other.thread:
             now.test = kept.test
             if self.options.slow_parameters == other.options.slow_parameters and kept.learned is not None:
                 self._stiffness.restore(kept.learned)
+
+    def _carried_over(self, kept: FilterState) -> Prediction:
+        """Return the step that led to a state as one of this thread and scene; it keeps no other predictor alive."""
+        predictor, state, pose = self.predictor, self.predictor.state, kept.pose
+        assert kept.prediction is not None
+        assert state is not None
+        assert pose is not None
+        positions, heading, version = state.positions, pose.heading, predictor.scene_version
+        lengths = np.hypot(*np.diff(positions, axis=0).T)
+        return replace(
+            kept.prediction,
+            scene_version=version,
+            positions=positions,
+            strain=lengths / self._formulation.rest_lengths(positions, heading) - 1.0,
+            compute_margins=lambda: Margins.of(
+                self._formulation.margins(positions, heading), predictor.contact_tolerance, version
+            ),
+            compute_forces=lambda: None,
+        )
 
 
 def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:

@@ -71,12 +71,14 @@ class EstimatorSession:
     def follow_on(self, other: EstimatorSession) -> None:
         """Continue from the estimate of another session, of another thread, scene or other options.
 
-        Observations of frames up to its last pose are too late from then on.
+        Observations of frames before its last pose are too late from then on.
         """
         self.reset()
         self._early = dict(other._early)
         if other._estimator.started:
             self._estimator.follow_on(other._estimator)
+            last = other._moments[-1]
+            self._moments.append(_Moment(last.pose, last.observation, self._estimator.snapshot()))
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
         """Start from a shape that is given; without it, straight behind the needle."""

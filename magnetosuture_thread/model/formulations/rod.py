@@ -105,7 +105,8 @@ class RodFormulation(Formulation):
         )
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
-        self._solver_buffers = BandedSolver().buffers(thread.segments + 1, self.dimension, len(self._buffers.first))
+        banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
+        self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._buffers.first))
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
         self._self_contact = selves[0] if selves else None
         self.touches_itself = bool(selves)
@@ -170,8 +171,10 @@ class RodFormulation(Formulation):
         worst, solves, status, solver = Residuals(0.0, 0.0, 0.0), 0, SOLVED, self._solver.name
         added: AddedRows | None = None
         off = 0.0  # how far the added rows are from being met
+        before = None
         if self.added:
             self.added.begin(positions, drive.time, interval)
+            before = self.warm_start()
         while True:
             done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
             worst, solves = worst.or_worse(Residuals(*done.residuals)), done.solves
@@ -179,8 +182,12 @@ class RodFormulation(Formulation):
             if done.code == NO_ROOM:
                 self._refuse_contacts()
             if done.code == ENDED:
-                if self.added and added is None:
-                    added = self._linearised(interval)
+                if before is not None and added is None:
+                    try:
+                        added = self._linearised(interval)
+                    except InvalidInputError:  # of a user's barrier: the step is not taken
+                        self.restore(before)
+                        raise
                     if added.unmet:
                         model, off = model._replace(structured=False, max_solves=solves + MAX_SOLVES), np.inf
                         continue

@@ -35,9 +35,9 @@ class ContactBuffers(NamedTuple):
     place: Vector
 
     @classmethod
-    def of(cls, nodes: int, dimension: int) -> ContactBuffers:
-        """Return room for the contacts of a thread."""
-        count = CONTACTS_PER_NODE * nodes
+    def of(cls, nodes: int, dimension: int, shapes: int = 0) -> ContactBuffers:
+        """Return room for the contacts of a thread; more for one whose nodes may be near many shapes at once."""
+        count = (CONTACTS_PER_NODE + 2 * shapes) * nodes
         node, obstacle = np.zeros((2, count), np.int64)
         return cls(
             node, obstacle, np.zeros(count), np.zeros((count, dimension)), np.zeros(count, np.bool_), np.zeros(count)

@@ -197,3 +197,11 @@ def test_shapes_must_fit(shapes, reach: float, dimension: int, reason: str):
 def test_a_friction_that_cannot_be_is_refused(dimension: int, friction: tuple[float, ...], wall: float, reason: str):
     with pytest.raises(ConfigurationError, match=reason):
         Workspace([Disc((0.0,) * dimension, 1e-3)], 0.1, dimension, friction=friction, wall_friction=wall)
+
+
+def test_points_that_are_near_hundreds_of_shapes_have_a_contact_with_each():
+    discs = [Disc((0.001 * (k % 20), 0.001 * (k // 20)), 1e-4) for k in range(200)]
+    points = np.column_stack([np.linspace(0.0, 0.019, 60), np.full(60, 0.00475)])
+    found = Workspace(discs, 0.05).near(points)
+    assert len(found.node) == 200 * 60
+    assert set(found.obstacle.tolist()) == set(range(200))

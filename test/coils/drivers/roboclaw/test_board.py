@@ -219,3 +219,18 @@ def test_what_is_no_port_is_named(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(DeviceError, match="cannot open"):
         ExchangePort(str(tmp_path / "file"), 115200, ANSWER_TIMEOUT)
+
+
+def test_a_second_attempt_takes_what_is_newest(peer, port):
+    wait_for(port, 0.5)
+    replies = iter([b"", SUPPLY, b"\xff"])
+    peer.answer(lambda _: next(replies))
+    made = board(port)
+    made.voltage = 24.0
+    newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
+    made.write(lambda: next(newest))
+    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.SET_DUTIES] == [
+        struct.pack(">hh", 4095, -8191),
+        bytes(4),
+    ]
+    assert made.warnings == ()

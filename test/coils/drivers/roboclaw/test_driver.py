@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,9 @@ import pytest
 
 from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+from magnetosuture_thread.coils.drivers.roboclaw import driver as driver_module
+from magnetosuture_thread.coils.drivers.roboclaw.board import DeviceError
+from magnetosuture_thread.coils.drivers.roboclaw.driver import LineThread, Mailbox
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
@@ -442,3 +446,76 @@ def test_boards_that_answer_to_any_address_need_paths_that_stay(bench, stable: b
         tried = failures(driver)
         bench.wait(lambda: min(tried.count(0), tried.count(1)) >= 3, "three attempts at each")
         assert not driver.state().ready
+
+
+def test_a_supply_that_breaks_down_is_a_loss(bench):
+    driver = bench.open()
+    bench.boards[0].supply = 3.0
+    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
+
+
+def test_closing_waits_for_no_line_longer_than_it_promises(bench, monkeypatch):
+    now, calls = 100.0, []
+
+    class Endless:
+        def stop(self) -> None:
+            calls.append("stop")
+
+        def join(self, timeout: float) -> None:
+            nonlocal now
+            now += timeout
+            calls.append("join")
+
+    driver = RoboClawDriver(bench.settings())
+    vars(driver)["_lines"] = [Endless(), Endless()]
+    monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now))
+    driver.close()
+    assert now - 100.0 == pytest.approx(0.3)
+    assert calls == ["stop", "stop", "join", "join"]
+
+
+class Stub:
+    """A board that does not hear the first requests for zero, and a port."""
+
+    def __init__(self, deaf: float = 0) -> None:
+        self.requests = 0
+        self.closed = False
+        self._deaf = deaf
+
+    def write_zero(self) -> None:
+        """Take a request for zero."""
+        self.requests += 1
+        if self.requests <= self._deaf:
+            raise DeviceError("nothing came")
+
+    def reset_output_buffer(self) -> None:
+        """Do nothing."""
+        raise OSError("gone")
+
+    def close(self) -> None:
+        """Keep that it was closed."""
+        self.closed = True
+
+
+def left(*boards: Stub) -> LineThread:
+    """Return a line that has left its boards."""
+    line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, ["connecting"], 0.1))
+    port = Stub()
+    vars(line)["_boards"] = dict(enumerate(boards))
+    assert not line._no_retry()
+    vars(LineThread)["_leave"](line, port)
+    assert port.closed
+    return line
+
+
+def test_a_board_that_did_not_hear_is_asked_for_zero_again():
+    boards = Stub(), Stub(deaf=2), Stub()
+    line = left(*boards)
+    assert [board.requests for board in boards] == [1, 3, 1]
+    assert line._no_retry()  # each request only once, as there are few milliseconds
+
+
+def test_a_board_that_never_hears_keeps_nobody():
+    boards = Stub(deaf=float("inf")), Stub()
+    left(*boards)
+    assert boards[1].requests == 1
