@@ -50,7 +50,7 @@ def test_scene_too_narrow_for_the_needle_is_rejected():
         ({"autostart": "armed", "driver": "roboclaw"}, "coil_bridge"),
         ({"without_prediction": "go on"}, r"coil_bridge\.without_prediction"),
         ({"command_timeout": 0.015}, r"coil_bridge\.command_timeout"),
-        ({"rate": 10.0}, r"coil_bridge\.rate"),
+        ({"rate": 10.0}, "4 periods of the loop"),
         ({"roboclaw_answer_timeout": 0.02}, r"coil_bridge\.roboclaw_answer_timeout"),
         ({"roboclaw_answer_timeout": 1.5}, r"coil_bridge\.roboclaw_answer_timeout"),
     ],

@@ -157,7 +157,7 @@ BAD: list[tuple[Any, str]] = [
     (collection(feature(polygon(SQUARE), kind="dish")), "dish.geometry: got {'coordinates'"),
     (
         collection(feature({"type": "Point", "coordinates": [0, 0]}, kind="dish", radius=0.05)),
-        "dish: got {}, expected diameter and depth",
+        "dish.properties.radius: got 0.05, expected diameter",
     ),
     (collection(feature(polygon(SQUARE), name="a"), feature(polygon(SQUARE), name="a")), "a: got 'a name given twice'"),
 ]
