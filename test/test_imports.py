@@ -15,7 +15,7 @@ PACKAGE = Path(magnetosuture_thread.__file__).parent
 # Imports run one way: a module imports from its own layer and the layers before it, not from those after it. Below
 # all are `geometry` and the modules at the top level.
 LAYERS = (
-    {"scene", "model", "forecast", "safety", "vision", "coils", "planning", "guidance", "rig"},  # the core
+    {"scene", "model", "forecast", "safety", "vision", "coils", "planning", "rig"},  # the core
     {"messages", "bags", "setups", "console", "workers"},
     {"evaluation", "calibration", "offline", "campaign"},
     {"nodes"},
