@@ -23,7 +23,7 @@ IN_SPACE = ("test/test_examples.py::test_an_example_runs[ball_in_space]",)
 BESIDES = (
     "test/calibration/test_online_agreement.py",
     "test/calibration/test_search.py::test_the_paper_s_numbers_are_fitted_too",
-    "test/model/test_self_contact.py::test_the_rows_are_the_distances_of_nodes_from_segments",
+    "test/thread/test_self_contact.py::test_the_rows_are_the_distances_of_nodes_from_segments",
     "test/rig/mechanics/test_rod.py::test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives",
     "test/test_documentation.py::test_python_examples_run",
 )

@@ -19,10 +19,10 @@ from rich.table import Table
 from magnetosuture_thread import NeedlePose
 from magnetosuture_thread.campaign.loop import START, ClosedLoop
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 
 CASES = (
     ("petri_35mm_polyamide", 25),

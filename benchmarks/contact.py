@@ -26,7 +26,6 @@ from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations import RodFormulation
 from magnetosuture_thread.reproduce.hernia import (
     paper_model,
     point_filter,
@@ -37,6 +36,7 @@ from magnetosuture_thread.reproduce.hernia import (
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.thread.formulations import RodFormulation
 
 STEERING = Path("examples/hernia_steering")
 TRUE_SEGMENTS = 240

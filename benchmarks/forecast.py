@@ -39,11 +39,11 @@ from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.session import PredictionResult
-from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.thread.material import MATERIALS, Attachment
+from magnetosuture_thread.thread_model.session import PredictionResult
 
 LOOPS = ("hernia", "slalom", "figure_eight", "dead_end", "wrap_and_tighten", "petri_35mm_polyamide_post")
 LENGTH, NEEDLE = 0.019, 0.007  # of thread and needle that are timed [m]

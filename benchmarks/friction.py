@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.thread import Attachment, Medium, Thread
+from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 RATE = 60.0
 POST = 1e-3  # m

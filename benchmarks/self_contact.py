@@ -15,12 +15,12 @@ from rich.table import Table
 from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.model.formulations import PrescribedMotion, RodFormulation, StepResult, ThreadState
-from magnetosuture_thread.model.self_contact import SelfContact
-from magnetosuture_thread.model.solvers import make_solver
-from magnetosuture_thread.model.thread import Attachment, Medium, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.thread.formulations import PrescribedMotion, RodFormulation, StepResult, ThreadState
+from magnetosuture_thread.thread.material import Attachment, Medium, Thread
+from magnetosuture_thread.thread.self_contact import SelfContact
+from magnetosuture_thread.thread.solvers import make_solver
 
 RATE = 60.0
 LENGTH = 0.019  # m

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 
 SEGMENT = 1.85e-3  # m; of the paper's thread
 SPEED = 10e-3  # m/s

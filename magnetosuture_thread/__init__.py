@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient, check_gradient
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
+    from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
     from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
     from magnetosuture_thread.jobs.calibrate import calibrate_bags
     from magnetosuture_thread.jobs.replay_offline import replay_offline
-    from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
-    from magnetosuture_thread.model.margins import BarrierMargins, Margins
-    from magnetosuture_thread.model.prediction import NeedlePose, Prediction
-    from magnetosuture_thread.model.predictor import ThreadPredictor
-    from magnetosuture_thread.model.thread import MATERIALS, Attachment, Material, Medium, Thread
     from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+    from magnetosuture_thread.thread.margins import BarrierMargins, Margins
+    from magnetosuture_thread.thread.material import MATERIALS, Attachment, Material, Medium, Thread
+    from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+    from magnetosuture_thread.thread.predictor import ThreadPredictor
 
 __version__ = "0.2.0"  # as in pyproject.toml, both files package.xml, CITATION.cff and CHANGELOG.md
 
@@ -32,11 +32,11 @@ _HOME = {
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
     "jobs.calibrate": ("calibrate_bags",),
     "jobs.replay_offline": ("replay_offline",),
-    "model.estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
-    "model.margins": ("BarrierMargins", "Margins"),
-    "model.prediction": ("NeedlePose", "Prediction"),
-    "model.predictor": ("ThreadPredictor",),
-    "model.thread": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
+    "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
+    "thread.margins": ("BarrierMargins", "Margins"),
+    "thread.prediction": ("NeedlePose", "Prediction"),
+    "thread.predictor": ("ThreadPredictor",),
+    "thread.material": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
     "safety": ("FilteredCommand", "NeedleSafetyFilter"),
     "scene": ("Dish", "Scene", "SceneShape", "read_scene"),
 }

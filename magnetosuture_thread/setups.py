@@ -11,7 +11,6 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import Configuration
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
 from magnetosuture_thread.planning.follower import PathFollowerSettings
 from magnetosuture_thread.planning.procedure import Procedure
@@ -21,6 +20,7 @@ from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, read_scene
 from magnetosuture_thread.scene.editing import SceneServerSettings
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 SETTINGS_CLASSES = (

@@ -13,8 +13,8 @@ import pytest
 from magnetosuture_thread import cli
 from magnetosuture_thread.cli import commands
 from magnetosuture_thread.cli.main import COMMANDS, MOVED, make_parser
-from magnetosuture_thread.model.formulations import FORMULATIONS
-from magnetosuture_thread.model.solvers import SOLVERS
+from magnetosuture_thread.thread.formulations import FORMULATIONS
+from magnetosuture_thread.thread.solvers import SOLVERS
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

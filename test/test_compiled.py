@@ -55,7 +55,7 @@ def test_a_second_start_compiles_nothing():
     """
     code = """
 from numba.core import event
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 with event.install_recorder("numba:compile") as compilations:
     {start}

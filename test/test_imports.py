@@ -15,7 +15,18 @@ PACKAGE = Path(magnetosuture_thread.__file__).parent
 # Imports run one way: a module imports from its own layer and the layers before it, not from those after it. Below
 # all are `geometry` and the modules at the top level.
 LAYERS = (
-    {"scene", "model", "forecast", "safety", "vision", "coils", "planning", "rig"},  # the core
+    {
+        "scene",
+        "thread",
+        "estimator",
+        "thread_model",
+        "forecast",
+        "safety",
+        "vision",
+        "coils",
+        "planning",
+        "rig",
+    },  # the core
     {"messages", "bags", "setups", "console", "workers"},
     {"evaluation", "calibration", "offline", "campaign"},
     {"nodes"},
@@ -34,7 +45,7 @@ OWNERS = {
     "zstandard": {"bags"},
     "numba": {"compiled"},
     "playwright": set(),
-    "osqp": {"model"},
+    "osqp": {"thread"},
     "dask": {"workers"},
     "distributed": {"workers"},
     "pyarrow": {"jobs"},

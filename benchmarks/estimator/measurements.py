@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from benchmarks.estimator.cases import CASES, RATE, Case, contact_frame, free_run, run_of, second_thread
 from benchmarks.estimator.truth import Run
+from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
-from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 THREADS = (("polyamide_7_0", "pinned"), ("polyamide_7_0", "clamped"), ("silk_6_0", "pinned"))

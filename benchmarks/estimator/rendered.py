@@ -10,12 +10,12 @@ import numpy as np
 from benchmarks.estimator.cases import CASES, RATE, contact_frame, free_run, run_of
 from benchmarks.estimator.measurements import FOUND_TIME, THREADS, Errors, estimator_of, targets
 from benchmarks.estimator.truth import WALL_RADIUS, Run
+from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.messages.reading import pose_deviation
-from magnetosuture_thread.model.estimator import EstimatorSession, ThreadEstimate, ThreadEstimator
-from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

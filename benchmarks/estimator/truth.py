@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
-from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Thread
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
+from magnetosuture_thread.thread.prediction import NeedlePose
 
 LENGTH = 0.019  # of the thread [m]
 SEGMENTS = 114  # of the rod that is the truth

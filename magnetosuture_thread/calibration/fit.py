@@ -18,8 +18,8 @@ from magnetosuture_thread.calibration.parameters import (
     with_stiffness_over_drag,
 )
 from magnetosuture_thread.calibration.residuals import Replays, across_residuals, mean_error, offset_residuals
-from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.thread import Attachment
+from magnetosuture_thread.thread.material import Attachment
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Array = NDArray[np.float64]
 

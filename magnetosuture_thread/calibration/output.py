@@ -11,7 +11,7 @@ from rich.table import Table
 
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 WIDTH = 118
 # Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.

@@ -18,8 +18,8 @@ from difflib import get_close_matches
 from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.thread import MATERIALS, MAX_REST_ANGLE
+from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"

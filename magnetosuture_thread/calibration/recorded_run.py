@@ -13,9 +13,9 @@ from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, mean_over_nodes, target_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.model.session import InitialObservation
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread_model.session import InitialObservation
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 AGAINST = ("seen", "truth")
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it

@@ -15,9 +15,9 @@ from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.errors import GraphError, InvalidInputError
 from magnetosuture_thread.evaluation.metrics import error_figures, mean_over_nodes, node_errors
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 REMEMBERED = 16  # settings, with all that they predict; a Jacobian asks again for its middle

@@ -13,7 +13,7 @@ from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.calibration.residuals import mean_across, mean_error
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 WORSE = 1.05  # times the error before, from which on a person should know
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"

@@ -31,8 +31,8 @@ from magnetosuture_thread.calibration.result import (
 )
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
+from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 MIN_IMPROVEMENT = 0.05  # % of length by which an attachment must fit better, besides the noise
 GIVEN_WAY = 0.1  # % of length; a default that predicts worse by more gives way to what was fitted

@@ -37,10 +37,10 @@ from magnetosuture_thread.messages.outputs import (
 )
 from magnetosuture_thread.messages.packing import packed_currents, packed_filter_state, packed_twist
 from magnetosuture_thread.messages.scene import packed_scene
-from magnetosuture_thread.model.session import PredictionResult
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_model.session import PredictionResult
 
 OF_CAMERA = (COMPRESSED_IMAGE, CAMERA_INFO)
 GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)

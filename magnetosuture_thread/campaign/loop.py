@@ -17,11 +17,11 @@ from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.session import TrackerSession
 

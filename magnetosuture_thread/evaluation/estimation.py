@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
+from magnetosuture_thread.estimator import Disturbance, SlowParameter
+from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import SILENT_PERIODS, Array, FrameResult, TimeSeries
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.model.estimator import Disturbance, SlowParameter
-from magnetosuture_thread.model.estimator.stiffness import STIFFNESS_OVER_DRAG
 
 ESTIMATE_COLUMNS = ("hidden", "corrected", "innovations", "innovation_squared")
 MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.estimator import Disturbance, SlowParameter, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator import Disturbance, SlowParameter, ThreadEstimate
-from magnetosuture_thread.model.margins import Margins, node_clearance
-from magnetosuture_thread.model.prediction import Prediction
+from magnetosuture_thread.thread.margins import Margins, node_clearance
+from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]

@@ -10,13 +10,13 @@ import numpy as np
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.errors import GraphError, InvalidInputError
+from magnetosuture_thread.estimator import Disturbance
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
 from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
-from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magnetosuture_thread.barrier import BUILT_IN
+from magnetosuture_thread.estimator import SlowParameter
 from magnetosuture_thread.evaluation.estimation import (
     ESTIMATE_COLUMNS,
     DisturbanceLog,
@@ -33,8 +34,7 @@ from magnetosuture_thread.evaluation.frames import (
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.model.estimator import SlowParameter
-from magnetosuture_thread.model.margins import Margins
+from magnetosuture_thread.thread.margins import Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin

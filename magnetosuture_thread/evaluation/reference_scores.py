@@ -16,11 +16,11 @@ from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.formulations import PaperOptions
-from magnetosuture_thread.model.prediction import NeedlePose, Prediction
-from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.model.program import SOLVED
-from magnetosuture_thread.model.thread import MATERIALS, Attachment, Medium, Thread
+from magnetosuture_thread.thread.formulations import PaperOptions
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread.program import SOLVED
 
 TOLERANCE = 1e-6  # of the residuals
 CONTACT_RANGE = 3e-3  # m; within this of an obstacle, depths are looked at

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.estimator import ThreadEstimate
 from magnetosuture_thread.forecast.rollout import KINDS, NEEDLE_MARGIN, NO_CONTACT, OBSTACLE_MARGIN, RolloutRecord
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model.estimator import ThreadEstimate
-from magnetosuture_thread.model.formulations import WarmStart
-from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.model.predictor import ThreadPredictor
-from magnetosuture_thread.model.thread import Thread
+from magnetosuture_thread.thread.formulations import WarmStart
+from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread.predictor import ThreadPredictor
 
 Vector = NDArray[np.float64]
 

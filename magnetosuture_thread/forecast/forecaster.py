@@ -26,17 +26,17 @@ from magnetosuture_thread.forecast.rollout import (
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
-from magnetosuture_thread.model.formulations import RodFormulation
-from magnetosuture_thread.model.formulations.rod_step import ENDED, NO_ROOM
-from magnetosuture_thread.model.formulations.step_buffers import ContactBuffers, StepBuffers
-from magnetosuture_thread.model.margins import FrictionLaw
-from magnetosuture_thread.model.prediction import NeedlePose, check_pose
-from magnetosuture_thread.model.predictor import MAX_STEP_LENGTH, ThreadPredictor
-from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.solvers import BandedSolver
-from magnetosuture_thread.model.thread import Thread
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread.formulations import RodFormulation
+from magnetosuture_thread.thread.margins import FrictionLaw
+from magnetosuture_thread.thread.material import Thread
+from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
+from magnetosuture_thread.thread.predictor import MAX_STEP_LENGTH, ThreadPredictor
+from magnetosuture_thread.thread.rod_step import ENDED, NO_ROOM
+from magnetosuture_thread.thread.solvers import BandedSolver
+from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
 Controller = Callable[[float, Vector, Vector], Vector]

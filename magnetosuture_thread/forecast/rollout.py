@@ -12,19 +12,6 @@ from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_co
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.model import mechanics
-from magnetosuture_thread.model.forces import write_forces
-from magnetosuture_thread.model.formulations.rod_step import (
-    ENDED,
-    NO_ROOM,
-    StepInput,
-    StepModel,
-    copy_points,
-    solve_step,
-)
-from magnetosuture_thread.model.formulations.step_buffers import ContactBuffers, StepBuffers
-from magnetosuture_thread.model.program import Indices, Mask, Table, Vector
-from magnetosuture_thread.model.solvers.banded import SolverBuffers
 from magnetosuture_thread.safety.certificate import FilterData
 from magnetosuture_thread.safety.motion import (
     filter_velocity,
@@ -32,6 +19,19 @@ from magnetosuture_thread.safety.motion import (
     needle_margin,
     pose_needle,
 )
+from magnetosuture_thread.thread import mechanics
+from magnetosuture_thread.thread.banded import SolverBuffers
+from magnetosuture_thread.thread.forces import write_forces
+from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
+from magnetosuture_thread.thread.rod_step import (
+    ENDED,
+    NO_ROOM,
+    StepInput,
+    StepModel,
+    copy_points,
+    solve_step,
+)
+from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins that are recorded."""

@@ -29,9 +29,9 @@ from magnetosuture_thread.jobs.replay_inputs import (
     open_bag,
     setup_of_notes,
 )
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.predictions import read_observations
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

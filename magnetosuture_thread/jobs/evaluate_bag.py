@@ -29,11 +29,11 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CURRENTS, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD
 from magnetosuture_thread.jobs.replay_inputs import BagInput, BagSelection, Log, Progress, open_bag
 from magnetosuture_thread.messages.reading import stamp_of
-from magnetosuture_thread.model.session import WAITING
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.offline.observations import NOT_FOUND, ObservationReader, pixels
 from magnetosuture_thread.offline.predictions import predictions
 from magnetosuture_thread.texts import one_line
+from magnetosuture_thread.thread_model.session import WAITING
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")

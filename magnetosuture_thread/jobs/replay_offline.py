@@ -43,9 +43,9 @@ from magnetosuture_thread.messages.outputs import (
 )
 from magnetosuture_thread.messages.packing import packed_tracker_state
 from magnetosuture_thread.messages.scene import packed_scene
-from magnetosuture_thread.model.session import WAITING
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
+from magnetosuture_thread.thread_model.session import WAITING
 from magnetosuture_thread.vision.session import FrameMeasurement
 
 if TYPE_CHECKING:

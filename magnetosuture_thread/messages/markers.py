@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
+from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.cdr import Stamp, pack
 from magnetosuture_thread.messages.packing import forecast_instants, time_or_nan
-from magnetosuture_thread.model.estimator import ThreadEstimate
-from magnetosuture_thread.model.estimator.estimate import ONE_SIDED_99
-from magnetosuture_thread.model.margins import UNKNOWN, Margins, friction_colour
-from magnetosuture_thread.model.prediction import Prediction
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread.margins import UNKNOWN, Margins, friction_colour
+from magnetosuture_thread.thread.prediction import Prediction
 
 if TYPE_CHECKING:
     from magnetosuture_thread.forecast import Forecast

@@ -37,7 +37,7 @@ from magnetosuture_thread.messages.packing import (
     packed_prediction,
     packed_wrench,
 )
-from magnetosuture_thread.model.session import PredictionResult
+from magnetosuture_thread.thread_model.session import PredictionResult
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 if TYPE_CHECKING:

@@ -16,16 +16,16 @@ from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quatern
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import CAMERA_FRAME
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, Stamp, aligned, pack
-from magnetosuture_thread.model.margins import FrictionState, Margins
-from magnetosuture_thread.model.prediction import Prediction
+from magnetosuture_thread.thread.margins import FrictionState, Margins
+from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.bridge import BridgeOutput
     from magnetosuture_thread.coils.coil_system import CoilSystem
     from magnetosuture_thread.coils.drivers import DriverState
+    from magnetosuture_thread.estimator import ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
-    from magnetosuture_thread.model.estimator import ThreadEstimate
     from magnetosuture_thread.vision.look import Track
 
 Vector = NDArray[np.float64]

@@ -27,8 +27,8 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
 from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
-from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
-from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
+from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 _COVARIANT_POSE = struct.Struct("<43d")  # position, quaternion and covariance

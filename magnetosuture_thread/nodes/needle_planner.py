@@ -23,6 +23,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import (
     ABORT_PROCEDURE,
@@ -35,7 +36,6 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
-from magnetosuture_thread.model.estimator.disturbance import disturbance_text
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode, reason_of

@@ -23,11 +23,11 @@ from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.markers import packed_forecast_markers
 from magnetosuture_thread.messages.packing import packed_forecast
-from magnetosuture_thread.model.session import PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
+from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
 MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed

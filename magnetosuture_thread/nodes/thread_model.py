@@ -18,10 +18,6 @@ from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_thread_markers
 from magnetosuture_thread.messages.outputs import estimate_outputs, prediction_outputs
-from magnetosuture_thread.model.prediction import STARTED
-from magnetosuture_thread.model.program import SOLVED
-from magnetosuture_thread.model.session import WAITING, PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
@@ -29,6 +25,10 @@ from magnetosuture_thread.nodes.parameters import Changeable
 from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
+from magnetosuture_thread.thread.prediction import STARTED
+from magnetosuture_thread.thread.program import SOLVED
+from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
+from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.thread_observation import ThreadObservation
 
 UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning

@@ -36,8 +36,8 @@ from magnetosuture_thread.messages.reading import (
     stamp_of,
 )
 from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.model.session import MAX_WAITING_POSES
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import lens_of

@@ -17,13 +17,13 @@ from magnetosuture_thread.errors import BagError, MagnetosutureError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.interface import CAMERA, COMPRESSED_IMAGE, NEEDLE_POSE, SCENE
 from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.model.margins import Margins
-from magnetosuture_thread.model.prediction import NeedlePose
-from magnetosuture_thread.model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.offline.observations import ObservationReader, Progress
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings, parse_material
 
 SOURCES = ("auto", "camera", "poses")
 

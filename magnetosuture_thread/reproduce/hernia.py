@@ -31,13 +31,13 @@ from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import OPERATOR_COMMAND
 from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.model.margins import Friction, FrictionState, Margins, friction_colour
-from magnetosuture_thread.model.prediction import NeedlePose, Prediction
-from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.thread.margins import Friction, FrictionState, Margins, friction_colour
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge

@@ -11,7 +11,7 @@ from benchmarks.general_solvers import PEERS
 from benchmarks.solver import measure, run_case, timed
 from benchmarks.track import SEGMENT, case
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace, triangulate
-from magnetosuture_thread.model.solvers import BandedSolver
+from magnetosuture_thread.thread.solvers import BandedSolver
 
 
 def test_rows_have_every_field_and_small_residuals():

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from magnetosuture_thread.calibration.recorded_run import read_run
 from magnetosuture_thread.calibration.search import calibrate
-from magnetosuture_thread.model.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
-from magnetosuture_thread.model.estimator.session import observation_of
-from magnetosuture_thread.model.prediction import NeedlePose
+from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.estimator.session import observation_of
+from magnetosuture_thread.thread.prediction import NeedlePose
 from test.calibration.runs import LENGTH, SETTINGS, noisy, rig_run, stiff
 
 TRUE, NOISE = 1.3e-9, 2e-5  # m^4/s, m

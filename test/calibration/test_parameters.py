@@ -23,8 +23,8 @@ from magnetosuture_thread.calibration.result import (
     CalibrationResult,
     Estimate,
 )
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.parameter_files import load_setup
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12)
 

@@ -18,7 +18,7 @@ from magnetosuture_thread.calibration.residuals import (
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
-from magnetosuture_thread.model.session import PARTIAL_WAIT
+from magnetosuture_thread.thread_model.session import PARTIAL_WAIT
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 

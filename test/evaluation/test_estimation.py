@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from magnetosuture_thread.estimator import Disturbance
 from magnetosuture_thread.evaluation import colours
 from magnetosuture_thread.evaluation.estimation import (
     Consistency,
@@ -22,7 +23,6 @@ from magnetosuture_thread.evaluation.estimation import (
 )
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.model.estimator import Disturbance
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 NODES = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])  # a thread 1 m long

@@ -13,8 +13,8 @@ from magnetosuture_thread.evaluation.metrics import (
     prediction_error_percent,
     target_points,
 )
-from magnetosuture_thread.model.margins import BarrierMargins, Margins
-from magnetosuture_thread.model.prediction import Prediction
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
+from magnetosuture_thread.thread.prediction import Prediction
 
 NODES = np.column_stack([np.linspace(0.0, 1.0, 11), np.zeros(11)])
 

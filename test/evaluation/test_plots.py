@@ -14,7 +14,7 @@ from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.plots import MARGIN_COLOURS, Photo, draw_summary
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.margins import BarrierMargins, Margins
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 
 NODES = np.column_stack([0.004 - 0.00076 * np.arange(26), np.zeros(26)])
 

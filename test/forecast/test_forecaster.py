@@ -24,9 +24,9 @@ from magnetosuture_thread import (
     ThreadPredictor,
 )
 from magnetosuture_thread.forecast import NeedleDrag
-from magnetosuture_thread.model.margins import FrictionLaw, Margins, NodeMotion
-from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.thread.margins import FrictionLaw, Margins, NodeMotion
+from magnetosuture_thread.thread.material import MATERIALS, Attachment
 
 EAST = np.array([1.0, 0.0])
 LAW = FrictionLaw(threshold=1e-3, beta=0.9, stuck_speed=1e-5)

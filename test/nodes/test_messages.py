@@ -21,20 +21,20 @@ from magnetosuture_thread import interface
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages import markers, packing, reading
 from magnetosuture_thread.messages.scene import packed_scene
-from magnetosuture_thread.model.estimator import Disturbance, ThreadEstimate
-from magnetosuture_thread.model.forces import ThreadForces
-from magnetosuture_thread.model.margins import BarrierMargins, Friction, FrictionState, Margins
-from magnetosuture_thread.model.prediction import Prediction
-from magnetosuture_thread.model.settings import parse_material
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
+from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
+from magnetosuture_thread.thread.prediction import Prediction
+from magnetosuture_thread.thread_model.settings import parse_material
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.look import State, no_pose
-from test.model.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
+from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.nodes import wire
 from test.scene.scenes import every_shape
 

@@ -14,10 +14,10 @@ from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.model.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes.parameters import Changeable, declare
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings
 
 
 def test_every_setting_is_a_described_parameter(graph):

@@ -12,10 +12,10 @@ from builtin_interfaces.msg import Time
 from magnetosuture_msgs.srv import EditShape
 
 from magnetosuture_thread.interface import ADD_SHAPE, REPLACE_SHAPE
-from magnetosuture_thread.model.thread import MATERIALS
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.thread.material import MATERIALS
 from test.nodes import wire
 
 RATE = 30.0

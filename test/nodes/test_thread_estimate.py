@@ -14,11 +14,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from magnetosuture_msgs.msg import SafetyMargins
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.prediction import NeedlePose
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
-from test.model.estimator.threads import error_percent, piece_of, poses, thread_of, true_shapes, whole
+from test.estimator.threads import error_percent, piece_of, poses, thread_of, true_shapes, whole
 from test.nodes import wire
 
 COUNT = 12

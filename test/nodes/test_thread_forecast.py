@@ -25,11 +25,11 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
 from magnetosuture_thread.messages.packing import packed_forecast
-from magnetosuture_thread.model.settings import ThreadModelSettings
-from magnetosuture_thread.model.thread import MATERIALS, Attachment
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_forecast import make_path_follower
-from test.model.estimator.threads import whole
+from magnetosuture_thread.thread.material import MATERIALS, Attachment
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from test.estimator.threads import whole
 from test.nodes import wire
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp
 

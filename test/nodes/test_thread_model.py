@@ -14,14 +14,14 @@ from nav_msgs.msg import Path
 from visualization_msgs.msg import Marker, MarkerArray
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.model.formulations import rod
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread import rod
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.examples import FOLDER
-from test.model.worlds import scene_with
 from test.nodes import wire
+from test.thread.worlds import scene_with
 
 
 def stamp(seconds: float) -> Time:

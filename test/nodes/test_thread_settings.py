@@ -18,13 +18,13 @@ from rclpy.parameter import Parameter
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.model.session import ThreadSession
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene, read_scene
-from test.model.worlds import scene_with
+from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from test.nodes import wire
+from test.thread.worlds import scene_with
 
 SCENE = "dish_150mm"
 POST = Disc((-0.005, 0.003), 0.002)

@@ -9,7 +9,6 @@ import numpy as np
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia import (
     HerniaRun,
     RecordedCommands,
@@ -19,6 +18,7 @@ from magnetosuture_thread.reproduce.hernia import (
     replay_steering,
 )
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 
 def run() -> HerniaRun:

@@ -8,8 +8,6 @@ import pytest
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.margins import FrictionState
-from magnetosuture_thread.model.settings import ThreadModelSettings
 from magnetosuture_thread.reproduce.hernia import (
     HerniaRun,
     RecordedCommands,
@@ -18,6 +16,8 @@ from magnetosuture_thread.reproduce.hernia import (
     replay_steering,
 )
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.thread.margins import FrictionState
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 # A gate of two discs with 1.6 mm between them, 4 mm ahead of the needle.
 SETTINGS = from_mapping(

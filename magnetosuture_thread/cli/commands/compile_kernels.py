@@ -41,10 +41,10 @@ def kernel_steps() -> dict[str, Callable[[], object]]:
     """Return what loads the compiled functions of each part, in the order in which they build on each other."""
     from magnetosuture_thread.coils.coil_system import CoilSystem
     from magnetosuture_thread.forecast import make_forecaster
-    from magnetosuture_thread.model.session import ThreadSession
     from magnetosuture_thread.planning.session import compile_planning
     from magnetosuture_thread.rig.rig import Rig
     from magnetosuture_thread.setups import read_setup
+    from magnetosuture_thread.thread_model.session import ThreadSession
     from magnetosuture_thread.vision.warm_up import warm_up
 
     setup = read_setup(SETUP)

@@ -10,7 +10,7 @@ import numpy as np
 
 from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
-from magnetosuture_thread.model.margins import SOLID
+from magnetosuture_thread.thread.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
 GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"

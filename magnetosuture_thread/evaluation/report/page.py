@@ -21,7 +21,7 @@ from magnetosuture_thread.evaluation.plots import ReportPicture
 from magnetosuture_thread.evaluation.report import figures as report
 from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, Figures
 from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
-from magnetosuture_thread.model.margins import SOLID
+from magnetosuture_thread.thread.margins import SOLID
 
 SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
 MAX_POINTS = 5000  # of a line

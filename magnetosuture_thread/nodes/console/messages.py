@@ -23,13 +23,13 @@ from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
+from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.markers import forecast_events
 from magnetosuture_thread.messages.reading import margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.model.estimator.disturbance import disturbance_text
-from magnetosuture_thread.model.margins import node_clearance
 from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.thread.margins import node_clearance
 
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page

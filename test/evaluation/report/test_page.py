@@ -21,15 +21,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from magnetosuture_thread.estimator import Disturbance
 from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import MinimumMargin, RunMetrics
 from magnetosuture_thread.evaluation.plots import Photo, draw_worst_frame
 from magnetosuture_thread.evaluation.report.figures import BagDetails, Figures, LiveFigures, format_number, headlines
 from magnetosuture_thread.evaluation.report.page import page_data, write_page
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.model.estimator import Disturbance
-from magnetosuture_thread.model.forces import ThreadForces
-from magnetosuture_thread.model.margins import BarrierMargins, Margins
+from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 
 LENGTH = 0.019
 NODES = np.column_stack([0.004 - LENGTH * np.arange(26) / 25, np.zeros(26)])

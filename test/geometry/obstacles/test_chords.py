@@ -10,8 +10,8 @@ import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
-from magnetosuture_thread.model.formulations import ThreadState
-from test.model.formulations.scenes import DT, east, formulated, lead, silk
+from magnetosuture_thread.thread.formulations import ThreadState
+from test.thread.scenes import DT, east, formulated, lead, silk
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 REACH = 0.02  # of nodes; chords have a part of it

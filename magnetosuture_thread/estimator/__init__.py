@@ -1,0 +1,11 @@
+"""The thread estimated: the predictor's program, corrected by what the camera measures."""
+
+from __future__ import annotations
+
+from magnetosuture_thread.estimator.disturbance import Disturbance
+from magnetosuture_thread.estimator.estimate import ThreadEstimate
+from magnetosuture_thread.estimator.estimator import EstimatorOptions, ThreadEstimator
+from magnetosuture_thread.estimator.session import EstimatorSession
+from magnetosuture_thread.estimator.stiffness import SlowParameter
+
+__all__ = ["Disturbance", "EstimatorOptions", "EstimatorSession", "SlowParameter", "ThreadEstimate", "ThreadEstimator"]

@@ -1,0 +1,420 @@
+"""The estimator: the predictor's steps along the needle's poses, each corrected by what the camera measures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.arguments import bounded, checked_arguments
+from magnetosuture_thread.barrier import BarrierRows
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.estimator.association import (
+    MIN_DEVIATION,
+    POINT_CORRELATION,
+    AssociationInput,
+    MeasuredPoints,
+    PlacedPiece,
+    measured_points,
+    place_pieces,
+)
+from magnetosuture_thread.estimator.correction import CorrectionResult, Corrector, Prior
+from magnetosuture_thread.estimator.disturbance import DisturbanceTest
+from magnetosuture_thread.estimator.estimate import FilterState, ThreadEstimate
+from magnetosuture_thread.estimator.noise import Innovations, NoiseModel, at_nodes, propagate_errors, weigh
+from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
+from magnetosuture_thread.thread.formulations import RodFormulation, ThreadState
+from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+
+Vector = NDArray[np.float64]
+
+ERROR_CORRELATION = 0.1  # of the length, over which the model's errors are alike
+INITIAL_ERROR = 0.2  # standard deviation of the free end of a thread whose shape nobody has seen, of the length
+LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
+SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
+LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
+MIN_VARIANCE = 1e-12  # D^2
+MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
+
+
+@checked_arguments("estimator")
+@dataclass(frozen=True)
+class EstimatorOptions:
+    """What a laboratory may choose of the estimator.
+
+    Attributes:
+        history: how late an observation may come [s].
+        slow_parameters: what is learned of the thread on line: nothing, `stiffness_over_drag`, or `auto`: stiffness
+            over drag, from the first time on that the thread moves as the model cannot explain.
+
+    Raises:
+        ConfigurationError: a value is out of bounds, or a parameter is unknown.
+    """
+
+    history: Annotated[float, bounded("s", 1e-3, 1e5)] = 1.0
+    slow_parameters: tuple[str, ...] = (AUTOMATIC,)
+
+    def __post_init__(self) -> None:
+        """Check the names."""
+        if self.slow_parameters not in ((), (AUTOMATIC,), (STIFFNESS_OVER_DRAG,)):
+            expected = f"{STIFFNESS_OVER_DRAG} or {AUTOMATIC} alone, or nothing"
+            raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
+
+
+class _Correction(NamedTuple):
+    """What came of a frame's points; see `ThreadEstimate`."""
+
+    result: CorrectionResult
+    innovations: Innovations
+    points: int
+    hidden: float = 1.0
+
+
+class ThreadEstimator:
+    """Estimates a thread from the needle's poses and what the camera measures of the thread.
+
+        estimator = ThreadEstimator(predictor)
+        estimator.start(pose)                          # shape unknown: straight behind the needle
+        estimate = estimator.step(next_pose, observation)
+
+    Without observations its positions are those of the predictor to the last bit.
+
+    Args:
+        predictor: steps the thread; formulation `rod`, in the plane. The estimator moves its state.
+        options: what may be chosen.
+
+    Raises:
+        ConfigurationError: the predictor's formulation is not `rod`, or it is not in the plane.
+    """
+
+    @checked_arguments("estimator")
+    def __init__(self, predictor: ThreadPredictor, options: EstimatorOptions | None = None) -> None:
+        formulation = predictor.formulation
+        if not isinstance(formulation, RodFormulation):
+            raise ConfigurationError("formulation", formulation.name, "rod, which the estimator corrects")
+        if formulation.dimension != 2:
+            raise ConfigurationError("dimension", formulation.dimension, "2: a camera measures in the plane")
+        self.predictor, self.thread = predictor, predictor.thread
+        self.options = options or EstimatorOptions()
+        self._formulation, self._unit = formulation, self.thread.segment_length
+        self._length = max(ERROR_CORRELATION * self.thread.segments, 0.5)  # l [D]
+        self._corrector = Corrector(predictor, formulation)
+        self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
+        self._now = self._forgotten()
+
+    def _forgotten(self) -> FilterState:
+        self._stiffness.reset()
+        errors = np.zeros((2, self.thread.segments + 1))
+        return FilterState(errors, NoiseModel(), DisturbanceTest(self.thread))
+
+    @property
+    def started(self) -> bool:
+        """Whether the thread has a shape."""
+        return self.predictor.started
+
+    def warm_up(self) -> None:
+        """Compile everything, so that no callback waits for it."""
+        self.predictor.warm_up()
+        path = np.array([[0.0, 0.0], [-self.thread.length, 0.0]])
+        points = np.linspace(path[0], path[1], 50)
+        piece = ThreadPiece(points, np.full(50, 1e-5), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), False)
+        pose = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
+        self.start(pose, path)
+        self.correct(ThreadObservation((piece,), True))
+        self.step(replace(pose, stamp=0.01), ThreadObservation((piece,), True))
+        self.reset()
+        self.predictor.added.first_time = math.inf
+
+    def reset(self) -> None:
+        """Forget the thread; the next call must be `start`."""
+        self.predictor.reset()
+        self._now = self._forgotten()
+
+    def start(
+        self, pose: NeedlePose, centreline: Points | None = None, deviation: float | None = None
+    ) -> ThreadEstimate:
+        """Set the thread's shape.
+
+        Args:
+            pose: the needle.
+            centreline: measured, from the needle's tail on, shape (m, 2) [m]; it may end early. None is a thread that
+                lies straight behind the needle, of which nothing is known.
+            deviation: of the centreline [m]; None for that of a measured one.
+
+        Raises:
+            InvalidInputError: see `ThreadPredictor.start`.
+        """
+        prediction = self.predictor.start(pose, centreline, strict=False)
+        seen, known = 0.0, 0.0
+        if centreline is not None:
+            seen = float(arc_lengths(centreline)[-1]) / self._unit
+            known = (LAID_DEVIATION * MIN_DEVIATION if deviation is None else deviation) / self._unit
+        self._now = now = self._forgotten()
+        now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
+        now.errors = self._errors_of(seen, known**2)
+        return self._estimate([])
+
+    def _errors_of(self, seen: float, variance: float) -> Points:
+        """Return the errors of a shape that is known up to an arc length [D] with a variance [D^2]."""
+        beyond = np.maximum(np.arange(self.thread.segments + 1.0) - seen, 0.0)
+        found = variance + (INITIAL_ERROR * beyond) ** 2
+        found[0] = 0.0
+        return np.array([found, 2.0 * self._length * found])
+
+    def start_observed(self, pose: NeedlePose, observation: ThreadObservation) -> ThreadEstimate:
+        """Set the thread's shape along the piece that leaves the needle; without one, straight behind it."""
+        self.start(pose)
+        return self.correct(observation)
+
+    def step(self, pose: NeedlePose, observation: ThreadObservation | None = None) -> ThreadEstimate:
+        """Follow the needle to its next pose, and correct the thread by what the frame of that pose shows of it.
+
+        Args:
+            pose: the needle.
+            observation: of the thread, at the same instant; None if there is none.
+
+        Raises:
+            InvalidInputError: see `ThreadPredictor.step`.
+            SolverError: see `ThreadPredictor.step`.
+        """
+        before, now = self.predictor.state, self._now
+        now.prediction = prediction = self._stiffness.step(pose)
+        now.converged = prediction.converged
+        state = self.predictor.state
+        assert before is not None
+        assert state is not None
+        noise = at_nodes(now.noise.intensity, self.thread.segments + 1)
+        noise[0] = 0.0
+        added = noise * np.array([[1.0], [2.0 * self._length]]) * (prediction.interval / self._unit**2)
+        here, there = np.ascontiguousarray(state.positions), np.ascontiguousarray(before.positions)
+        now.errors = propagate_errors(here, there, self._unit, added, now.errors)
+        now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
+        return self.correct(observation) if observation is not None else self._estimate([])
+
+    def correct(self, observation: ThreadObservation) -> ThreadEstimate:
+        """Correct the thread at the last pose by an observation of the same instant."""
+        state, pose, unit = self.predictor.state, self.predictor.pose, self._unit
+        if state is None or pose is None:
+            raise InvalidInputError("thread observation", "one before the start", "a centreline first")
+        placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
+        if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
+            state = laid
+            placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
+        points, refused = self._points_of(placed, state)
+        if points is None:
+            return self._estimate(problems + refused)
+        if self._stiffness.state.active:
+            weigh(points, self._now.errors[0])
+            noise = at_nodes(self._now.noise.raised, self.thread.segments + 1)
+            if not self._corrector.solve(self._prior(state, pose, noise), points).problem:
+                state = self._stiffness.learn(self._corrector, state, pose.stamp)
+                again, refused = self._points_of(placed, state)
+                points = again or points
+        return self._corrected(points, pose, state, problems + refused)
+
+    def _points_of(self, placed: list[PlacedPiece], state: ThreadState) -> tuple[MeasuredPoints | None, list[str]]:
+        now, nodes = self._now, state.positions / self._unit
+        margin, workspace = 0.5 * self.thread.diameter, self._formulation.workspace
+        given = AssociationInput(nodes, float(now.errors[0, -1]), self._unit, workspace, margin, now.noise.scale)
+        return measured_points(placed, given)
+
+    def _prior(self, state: ThreadState, pose: NeedlePose, noise: Vector) -> Prior:
+        """Return the prior of a correction; noise as intensity at each node [m^2/s]."""
+        unit, rod = self._unit, self._formulation.rod
+        return Prior(
+            np.ascontiguousarray(state.positions / unit),
+            np.ascontiguousarray(pose.heading, dtype=np.float64),
+            np.maximum(self._now.errors[1], MIN_VARIANCE),
+            noise / unit**2,
+            self._length,
+            rod.bending_stiffness / (rod.drag_across * unit**4),
+        )
+
+    def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
+        """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
+
+        At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
+        so too. What the piece does not show goes on as it lay.
+        """
+        now, unit, segments = self._now, self._unit, self.thread.segments
+        if not piece.attached or (not now.unknown and piece.square < LARGE_ERROR**2):
+            now.gross = 0
+            return None
+        now.gross += 1
+        end = piece.start + float(piece.arcs[-1])
+        prior = float(np.interp(0.5 * end, np.arange(segments + 1), now.errors[0]))
+        measured = math.isfinite(now.measured_at)
+        if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
+            return None
+        seen = smoothed_line(piece.points, piece.arcs, SMOOTHING * POINT_CORRELATION / unit) * unit
+        path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
+        radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
+        laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
+        self.predictor.pose, self.predictor.state = pose, laid
+        # Whether it lies outside of obstacles is not known before it is corrected.
+        now.gross, now.unknown, now.converged = 0, False, False
+        now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
+        now.noise, now.test = NoiseModel(), DisturbanceTest(self.thread)
+        self._stiffness.restart()
+        return laid
+
+    def _corrected(
+        self, points: MeasuredPoints, pose: NeedlePose, state: ThreadState, problems: list[str]
+    ) -> ThreadEstimate:
+        now, unit, work = self._now, self._unit, self._corrector.work
+        measured = math.isfinite(now.measured_at)
+        elapsed = pose.stamp - now.measured_at if measured else 0.0
+        innovations, now.errors = now.noise.learn(points, now.errors, unit, elapsed, 2.0 * self._length)
+        prior = self._prior(state, pose, at_nodes(now.noise.raised, self.thread.segments + 1))
+        result = self._corrector.solve(prior, points)
+        if result.problem:
+            return self._estimate([*problems, result.problem], _Correction(result, innovations, len(points.place)))
+        now.errors, hidden = now.noise.take_correction(points, work, np.array([now.errors[0], prior.density]), unit)
+        self._stiffness.correct(self._corrector, float(now.errors[0].mean()))
+        if measured:  # else there is no earlier time to compare with
+            # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
+            # points of a window share it, and so do both times that the test compares.
+            scale, sums = now.noise.scale, now.noise.sums
+            variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
+            now.test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
+            if now.test.confirmed(pose.stamp):
+                self._stiffness.activate()
+        self.predictor.pose = pose
+        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
+        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
+        return self._estimate(problems, _Correction(result, innovations, len(points.place), hidden))
+
+    def _estimate(self, problems: Sequence[str], correction: _Correction | None = None) -> ThreadEstimate:
+        now, pose, state = self._now, self.predictor.pose, self.predictor.state
+        assert now.prediction is not None
+        assert pose is not None
+        assert state is not None
+        formulation, positions = self._formulation, state.positions
+        corrected = correction is not None and not correction.result.problem
+        # Where innovations are larger than expected, so are the errors that are left.
+        scale = self._unit**2 * max(now.noise.ratio, 1.0)
+        if corrected:
+            covariance = scale * self._corrector.work.covariance
+        else:
+            along = np.gradient(positions, axis=0)
+            normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+            covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
+        formulation.added.set_time(pose.stamp)
+        added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
+
+        def compute_rows() -> list[BarrierRows]:
+            return [*formulation.margins(positions, pose.heading), *added]
+
+        return ThreadEstimate(
+            prediction=now.prediction,
+            positions=positions,
+            covariance=covariance,
+            deviation=np.sqrt(scale * np.maximum(now.errors[0], 0.0)),
+            corrected=corrected,
+            unmeasured_for=pose.stamp - now.measured_at,
+            converged=now.converged,
+            residual=correction.result.residual if correction is not None and corrected else 0.0,
+            solves=correction.result.solves if correction is not None and corrected else 0,
+            points=correction.points if correction is not None else 0,
+            hidden=correction.hidden if correction is not None else 1.0,
+            innovations=correction.innovations if correction is not None else None,
+            noise=now.noise.intensity,
+            disturbances=now.test.found(pose.stamp, positions),
+            problems=tuple(problems),
+            slow_parameters=self._stiffness.report(),
+            thread=self._stiffness.thread,
+            compute_rows=compute_rows,
+            contact_tolerance=self.predictor.contact_tolerance,
+        )
+
+    def snapshot(self) -> FilterState:
+        """Return everything that the next step depends on."""
+        return replace(
+            self._now,
+            noise=self._now.noise.copied(),
+            test=self._now.test.copied(),
+            pose=self.predictor.pose,
+            thread=self.predictor.state,
+            warm_start=self._formulation.warm_start(),
+            learned=self._stiffness.state,
+        )
+
+    def restore(self, kept: FilterState) -> None:
+        """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
+        assert kept.warm_start is not None
+        assert kept.learned is not None
+        self._now = replace(kept, noise=kept.noise.copied(), test=kept.test.copied())
+        self.predictor.pose, self.predictor.state = kept.pose, kept.thread
+        self._formulation.restore(kept.warm_start)
+        self._stiffness.restore(kept.learned)
+
+    def follow_on(self, other: ThreadEstimator) -> None:
+        """Continue from the estimate of another thread, in another scene or with other options.
+
+        What was learned of the stiffness and added up for disturbances stays with the thread that it is of.
+        """
+        self.reset()
+        self.predictor.follow_on(other.predictor)
+        kept, now, (old, new) = other.snapshot(), self._now, (other._unit, self._unit)
+        at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
+        now.errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
+        now.noise, now.measured_at, now.prediction = kept.noise, kept.measured_at, self._carried_over(kept)
+        now.gross, now.unknown, now.converged = kept.gross, kept.unknown, kept.converged
+        if self.thread == other.thread:
+            now.test = kept.test
+            if self.options.slow_parameters == other.options.slow_parameters and kept.learned is not None:
+                self._stiffness.restore(kept.learned)
+
+    def _carried_over(self, kept: FilterState) -> Prediction:
+        """Return the step that led to a state as one of this thread and scene; it keeps no other predictor alive."""
+        predictor, state, pose = self.predictor, self.predictor.state, kept.pose
+        assert kept.prediction is not None
+        assert state is not None
+        assert pose is not None
+        positions, heading, version = state.positions, pose.heading, predictor.scene_version
+        lengths = np.hypot(*np.diff(positions, axis=0).T)
+        return replace(
+            kept.prediction,
+            scene_version=version,
+            positions=positions,
+            strain=lengths / self._formulation.rest_lengths(positions, heading) - 1.0,
+            compute_margins=lambda: Margins.of(
+                self._formulation.margins(positions, heading), predictor.contact_tolerance, version
+            ),
+            compute_forces=lambda: None,
+        )
+
+
+def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:
+    """Return a path averaged over a length along it, by a normal distribution of that standard deviation."""
+    apart = np.abs(arcs[:, None] - arcs[None, :])
+    # Towards an end the average is taken over less, evenly to both sides, so that the end stays where it is.
+    room = np.minimum(arcs, arcs[-1] - arcs)
+    weights = np.exp(-0.5 * (apart / length) ** 2) * (apart <= room[:, None] + 1e-12)
+    return np.asarray(weights @ points / weights.sum(axis=1, keepdims=True))
+
+
+def continued(path: Points, positions: Points, node: int) -> Points:
+    """Return a path that goes on as a thread lay from a node on, turned so that it goes on straight.
+
+    Args:
+        path: shape (m, 2), m >= 2.
+        positions: of the thread, shape (n + 1, 2).
+        node: at the end of the path.
+    """
+    path = path[np.concatenate([[True], np.hypot(*np.diff(path, axis=0).T) > 0.0])]
+    if node >= len(positions) - 2 or len(path) < 2:
+        return path
+    rest = positions[node + 1 :] - positions[node]
+    old, new = positions[node + 1] - positions[max(node - 1, 0)], path[-1] - path[-min(len(path), 4)]
+    turn = math.atan2(new[1], new[0]) - math.atan2(old[1], old[0])
+    c, s = math.cos(turn), math.sin(turn)
+    return np.vstack([path, path[-1] + rest @ np.array([[c, s], [-s, c]])])

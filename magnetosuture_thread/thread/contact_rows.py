@@ -1,0 +1,317 @@
+"""The rows of a step's program for contacts with obstacles and wall, at nodes and between them, and for their friction.
+
+Friction is Coulomb's, in the plane. A place of the thread, a node or a place s between two, that a shape pushes with
+the force N n dissipates mu N |t' u(s)| as it slides with the velocity u(s) along the tangent t of the shape. That is
+convex in u, and its multiplier is the force of friction. With N of the solve before, a row of friction is
+
+    t' u(s) + c lambda = c lambda_before,    |lambda| <= mu N
+
+Below its limit the place sticks, at its limit it slides. The compliance c makes the multipliers of many stuck places
+along a taut thread unique. As lambda_before is the multiplier of the solve before, a thread at rest does not creep
+however long it is held: t' u = 0 as soon as the forces do not change.
+
+Source: Coulomb; M. Jean, J. J. Moreau 1992, contact dynamics. Deviation: the normal force is that of the solve before,
+so that the program stays convex, and a step is solved again while that changes; the turning of the thread's
+cross-sections is left out of its slip.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.geometry.obstacles import FRICTION, WorkspaceData, find_contacts
+from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread.program import SPAN, Mask, Vector
+from magnetosuture_thread.thread.step_buffers import GRIPS, NO_SHAPE, ContactBuffers, StepBuffers
+
+DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
+CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
+FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver
+
+
+@compiled_inline
+def _chord_part(contacts: ContactBuffers) -> ChordContacts:
+    return ChordContacts(contacts.node, contacts.obstacle, contacts.distance, contacts.normal, contacts.place)
+
+
+@compiled_inline
+def _node_contacts(points: Points, workspace: WorkspaceData, to: ContactBuffers) -> int:
+    return find_contacts(points, workspace, to.node, to.obstacle, to.distance, to.normal, to.nearest)
+
+
+@compiled_uncounted
+def contact_rows(
+    buffers: StepBuffers,
+    row: int,
+    workspace: WorkspaceData,
+    about: Points,
+    start: Points,
+    known: Mask,
+    interval: float,
+    unit: float,
+    radius: float,
+    chords: bool,
+) -> tuple[int, float]:
+    """Write the rows  n' u(s) >= (-h(y) - n' (x - y)(s)) / dt  of the contacts near y, with h = sd(y(s)) - rho.
+
+    A contact is at a node, s = 0, or at a place s between node i and the next, where u(s) = (1 - s) u_i + s u_{i+1},
+    and so x and y. In the end their nodes and obstacles, the wall among them, are the first of the buffers's.
+
+    Args:
+        buffers: written, from a row on.
+        row: the first of these rows.
+        workspace: obstacles and wall [m].
+        about: y, shape (n + 1, d) [D].
+        start: x, shape (n + 1, d) [D].
+        known: nodes that have no rows, as nothing can push them, shape (n + 1,).
+        interval: dt [s].
+        unit: D [m].
+        radius: rho [m].
+        chords: whether there are rows of places between nodes.
+
+    Returns:
+        The number of rows, -1 if there is no room for them, and the greatest depth of a contact [m].
+    """
+    nodes, dimension = about.shape
+    points, minimum, contacts = buffers.work[0], buffers.work[1], buffers.contacts
+    for i in range(nodes):
+        minimum[i, 0] = minimum[i, 1] = np.inf
+        for a in range(dimension):
+            points[i, a] = about[i, a] * unit
+    found = _node_contacts(points, workspace, contacts)
+    buffers.clearance[:] = workspace.reach
+    for c in range(found):
+        contacts.place[c] = 0.0
+        buffers.clearance[contacts.node[c]] = min(buffers.clearance[contacts.node[c]], contacts.distance[c])
+    if found > 0 and chords:
+        to = _chord_part(contacts)
+        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, to)
+    if found < 0 or row + found > len(buffers.first):
+        return -1, 0.0
+    kept, depth = 0, 0.0
+    for c in range(found):
+        i, s = contacts.node[c], contacts.place[c]
+        if known[i] and (s == 0.0 or known[i + 1]):
+            continue
+        kind = 0 if s == 0.0 else 1
+        minimum[i, kind] = min(minimum[i, kind], contacts.distance[c] - radius)
+        clearance = contacts.distance[c] - radius
+        depth = max(depth, -clearance)
+        bound = -clearance / unit
+        begin, here = min(i, nodes - 3), row + kept
+        for k in range(SPAN):
+            weight = 1.0 - s if begin + k == i else (s if begin + k == i + 1 else 0.0)
+            for a in range(dimension):
+                buffers.gradient[here, k, a] = weight * contacts.normal[c, a]
+                bound -= buffers.gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
+            if known[begin + k]:
+                buffers.gradient[here, k] = 0.0
+        buffers.first[here], buffers.value[here] = begin, clearance / unit
+        buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
+        # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
+        # both sides of a shape: then as far as it goes.
+        buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
+        buffers.limit[here] = np.inf
+        contacts.node[kept], contacts.obstacle[kept], contacts.place[kept] = i, contacts.obstacle[c], s
+        for a in range(dimension):
+            contacts.normal[kept, a] = contacts.normal[c, a]
+        kept += 1
+    # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
+    for c in range(kept):
+        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
+        pushes = buffers.value[row + c] * unit <= max(minimum[i, kind], DEPTH_TOLERANCE)
+        buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
+    return kept, depth
+
+
+@compiled_uncounted
+def stays_clear(
+    buffers: StepBuffers,
+    workspace: WorkspaceData,
+    before: Points,
+    about: Points,
+    known: Mask,
+    unit: float,
+    radius: float,
+) -> bool:
+    """Return whether no contact is deeper than `DEPTH_TOLERANCE`, once nodes have moved since rows were written.
+
+    A distance changes by no more than a node moves. So it is computed again only of nodes and chords that may have got
+    too close by that; a solve that ends a step moves them by micrometres.
+
+    Args:
+        buffers: its clearances are of `before`, and become those of `about` or less; contacts are overwritten.
+        workspace: obstacles and wall [m].
+        before: where rows were written, shape (n + 1, d) [D].
+        about: where the nodes are, shape (n + 1, d) [D].
+        known: nodes that have no rows, shape (n + 1,).
+        unit: D [m].
+        radius: rho [m].
+    """
+    points, clearance, minimum = buffers.work[0], buffers.clearance, radius - DEPTH_TOLERANCE
+    for i in range(len(about)):
+        for a in range(about.shape[1]):
+            points[i, a] = about[i, a] * unit
+    to = buffers.contacts
+    for i in range(len(about)):
+        square = 0.0
+        for a in range(about.shape[1]):
+            square += (about[i, a] - before[i, a]) ** 2
+        clearance[i] -= unit * math.sqrt(square)
+        if not (clearance[i] >= minimum or known[i]):
+            found = _node_contacts(points[i : i + 1], workspace, to)
+            clearance[i] = workspace.reach
+            for c in range(found):
+                clearance[i] = min(clearance[i], to.distance[c])
+            if found < 0 or not clearance[i] >= minimum:
+                return False
+    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), _chord_part(to))
+    for c in range(found):
+        if to.distance[c] < minimum and not (known[to.node[c]] and known[to.node[c] + 1]):
+            return False
+    return found >= 0
+
+
+@compiled_uncounted
+def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
+    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
+
+    Of these also their forces, with those of friction.
+    """
+    for r in range(len(multipliers)):
+        buffers.multipliers[r] = multipliers[r]
+    contacts = buffers.contacts
+    buffers.push[:] = 0.0
+    buffers.contact_force[:] = 0.0
+    for r in range(rows, len(multipliers)):
+        if buffers.limit[r] == np.inf:
+            node, kind = contacts.node[r - rows], 0 if contacts.place[r - rows] == 0.0 else 1
+            buffers.push[kind, node] = max(buffers.push[kind, node], multipliers[r])
+        for k in range(SPAN):
+            for a in range(buffers.contact_force.shape[1]):
+                buffers.contact_force[buffers.first[r] + k, a] += buffers.gradient[r, k, a] * multipliers[r]
+
+
+@compiled_uncounted
+def knows_friction(workspace: WorkspaceData) -> bool:
+    """Return whether any shape or the wall has friction."""
+    largest = 0.0
+    for row in range(len(workspace.frames)):
+        largest = max(largest, workspace.frames[row, FRICTION])
+    return largest > 0.0
+
+
+@compiled_uncounted
+def friction_rows(
+    buffers: StepBuffers, row: int, count: int, workspace: WorkspaceData, interval: float
+) -> tuple[int, float]:
+    """Write the rows of friction of what shapes pushed in the last solve and is in contact with them now.
+
+    Args:
+        buffers: written, behind the contacts; these must be there already.
+        row: the first row of the contacts.
+        count: how many contacts there are.
+        workspace: has the coefficients of friction.
+        interval: dt [s].
+
+    Returns:
+        The number of rows, -1 if there is no room for them; and by how much the limits differ from those of the last
+        solve, over the greatest of them.
+    """
+    contacts, best, known = buffers.contacts, buffers.grip_contact, buffers.known
+    before, start = buffers.before, buffers.start
+    nodes = buffers.grip.shape[1]
+    best[:] = -1
+    for c in range(count):
+        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
+        slot = _slot_of(buffers, kind, i, contacts.obstacle[c])
+        if slot >= 0:
+            force, other = buffers.grip[kind, i, slot], best[kind, i, slot]
+            push = contacts.normal[c, 0] * force[0] + contacts.normal[c, 1] * force[1]
+            least = contacts.normal[other, 0] * force[0] + contacts.normal[other, 1] * force[1] if other >= 0 else 0.0
+            if push > least:
+                best[kind, i, slot] = c
+    written, change, greatest = 0, 0.0, 0.0
+    for kind in range(2):
+        for i in range(nodes):
+            for slot in range(GRIPS):
+                shape = buffers.grip_shape[kind, i, slot]
+                if shape == NO_SHAPE:
+                    continue
+                grip, limit, c = buffers.grip[kind, i, slot], 0.0, best[kind, i, slot]
+                if c >= 0:
+                    limit = workspace.frames[shape + 1, FRICTION] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
+                change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
+                if limit == 0.0:
+                    continue
+                at = count + written
+                if at >= len(contacts.node):
+                    return -1, 0.0
+                here, begin, moved = row + at, min(i, nodes - SPAN), 0.0
+                buffers.gradient[here] = 0.0
+                for k in range(i, i + kind + 1):
+                    share = 1.0 if kind == 0 else (1.0 - contacts.place[c] if k == i else contacts.place[c])
+                    x, y = -share * contacts.normal[c, 1], share * contacts.normal[c, 0]
+                    if known[k]:
+                        moved += x * (start[k, 0] - before[k, 0]) + y * (start[k, 1] - before[k, 1])
+                    else:
+                        buffers.gradient[here, k - begin, 0], buffers.gradient[here, k - begin, 1] = x, y
+                buffers.first[here], buffers.value[here] = begin, 0.0
+                buffers.lower[here] = buffers.upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
+                buffers.compliance[here], buffers.limit[here] = FRICTION_COMPLIANCE, limit
+                buffers.multipliers[here] = max(min(grip[2], limit), -limit)
+                contacts.node[at], contacts.obstacle[at], contacts.place[at] = i, shape, contacts.place[c]
+                written += 1
+    return written, change / greatest if greatest > 0.0 else 0.0
+
+
+@compiled_uncounted
+def keep_grips(buffers: StepBuffers, multipliers: Vector, row: int, workspace: WorkspaceData) -> None:
+    """Keep the normal forces of a solve, by place and shape, and what friction there was.
+
+    A place that more than `GRIPS` shapes with friction push at once has friction with the first of them.
+
+    Args:
+        buffers: the program's; written.
+        multipliers: of all its rows, shape (r,).
+        row: the first row of the contacts.
+        workspace: has the coefficients of friction.
+    """
+    contacts = buffers.contacts
+    buffers.grip[:] = 0.0
+    for r in range(row, len(multipliers)):
+        i, shape, place = contacts.node[r - row], contacts.obstacle[r - row], contacts.place[r - row]
+        kind = 0 if place == 0.0 else 1
+        slot = _slot_of(buffers, kind, i, shape)
+        if buffers.limit[r] < np.inf:
+            buffers.grip[kind, i, slot, 2] = multipliers[r]
+            buffers.grip[kind, i, slot, 3] = buffers.limit[r]
+            buffers.grip[kind, i, slot, 4] = place
+            continue
+        if not (multipliers[r] > 0.0 and workspace.frames[shape + 1, FRICTION] > 0.0):
+            continue
+        if slot < 0:
+            slot = _slot_of(buffers, kind, i, NO_SHAPE)
+        if slot >= 0:
+            buffers.grip_shape[kind, i, slot] = shape
+            for a in range(2):
+                buffers.grip[kind, i, slot, a] += multipliers[r] * contacts.normal[r - row, a]
+    for kind in range(2):
+        for i in range(buffers.grip.shape[1]):
+            for slot in range(GRIPS):
+                if buffers.grip[kind, i, slot, 0] == 0.0 and buffers.grip[kind, i, slot, 1] == 0.0:
+                    buffers.grip_shape[kind, i, slot] = NO_SHAPE
+                    buffers.grip[kind, i, slot] = 0.0
+
+
+@compiled_inline
+def _slot_of(buffers: StepBuffers, kind: int, node: int, shape: int) -> int:
+    """Return which of the shapes of a node (kind 0) or of a chord (kind 1) this is, -1 for none."""
+    for slot in range(GRIPS):
+        if buffers.grip_shape[kind, node, slot] == shape:
+            return slot
+    return -1

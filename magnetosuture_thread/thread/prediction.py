@@ -1,0 +1,131 @@
+"""What goes into a predictor and comes out: the needle's stamped pose, and the thread at one instant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.margins import Margins
+
+MAX_COORDINATE = 1.0  # m; nothing that a dish could hold is farther away
+TIME, DEVIATION = Quantity("", "s"), Quantity("", minimum=0.0)
+STARTED = "started"  # status of a prediction that no step led to
+
+
+class NeedleMotion(NamedTuple):
+    """The needle's motion at a pose.
+
+    Attributes:
+        velocity: of its tail, shape (d,) [m/s].
+        turning: rate at which its heading turns, counter-clockwise, in the plane [rad/s].
+    """
+
+    velocity: NDArray[np.float64]
+    turning: float
+
+
+@dataclass(frozen=True)
+class NeedlePose:
+    """The needle at one instant, in the dish frame.
+
+    Attributes:
+        stamp: [s]
+        tail: the blunt end, where the thread is attached, shape (d,) [m].
+        heading: unit vector from tail to tip, shape (d,).
+        deviation: standard deviations of the tail in each direction [m] and of the heading [rad]; zeros if not known.
+        motion: of the needle, for the forces; None if only the poses tell.
+    """
+
+    stamp: float
+    tail: Points
+    heading: Points
+    deviation: tuple[float, float] = (0.0, 0.0)
+    motion: NeedleMotion | None = None
+
+    def __post_init__(self) -> None:
+        """Take sequences of numbers as arrays."""
+        for name in ("tail", "heading"):
+            object.__setattr__(self, name, as_numbers(f"needle pose {name}", getattr(self, name)))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The thread at one instant.
+
+    Attributes:
+        stamp: [s]
+        formulation: name of the formulation.
+        scene_version: of the scene that it was predicted in; empty where the model knows none.
+        positions: of all nodes, shape (n + 1, d) [m].
+        strain: each segment's length from end to end over what it should be, less one, shape (n,).
+        interval: time since the previous prediction [s].
+        substeps: number of steps it was divided into.
+        solver: the solver's name.
+        status: the solver's own word; where one did not solve at once, what had to be tried.
+        residual: the largest scaled residual of the solves.
+        converged: whether every step ended where the barriers themselves hold, not only their linearisations;
+            if not, the margins are those of a thread that is not where the equations say.
+        compute_margins: of this prediction.
+        compute_forces: of this prediction.
+    """
+
+    stamp: float
+    formulation: str
+    scene_version: str
+    positions: Points
+    strain: NDArray[np.float64]
+    interval: float
+    substeps: int
+    solver: str
+    status: str
+    residual: float
+    converged: bool
+    compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
+    compute_forces: Callable[[], ThreadForces | None] = field(default=lambda: None, repr=False, compare=False)
+
+    @cached_property
+    def margins(self) -> Margins:
+        """The margins of every barrier by its name, in SI units; computed at first access."""
+        return self.compute_margins()
+
+    @cached_property
+    def forces(self) -> ThreadForces | None:
+        """Tension, contact forces and the thread's pull on the needle; computed at first access.
+
+        None before the first step, and with a formulation that is of no mechanics.
+        """
+        return self.compute_forces()
+
+
+def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int = 2) -> None:
+    """Raise `InvalidInputError` unless a pose can be one: finite, its tail within reach, its heading a unit vector.
+
+    Args:
+        pose: of the needle.
+        reach: greatest distance of its tail from the dish's centre [m].
+        dimension: of the space that it is in.
+    """
+    # In plain floats: for two or three of them numpy takes ten times as long, in every step.
+    if not TIME.within(pose.stamp):
+        raise InvalidInputError("needle pose stamp", pose.stamp, "a finite time [s]")
+    if not pose.tail.shape == pose.heading.shape == (dimension,):
+        shapes = f"tail and heading of shapes {pose.tail.shape} and {pose.heading.shape}"
+        raise InvalidInputError("needle pose", shapes, f"shapes ({dimension},)")
+    tail, heading = pose.tail.tolist(), pose.heading.tolist()
+    if not math.hypot(*tail) <= reach:
+        expected = f"finite coordinates, at most {reach:g} m from the dish's centre"
+        raise InvalidInputError("needle pose position", tail, expected + Quantity("", "m", -reach, reach).hint(tail))
+    finite_array("needle pose deviation", pose.deviation, (2,), DEVIATION)
+    if not abs(math.hypot(*heading) - 1.0) <= 1e-3:
+        raise InvalidInputError("needle pose heading", heading, "a unit vector")

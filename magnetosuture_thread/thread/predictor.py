@@ -1,0 +1,440 @@
+"""The predictor: steps the thread model along the needle's stamped poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+
+from magnetosuture_thread.arguments import bounded, checked_arguments
+from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.geometry.arrays import finite_array
+from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
+from magnetosuture_thread.scene import Scene, find_collision
+from magnetosuture_thread.thread.forces import ThreadForces
+from magnetosuture_thread.thread.formulations import (
+    Formulation,
+    PaperOptions,
+    PrescribedMotion,
+    RodFormulation,
+    StepResult,
+    ThreadState,
+    WarmStart,
+    make_formulation,
+)
+from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene, direction_between
+from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
+from magnetosuture_thread.thread.program import SOLVED, Residuals
+from magnetosuture_thread.thread.self_contact import SelfContact
+from magnetosuture_thread.thread.solvers import make_solver
+
+DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a camera sees above it
+LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
+START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
+MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
+MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
+MOTION_TIME = 4e-3  # s; shorter, what the pose's noise bends counts for more, and longer, the thread has gone on
+MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
+
+
+@checked_arguments("thread predictor")
+@dataclass(frozen=True)
+class PredictorOptions:
+    """Numbers of a predictor that have a good default.
+
+    Attributes:
+        margin_range: margins are computed of nodes that are closer to a shape or the wall than this [m].
+        contact_tolerance: a node this close to a shape or the wall touches it [m].
+        residual_tolerance: the largest scaled residual with which a solution is accepted.
+        max_step: intervals are divided into steps of at most this [s].
+        max_substeps: but into at most so many; then the steps get longer.
+    """
+
+    margin_range: Annotated[float, bounded("m", 0.0, 2.0)] = 5e-3
+    contact_tolerance: Annotated[float, bounded("m", 0.0, 1e-3)] = 2e-6
+    residual_tolerance: Annotated[float, bounded("", 1e-15, 1e-2)] = 1e-6
+    max_step: Annotated[float, bounded("s", 1e-5, 2.0)] = 0.02
+    max_substeps: Annotated[int, bounded("", 1, 100_000)] = 200
+
+
+class ThreadPredictor:
+    """Predicts a thread from the needle's poses.
+
+        predictor = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25, scene=scene)
+        predictor.start(pose)
+        prediction = predictor.step(next_pose)
+        prediction.margins["obstacle"].minimum
+
+    Args:
+        thread: the thread.
+        scene: dish and shapes; in space `Workspace` of three dimensions; None for neither wall nor shapes.
+        barriers: what is enforced besides the formulation's own barriers, see `Barrier`.
+        formulation: `rod`, the accurate one, or `paper`, as printed; or one that is made already, which then knows
+            scene and barriers itself.
+        solver: `banded` or `osqp`.
+        paper: the options of the formulation `paper`.
+        fixed_nodes: nodes that stay where they are at the start, as where tissue holds the thread.
+        options: by name, see `PredictorOptions`.
+
+    Attributes:
+        thread: the thread.
+        formulation, fixed_nodes, options: see the arguments; `scene_version` is empty without a scene.
+        contact_tolerance: of the options.
+        pose, state: the last ones; None before the start.
+        added: the barriers that were added, with the time from which those that move count.
+        reach: greatest distance of the needle's tail from the dish's centre [m].
+
+    Raises:
+        ConfigurationError: a name is unknown, a barrier or a shape cannot be used, or the segments do not resolve the
+            scene: a shape is narrower than one of them, or the dish than four.
+        InvalidInputError: a fixed node is none of the thread's.
+    """
+
+    @checked_arguments("thread predictor")
+    def __init__(
+        self,
+        thread: Thread,
+        scene: Scene | Workspace | None = None,
+        barriers: Sequence[Barrier] = (),
+        *,
+        formulation: str | Formulation = "rod",
+        solver: str = "banded",
+        paper: PaperOptions | None = None,
+        fixed_nodes: Sequence[int] = (),
+        **options: object,
+    ) -> None:
+        self.options = chosen = PredictorOptions(**options)  # type: ignore[arg-type]
+        for node in fixed_nodes:
+            _check_node("fixed node", node, thread)
+        workspace, self.scene_version, self._scene = Workspace((), chosen.margin_range), "", scene
+        if isinstance(scene, Workspace):
+            workspace = scene
+        elif scene is not None:
+            check_scene(thread, scene)
+            # Margins are of the thread's surface, and of the half segments beside a node.
+            reach = chosen.margin_range + 0.5 * (thread.diameter + thread.segment_length)
+            workspace = Workspace(
+                scene.obstacles,
+                reach,
+                wall_radius=scene.dish.radius,
+                friction=scene.friction,
+                wall_friction=scene.dish.wall_friction,
+            )
+            self.scene_version = scene.version
+            if formulation == RodFormulation.name and scene.dish.has_self_contact(thread.diameter):
+                barriers = (*barriers, SelfContact(thread))
+        if isinstance(formulation, str):
+            tolerance = chosen.residual_tolerance
+            solves = make_solver(solver, tolerance)
+            formulation = make_formulation(formulation, thread, workspace, solves, tolerance, paper, barriers)
+        self.thread, self.formulation, self.contact_tolerance = thread, formulation, chosen.contact_tolerance
+        self.added = formulation.added
+        self.fixed_nodes = tuple(sorted(set(fixed_nodes)))
+        self._room_radius = workspace.wall_radius - 0.5 * thread.diameter
+        self.reach = min(workspace.wall_radius + DISH_MARGIN, MAX_COORDINATE)
+        far, self._shape = self.reach + thread.length, (None, formulation.dimension)
+        self._limits = bounded("m", -far, far)
+        self.pose: NeedlePose | None = None
+        self.state: ThreadState | None = None
+
+    @classmethod
+    def create(
+        cls,
+        material: str,
+        *,
+        length: float,
+        segments: int,
+        scene: Scene | Workspace | None = None,
+        barriers: Sequence[Barrier] = (),
+        attachment: str = "pinned",
+        viscosity: float = 1.0,
+        **options: Any,
+    ) -> ThreadPredictor:
+        """Return a predictor of a thread of a known material that floats in a viscous liquid.
+
+        Args:
+            material: name, one of `MATERIALS`.
+            length: of the thread [m].
+            segments: n.
+            scene: see the class, as are the following.
+            barriers: what is enforced besides.
+            attachment: how the thread is fixed to the needle, a value of `Attachment`.
+            viscosity: of the liquid [Pa s].
+            options: further arguments of the class, by name.
+
+        Raises:
+            ConfigurationError: a name is unknown, a number is not positive, or see the class.
+        """
+        Quantity("", choices=tuple(MATERIALS)).checked("material", material, str)
+        Quantity("", choices=tuple(kind.value for kind in Attachment)).checked("attachment", attachment, str)
+        thread = Thread.of(
+            MATERIALS[material],
+            length=length,
+            segments=segments,
+            attachment=Attachment(attachment),
+            viscosity=viscosity,
+        )
+        return cls(thread, scene, barriers, **options)
+
+    @property
+    def started(self) -> bool:
+        """Whether the thread has a shape."""
+        return self.state is not None
+
+    def warm_up(self) -> None:
+        """Step a straight thread, so that no kernel is compiled in the first callback."""
+        dimension = self.formulation.dimension
+        east = np.eye(dimension)[0]
+        path = -self.thread.segment_length * np.arange(self.thread.segments + 1)[:, None] * east
+        begun = self.start_at(NeedlePose(0.0, np.zeros(dimension), east), path)
+        assert begun.margins  # which are computed by kernels of their own
+        with suppress(SolverError):  # an obstacle that lies here says nothing of a thread that lies elsewhere
+            for count in (1, 2):
+                self.step(NeedlePose(count * self.options.max_step, np.zeros(dimension), east))
+        self.formulation.warm_up()
+        self.reset()
+        self.added.first_time = math.inf
+
+    def reset(self) -> None:
+        """Forget the thread's shape; the next call must be `start`."""
+        self.pose = self.state = None
+
+    def start(self, pose: NeedlePose, centreline: Points | None = None, *, strict: bool = True) -> Prediction:
+        """Set the thread's shape from a centreline, measured or assumed, from tail to end.
+
+        Args:
+            pose: the needle at the same instant.
+            centreline: polyline, shape (m, d), m >= 2 [m]. None is a thread that lies straight behind the needle, and
+                where the wall is in its way, along the wall.
+            strict: whether a centreline of another length than the thread's, by more than `LENGTH_TOLERANCE`, is
+                refused, and a thread that lies in the wall or a shape of the scene by more than `START_DEPTH`. If not,
+                a shorter centreline goes on straight, as where the camera measured a part, what is too long is left
+                out, and the thread is pushed out of what it lies in.
+
+        Raises:
+            InvalidInputError: the pose or the centreline is not finite, or too far from the dish; the centreline is
+                shorter than a segment or begins farther than one from the tail; or see `strict`.
+        """
+        check_pose(pose, self.reach, self.formulation.dimension)
+        length, whole = self.thread.length, centreline is not None and strict
+        if centreline is None:
+            centreline = np.array([pose.tail, pose.tail - 2.0 * self.thread.segment_length * pose.heading])
+        centreline = finite_array("centreline", centreline, self._shape, self._limits)
+        if len(centreline) < 2:
+            raise InvalidInputError("centreline", f"{len(centreline)} points", "at least 2")
+        gap, unit = float(np.linalg.norm(centreline[0] - pose.tail)), self.thread.segment_length
+        if gap > unit:
+            raise InvalidInputError("centreline", f"{gap:.2e} m from the needle's tail", f"at most {unit:.2e} m")
+        path = np.vstack([pose.tail, centreline[1:]])
+        if arc_lengths(path)[-1] < unit:
+            raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:.2e} m long", f"at least {unit:.2e} m")
+        if whole and not abs(arc_lengths(path)[-1] - length) <= LENGTH_TOLERANCE * length:
+            expected = f"{length:g} m, the thread's length, within {LENGTH_TOLERANCE:.0%}; strict=False takes a part"
+            raise InvalidInputError("centreline", f"{arc_lengths(path)[-1]:g} m long", expected)
+        chain = chain_inside(path, self.thread.segments, unit, self._room_radius)
+        if strict and isinstance(self._scene, Scene) and (name := find_collision(self._scene, chain, START_DEPTH)):
+            raise InvalidInputError("centreline", f"a thread that lies in {name}", "one clear of wall and shapes")
+        return self.start_at(pose, chain)
+
+    def start_at(self, pose: NeedlePose, vertices: Points) -> Prediction:
+        """Set the thread's nodes.
+
+        Args:
+            pose: the needle at the same instant.
+            vertices: all nodes, shape (n + 1, d) [m].
+
+        Raises:
+            InvalidInputError: the pose or a node is not finite, there are not n + 1 nodes, the first is
+                farther than a segment from the tail, or segments cross where the scene does not allow it.
+        """
+        check_pose(pose, self.reach, self.formulation.dimension)
+        shape = self.thread.segments + 1, self.formulation.dimension
+        vertices = finite_array("thread's nodes", vertices, shape, self._limits)
+        gap = float(np.linalg.norm(vertices[0] - pose.tail))
+        if gap > self.thread.segment_length:
+            nearest = f"at most {self.thread.segment_length:.2e} m"
+            raise InvalidInputError("thread's first node", f"{gap:.2e} m from the needle's tail", nearest)
+        self.formulation.check_start(vertices)
+        self.added.first_time = min(self.added.first_time, pose.stamp)
+        self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
+        self.pose = pose
+        return self._prediction(pose, 0.0, 0, None, None, Residuals(0.0, 0.0, 0.0), True)
+
+    def follow_on(self, other: ThreadPredictor) -> None:
+        """Continue from the state of another predictor, if it has started."""
+        self.added.first_time, self.pose = other.added.first_time, other.pose
+        self.state = other.state.resampled(other.thread, self.thread) if other.state is not None else None
+
+    def step(self, pose: NeedlePose, prescribed: Mapping[int, Points] | None = None) -> Prediction:
+        """Follow the needle to its next pose.
+
+        The real interval between the stamps is stepped over, in sub-steps along the straight line
+        between the two poses: so many that neither the time nor the way of a prescribed node, half a segment,
+        is too long for one. Where a solve fails, the thread stays as it was at the last pose.
+
+        Args:
+            pose: the needle.
+            prescribed: where other nodes are at the same instant, if their motion is measured: positions of
+                shape (d,) by index [m].
+
+        Raises:
+            InvalidInputError: the pose is not finite, or not later than the last one; or a node of prescribed motion is
+                none of the thread's, or not finite.
+            SolverError: a solution's residual is above the tolerance.
+        """
+        if self.pose is None or self.state is None:
+            raise InvalidInputError("needle pose", "a pose before the start", "a centreline first")
+        check_pose(pose, self.reach, self.formulation.dimension)
+        last, state = self.pose, self.state
+        interval = pose.stamp - last.stamp
+        if interval <= 0.0:
+            raise InvalidInputError("needle pose stamp", f"{pose.stamp:.6f} s", f"later than {last.stamp:.6f} s")
+        ends = {0: pose.tail, **{node: state.positions[node] for node in self.fixed_nodes}}
+        for node, position in (prescribed or {}).items():
+            _check_node("node of prescribed motion", node, self.thread)
+            ends[node] = finite_array(f"position of node {node}", position, self._shape[1:], self._limits)
+        nodes = tuple(ends)
+        begin, end = state.positions[list(nodes)], np.array([ends[node] for node in nodes])
+        way = max(map(math.dist, begin.tolist(), end.tolist()))
+        wanted = max(interval / self.options.max_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
+        substeps = min(self.options.max_substeps, math.ceil(wanted - 1e-9))
+        residuals, done, worst, converged = Residuals(0.0, 0.0, 0.0), None, None, True
+
+        def drive(part: float) -> PrescribedMotion:
+            heading = direction_between(last.heading, pose.heading, part)
+            return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
+
+        steps, taken = ((index / substeps, interval / substeps) for index in range(1, substeps + 1)), 0
+        for part, duration in steps:
+            for done in self._follow(state, drive, part, duration, interval):
+                state, residuals = done.state, residuals.or_worse(done.residuals)
+                converged, taken = converged and done.converged, taken + 1
+                worst = done if worst is None or worst.status == SOLVED else worst
+        substeps = taken
+        self.pose, self.state = pose, state
+        others = tuple((node, (ends[node] - place) / interval) for node, place in zip(nodes, begin, strict=True))
+        return self._prediction(pose, interval, substeps, done, worst, residuals, converged, others)
+
+    def _follow(
+        self,
+        state: ThreadState,
+        drive: Callable[[float], PrescribedMotion],
+        part: float,
+        duration: float,
+        interval: float,
+        halvings: int = 0,
+    ) -> Iterator[StepResult]:
+        """Yield the sub-step that ends at a part of the interval, or more of them where the thread is in its own way.
+
+        Raises:
+            SolverError: it would do so in the shortest of them, or see `step`.
+        """
+        done, crowded = None, self.formulation.touches_itself and halvings < MAX_CROWDED_HALVINGS
+        try:
+            done = self.formulation.step(state, drive(part), duration)
+        except SolverError:
+            if not crowded:
+                raise
+        if done is not None and not done.passed and (done.converged or not crowded):
+            yield done
+            return
+        if done is not None and done.passed and halvings == MAX_HALVINGS:
+            self.formulation.forget()
+            raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
+        parts, begin = list[StepResult](), state
+        try:
+            for end in (part - 0.5 * duration / interval, part):
+                parts += self._follow(begin, drive, end, 0.5 * duration, interval, halvings + 1)
+                begin = parts[-1].state
+        except SolverError:
+            if done is None or done.passed:
+                raise
+            parts = [done]  # no better than it was
+        yield from parts
+
+    def _prediction(
+        self,
+        pose: NeedlePose,
+        interval: float,
+        substeps: int,
+        last: StepResult | None,
+        worst: StepResult | None,
+        residuals: Residuals,
+        converged: bool,
+        prescribed: Sequence[tuple[int, Points]] = (),
+    ) -> Prediction:
+        state, formulation = self.state, self.formulation
+        assert state is not None
+        positions = state.positions
+        warm_start = formulation.warm_start() if prescribed and pose.motion is not None else None
+        self.added.set_time(pose.stamp)
+        added = self.added.rows(positions)  # at once, as barriers may move on before they are asked again
+
+        def compute_margins() -> Margins:
+            rows = formulation.margins(positions, pose.heading)
+            return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
+
+        def compute_forces() -> ThreadForces | None:
+            found = None if last is None else formulation.forces(last, pose.heading)
+            if found is None or warm_start is None:
+                return found
+            return self._forces_in_motion(state, pose, prescribed, warm_start) or found
+
+        along = positions[1:] - positions[:-1]
+        lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
+        return Prediction(
+            stamp=pose.stamp,
+            formulation=formulation.name,
+            scene_version=self.scene_version,
+            positions=positions,
+            strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
+            interval=interval,
+            substeps=substeps,
+            solver=worst.solver if worst else "none",
+            status=worst.status if worst else STARTED,
+            residual=residuals.largest,
+            converged=converged,
+            compute_margins=compute_margins,
+            compute_forces=compute_forces,
+        )
+
+    def _forces_in_motion(
+        self, state: ThreadState, pose: NeedlePose, prescribed: Sequence[tuple[int, Points]], warm_start: WarmStart
+    ) -> ThreadForces | None:
+        """Return the forces at a pose while the needle moves as `pose.motion` says; None where a step finds none.
+
+        They are those of a short step of first order on from the state: the drag is that of the present velocity, and
+        not of the way since the last pose, which has the noise of two poses. Nothing is changed by it.
+        """
+        motion, formulation = pose.motion, self.formulation
+        assert motion is not None
+        angle = math.atan2(pose.heading[1], pose.heading[0]) + motion.turning * MOTION_TIME
+        heading = np.array([math.cos(angle), math.sin(angle)])
+        nodes = tuple(node for node, _ in prescribed)
+        velocities = np.array([motion.velocity if node == 0 else velocity for node, velocity in prescribed])
+        moved = PrescribedMotion(nodes, state.positions[list(nodes)] + MOTION_TIME * velocities, heading, pose.stamp)
+        # After a much shorter step nothing is extrapolated from the last velocities.
+        begin = ThreadState(state.positions, state.velocities, 0.1 * MOTION_TIME)
+        kept = formulation.warm_start()
+        formulation.restore(warm_start)
+        try:
+            done = formulation.step(begin, moved, MOTION_TIME)
+        except SolverError:
+            return None
+        finally:
+            formulation.restore(kept)
+        return formulation.forces(done, heading) if done.converged else None
+
+
+def _check_node(field: str, node: int, thread: Thread) -> None:
+    """Raise `InvalidInputError` unless this is a node of the thread and not the needle's own."""
+    if not (isinstance(node, (int, np.integer)) and 1 <= node <= thread.segments):
+        raise InvalidInputError(field, node, f"a node from 1 to {thread.segments}; node 0 follows the needle")

@@ -1,0 +1,1 @@
+"""What the node `thread_model` runs: its settings, and prediction and estimate of a stream of poses."""

@@ -1,0 +1,220 @@
+"""Points are put where they belong along the thread, or refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import Disc
+from magnetosuture_thread.estimator.association import (
+    MIN_DEVIATION,
+    POINT_CORRELATION,
+    AssociationInput,
+    measured_points,
+    path_lengths,
+    path_without_outliers,
+    place_pieces,
+    project,
+    read_piece,
+    search_start,
+)
+from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.estimator.threads import (
+    DEVIATION,
+    LENGTH,
+    error_percent,
+    estimator_of,
+    piece_of,
+    poses,
+    thread_of,
+    true_shapes,
+    whole,
+)
+
+NAN = (float("nan"), float("nan"))
+
+
+def test_points_far_aside_are_left_out_of_the_path() -> None:
+    rng = np.random.default_rng(1)
+    angle = np.linspace(0.0, 4.0, 100)
+    points = 3.0 * np.column_stack([np.cos(angle), np.sin(angle)]) + rng.normal(0.0, 0.02, (100, 2))
+    wrong = np.zeros(100, dtype=np.bool_)
+    wrong[[0, 7, 8, 40, 41, 42, 77, 99]] = True
+    points[wrong] += rng.choice([-1.0, 1.0], (8, 2)) * 4.0
+    np.testing.assert_array_equal(path_without_outliers(points, 0.12, 0.3), ~wrong)
+
+
+@pytest.mark.parametrize("count", [99, 120, 350])
+def test_a_piece_of_many_points_keeps_both_ends_and_its_points_share_information(count: int) -> None:
+    points = np.column_stack([np.linspace(0.0, 0.019, count), np.zeros(count)])
+    points[5] = np.nan, 0.0
+    points[7] = 0.0, 20.0  # out of bounds
+    path, deviation, arcs, share = read_piece(points, np.full(count, 1e-7), 1e-3, 100)
+    assert 50 <= len(path) <= 100
+    np.testing.assert_allclose(path[[0, -1], 0], [0.0, 19.0])
+    np.testing.assert_allclose(deviation, MIN_DEVIATION / 1e-3)  # none is better than that
+    np.testing.assert_allclose(arcs, path[:, 0])
+    np.testing.assert_allclose(share, np.minimum(np.gradient(arcs) * 1e-3 / POINT_CORRELATION, 1.0))
+
+
+def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:
+    rng = np.random.default_rng(2)
+    points = np.column_stack([np.linspace(0.0, 10.0, 200), rng.normal(0.0, 0.02, 200)])
+    arcs = path_lengths(points, 0.4)
+    assert abs(arcs[-1] - 10.0) < 0.05 < 0.2 < np.hypot(*np.diff(points, axis=0).T).sum() - 10.0
+    assert np.all(np.diff(arcs) >= 0.0)
+
+
+@pytest.mark.parametrize("turn", [0.1, -0.1])
+def test_points_on_the_arc_that_the_thread_bends_in_have_no_innovation(turn: float) -> None:
+    """Nodes on a circle, one unit of its arc apart; between two of them it is up to 0.0125 beside their chord."""
+    centre = np.array([0.0, 1.0 / turn])
+
+    def on_arc(arcs: np.ndarray, outwards: float = 0.0) -> np.ndarray:
+        return centre + (1.0 / turn - outwards) * np.column_stack([np.sin(turn * arcs), -np.cos(turn * arcs)])
+
+    nodes, arcs = on_arc(np.arange(20.0)), np.arange(0.0, 12.0, 0.23)
+    for left in (0.0, 0.02, -0.02):
+        place, innovation, count = project(nodes, on_arc(3.1 + arcs, left), arcs, 3.1, 0.1)
+        assert count == len(arcs)
+        np.testing.assert_allclose(place, 3.1 + arcs, atol=0.01)
+        np.testing.assert_allclose(innovation, left, atol=1e-4)
+
+
+def test_beside_a_kink_the_thread_is_straight_and_beyond_its_ends_is_nothing() -> None:
+    nodes = np.array([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)])
+    points = np.array([(1.5, 0.01), (1.8, -0.02), (2.03, 0.4), (2.0, 1.5), (2.0, 5.0)])
+    arcs = np.array([0.0, 0.3, 0.9, 2.0, 5.5])
+    place, innovation, count = project(nodes, points, arcs, 1.5, 0.1)
+    assert count == 4
+    np.testing.assert_allclose(place, [1.5, 1.8, 2.4, 3.5, np.nan])
+    np.testing.assert_allclose(innovation, [0.01, -0.02, -0.03, 0.0, 0.0], atol=1e-12)
+
+
+def test_start_of_a_piece_is_found_along_the_thread() -> None:
+    nodes = np.column_stack([np.arange(30.0), 3.0 * np.sin(0.3 * np.arange(30.0))])
+    at = np.arange(0.0, 8.0, 0.25)
+    along = np.concatenate([[0.0], np.hypot(*np.diff(nodes, axis=0).T).cumsum()])
+    unit = nodes * 29.0 / along[-1]
+    chain = np.column_stack(
+        [np.interp(np.linspace(0.0, 29.0, 30), along * 29.0 / along[-1], unit[:, a]) for a in (0, 1)]
+    )
+    points = np.column_stack([np.interp(11.3 + at, np.arange(30.0), chain[:, a]) for a in (0, 1)])
+    found, square = search_start(chain, points, at, 0.0, 21.0, 100.0)
+    assert found == pytest.approx(11.3, abs=0.06)
+    assert square < 0.01
+
+
+@pytest.mark.parametrize("beyond", [0.4, -0.3])
+def test_a_piece_is_placed_from_either_end_and_its_free_end_is_measured_along_the_thread(beyond: float) -> None:
+    turn = 0.1 * np.arange(25.0)
+    nodes = np.vstack([np.zeros(2), np.cumsum(np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)])
+    along = nodes[-1] - nodes[-2]
+    points = np.vstack([nodes[8:], nodes[-1] + beyond * along]) * 1e-3
+    found = []
+    for turned in (False, True):
+        ends = (PieceEnd.UNKNOWN, PieceEnd.FREE)
+        ends, given = (ends[::-1], points[::-1]) if turned else (ends, points)
+        piece = ThreadPiece(given, np.full(len(points), 1e-5), *ends, NAN, direction_known=False)
+        placed, problems = place_pieces(ThreadObservation((piece,)), nodes, np.ones(26), 1e-3)
+        assert not problems
+        measured, _ = measured_points(placed, AssociationInput(nodes, 0.01, 1e-3, Workspace((), 5e-3), 0.0, 1.0))
+        assert measured is not None
+        assert measured.end[0] == pytest.approx(beyond)
+        found.append(placed[0])
+    for name in ("points", "variance", "share", "arcs", "start"):
+        np.testing.assert_allclose(getattr(found[0], name), getattr(found[1], name), atol=1e-6, err_msg=name)
+
+
+def run_with(pieces_at, count: int = 60, **options):
+    """Return estimates of a thread that starts as it lies, with pieces made from its true nodes at each pose."""
+    way, thread = poses(count), thread_of(**options)
+    truth = true_shapes(thread, way)
+    estimator = estimator_of(thread_of(viscosity=1.3))
+    estimator.start(way[0])
+    found = [estimator.step(pose, pieces_at(truth[k], k)) for k, pose in enumerate(way[1:], 1)]
+    return found, truth
+
+
+def test_a_piece_of_unknown_place_and_direction_is_placed() -> None:
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        piece = piece_of(nodes, k, 0.4 * LENGTH, 0.8 * LENGTH)
+        turned = piece.points[::-1] if k % 2 else piece.points
+        return ThreadObservation(
+            (ThreadPiece(turned, piece.deviation, PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, direction_known=False),)
+        )
+
+    found, truth = run_with(seen)
+    assert all(each.corrected and not each.problems for each in found)
+    assert found[-1].hidden == pytest.approx(0.6, abs=0.1)
+    assert error_percent(found[-1].positions, truth[-1]) < 0.2
+
+
+def test_another_thread_is_refused() -> None:
+    other = np.column_stack([np.linspace(-0.012, 0.004, 60), np.full(60, 0.002)])
+
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        piece = ThreadPiece(other, np.full(60, DEVIATION), PieceEnd.UNKNOWN, PieceEnd.UNKNOWN, NAN, False)
+        return ThreadObservation((piece, piece_of(nodes, k)))
+
+    found, truth = run_with(seen)
+    assert all(any("another" in problem for problem in each.problems) for each in found)
+    assert error_percent(found[-1].positions, truth[-1]) < 0.15
+
+
+def test_outliers_do_not_move_the_thread() -> None:
+    def seen(nodes: np.ndarray, k: int) -> ThreadObservation:
+        rng, piece = np.random.default_rng(k), piece_of(nodes, k)
+        wrong = rng.random(len(piece.points)) < 0.1
+        angle = rng.uniform(0.0, 2.0 * np.pi, wrong.sum())
+        piece.points[wrong] += 5e-3 * np.column_stack([np.cos(angle), np.sin(angle)])
+        return ThreadObservation((piece,))
+
+    found, truth = run_with(seen)
+    assert max(error_percent(each.positions, nodes) for each, nodes in zip(found, truth[1:], strict=True)) < 0.5
+    assert error_percent(found[-1].positions, truth[-1]) < 0.15
+
+
+def test_points_beyond_an_obstacle_are_refused() -> None:
+    disc, way = Disc((-0.01, 0.0021), 2e-3), poses(3, turn=0.0)
+    estimator = estimator_of(thread_of(), (disc,))
+    estimator.start(way[0])
+    nodes = np.column_stack([-np.linspace(0.0, LENGTH, 26), np.zeros(26)]) + way[1].tail
+    piece = piece_of(nodes, 1)
+    beyond = (piece.points[:, 0] < -0.0094) & (piece.points[:, 0] > -0.0106)
+    piece.points[beyond, 1] = 0.0045
+    estimate = estimator.step(way[1], ThreadObservation((piece,)))
+    assert (
+        any("obstacle" in problem or "path" in problem for problem in estimate.problems)
+        or np.abs(estimate.positions[:, 1]).max() < 1e-4
+    )
+    assert np.abs(estimate.positions[:, 1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("start", ["straight", "wrong"])
+def test_unknown_start_is_found_at_once(start: str) -> None:
+    way = poses(90)
+    truth = true_shapes(thread_of(), way)
+    estimator = estimator_of(thread_of())
+    bent = truth[40] + np.linspace(0.0, 1.0, 26)[:, None] * np.array([0.0, 0.2 * LENGTH])
+    estimator.start(way[40], bent if start == "wrong" else None)
+    for k in range(41, 71):
+        estimate = estimator.step(way[k], whole(truth[k], k))
+    assert error_percent(estimate.positions, truth[70]) < 0.3
+
+
+def test_a_thread_that_lies_elsewhere_is_believed_when_a_second_frame_shows_it() -> None:
+    way = poses(14)
+    truth = true_shapes(thread_of(), way)
+    estimator = estimator_of(thread_of())
+    estimator.start_observed(way[0], whole(truth[0], 0))
+    for k in range(1, 12):
+        estimator.step(way[k], whole(truth[k], k))
+    turn = np.array([[math.cos(1.2), math.sin(1.2)], [-math.sin(1.2), math.cos(1.2)]])
+    elsewhere = [way[k].tail + (truth[k] - way[k].tail) @ turn for k in (12, 13)]
+    first, second = (estimator.step(way[k], whole(elsewhere[k - 12], k)) for k in (12, 13))
+    assert error_percent(first.positions, elsewhere[0]) > 1.0
+    assert error_percent(second.positions, elsewhere[1]) < 0.1

@@ -1,0 +1,104 @@
+"""The formulation `rod` in air: inertia and weight, against closed forms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import j0
+
+from magnetosuture_thread.thread.formulations import PrescribedMotion, ThreadState
+from test.thread.scenes import east, formulated, in_air, straight, stretch
+
+G = 9.81
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_thread_that_nothing_holds_falls_freely(dimension: int):
+    down = np.zeros(dimension)
+    down[-1] = -G
+    thread = in_air(0.4, 20, down.tolist(), stiffness=1e-5)
+    formulation = formulated(thread, dimension=dimension)
+    angles = np.linspace(0.0, 1.0, 20)
+    steps = np.zeros((20, dimension))
+    steps[:, 0], steps[:, 1] = 0.02 * np.cos(angles), 0.02 * np.sin(angles)
+    state = ThreadState.at_rest(np.vstack([np.zeros(dimension), np.cumsum(steps, axis=0)]))
+    middle, dt, count = state.positions.mean(axis=0), 1e-3, 300
+    weights = np.ones(21)
+    weights[[0, -2, -1]] = 0.5, 13.0 / 12.0, 5.0 / 12.0
+    middle = np.average(state.positions, axis=0, weights=weights)
+    free = PrescribedMotion((), np.empty((0, dimension)), east(dimension))
+    for _ in range(count):
+        state = formulation.step(state, free, dt).state
+    fallen = np.average(state.positions, axis=0, weights=weights) - middle
+    np.testing.assert_allclose(fallen, 0.5 * dt**2 * count * (count + 1) * down, atol=1e-7)
+    np.testing.assert_allclose(fallen[-1], -0.5 * G * (count * dt) ** 2, rtol=5e-3)
+
+
+def test_a_rope_between_two_hands_hangs_in_a_catenary():
+    """Y = a cosh(x / a), with 2 a sinh(w / 2 a) = L for a span w and a length L."""
+    length, span, segments = 1.0, 0.7, 60
+    thread = in_air(length, segments, (0.0, -G), drag=0.05)
+    formulation = formulated(thread)
+    state = ThreadState.at_rest(straight(thread))
+    begin, end = state.positions[-1].copy(), np.array([-span, 0.0])
+    for step in range(1, 1500):
+        part = min(1.0, step / 300)
+        drive = PrescribedMotion((0, segments), np.array([[0.0, 0.0], begin + part * (end - begin)]), east())
+        state = formulation.step(state, drive, 5e-3).state
+    assert np.abs(state.velocities).max() < 1e-5
+    a = brentq(lambda a: 2.0 * a * math.sinh(0.5 * span / a) - length, 0.05, 10.0)
+    x = state.positions[:, 0] + 0.5 * span
+    expected = a * (np.cosh(x / a) - math.cosh(0.5 * span / a))
+    np.testing.assert_allclose(state.positions[:, 1], expected, atol=1e-3 * length)
+    assert abs(stretch(thread, state.positions)) < 1e-3
+
+
+@pytest.mark.parametrize(("segments", "within"), [(3, 0.03), (20, 0.005)])
+def test_a_hanging_chain_swings_with_its_period(segments: int, within: float):
+    """The slowest mode of a hanging chain has the period 4 pi / j_0 sqrt(L / g), j_0 = 2.4048.
+
+    A chain of a few heavy links is close to it already.
+    """
+    length = 0.5
+    thread = in_air(length, segments, (0.0, -G))
+    formulation = formulated(thread)
+    at = np.linspace(0.0, 1.0, segments + 1)
+    shape = np.column_stack([0.01 * length * j0(2.404826 * np.sqrt(1.0 - at)), -length * at])  # the slowest mode
+    shape[1:] = np.cumsum(
+        length / segments * np.diff(shape, axis=0) / np.linalg.norm(np.diff(shape, axis=0), axis=1)[:, None], axis=0
+    )
+    state, dt = ThreadState.at_rest(shape), 5e-4
+    hung = PrescribedMotion((0,), np.zeros((1, 2)), east())
+    ends, times = [], []
+    for step in range(1, 4000):
+        state = formulation.step(state, hung, dt).state
+        ends.append(state.positions[-1, 0])
+        times.append(step * dt)
+    values = np.array(ends)
+    rising = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    assert len(rising) >= 1
+    falling = np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))
+    half = times[rising[0]] - times[falling[0]]
+    assert 2.0 * half == pytest.approx(4.0 * math.pi / 2.404826 * math.sqrt(length / G), rel=within)
+
+
+def test_bending_damping_takes_the_energy_out_of_a_spring():
+    """An elastic thread that is clamped and plucked swings on in vacuum, and not with a damped bending."""
+    thread = in_air(0.1, 20, (0.0, 0.0), stiffness=1e-3)
+    swings = {}
+    for damping in (0.0, 0.02):
+        damped = replace(thread, medium=replace(thread.medium, bending_damping=damping))
+        formulation = formulated(damped)
+        state = ThreadState.at_rest(straight(thread))
+        state.velocities[:, 1] = 0.05 * np.linspace(0.0, 1.0, 21) ** 2
+        hold = PrescribedMotion((0, 1), state.positions[:2].copy(), east())
+        moved = []
+        for _ in range(600):
+            state = formulation.step(state, hold, 2e-4).state
+            moved.append(abs(state.positions[-1, 1]))
+        swings[damping] = max(moved[-200:])
+    assert swings[0.02] < 0.3 * swings[0.0]

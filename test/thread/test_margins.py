@@ -1,0 +1,50 @@
+"""The margins of a prediction as one table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.barrier import NO_OBSTACLE, BarrierRows
+from magnetosuture_thread.thread.margins import Margins
+
+
+def rows(barrier: str, nodes: list[int], obstacle: list[int], clearance: list[float]) -> BarrierRows:
+    """Return barriers whose values are twice their clearances."""
+    table = np.array([[node - 1, node] for node in nodes], dtype=np.intp).reshape(-1, 2)
+    away = np.array(clearance, dtype=float)
+    return BarrierRows(
+        barrier, table, np.array(obstacle, dtype=np.intp), 2.0 * away, np.zeros((len(nodes), 2, 2)), away
+    )
+
+
+CONNECTIVITY = rows("connectivity", [1, 2, 3], [NO_OBSTACLE] * 3, [1e-9, -1e-9, 0.0])
+OBSTACLE = rows("obstacle", [3, 7, 7, 5], [0, 0, 1, 2], [4e-5, 2e-3, 5e-5, -1e-6])
+
+
+def test_barriers_are_found_by_their_names_in_their_order():
+    found = Margins.of([CONNECTIVITY, OBSTACLE], 5e-5)
+    assert list(found) == ["connectivity", "obstacle"]
+    assert found["connectivity"].node.tolist() == [1, 2, 3]
+    assert found["obstacle"].node.tolist() == [3, 7, 7, 5]
+    assert found["connectivity"].obstacle.tolist() == [-1, -1, -1]
+    assert found["obstacle"].obstacle.tolist() == [0, 0, 1, 2]
+    np.testing.assert_array_equal(found["obstacle"].value, 2.0 * found["obstacle"].clearance)
+    assert found["connectivity"].clearance.tolist() == [1e-9, -1e-9, 0.0]
+    assert found["obstacle"].clearance.tolist() == [4e-5, 2e-3, 5e-5, -1e-6]
+    with pytest.raises(KeyError):
+        found["no_such_barrier"]
+
+
+def test_the_minimum_of_each_barrier_is_named():
+    found = Margins.of([CONNECTIVITY, OBSTACLE], 5e-5)
+    connectivity, obstacle = found.minima
+    assert (connectivity.barrier, connectivity.node[0], connectivity.obstacle[0]) == ("connectivity", 2, -1)
+    assert (obstacle.barrier, obstacle.node[0], obstacle.obstacle[0]) == ("obstacle", 5, 2)
+    assert (obstacle.minimum, obstacle.minimum_clearance) == (-2e-6, -1e-6)
+    assert (found["obstacle"].minimum, found["obstacle"].minimum_clearance) == (-2e-6, -1e-6)
+
+
+@pytest.mark.parametrize(("tolerance", "touching"), [(5e-5, (3, 5, 7)), (1e-5, (5,)), (0.0, (5,)), (1.0, (3, 5, 7))])
+def test_nodes_within_the_tolerance_touch(tolerance: float, touching: tuple[int, ...]):
+    assert Margins.of([CONNECTIVITY, OBSTACLE], tolerance).in_contact == touching

@@ -1,0 +1,241 @@
+"""The predictor: stamps, starts and bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread.predictor import ThreadPredictor
+
+THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
+
+
+def pose(stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> NeedlePose:
+    """Return a needle pose."""
+    return NeedlePose(stamp, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
+
+
+def new(
+    obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = (), formulation: str = "rod"
+) -> ThreadPredictor:
+    """Return a predictor that has not started."""
+    return ThreadPredictor(THREAD, Workspace(obstacles, 5e-3), formulation=formulation, fixed_nodes=fixed_nodes)
+
+
+def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, ...] = ()) -> ThreadPredictor:
+    """Return a predictor of a thread that lies straight behind the needle."""
+    predictor = new(obstacles, fixed_nodes)
+    predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
+    return predictor
+
+
+def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
+    seen = thread_arc(np.zeros(2), 3.0, 60.0, length=0.015)
+    prediction = new().start(pose(1.0), seen, strict=False)
+    assert np.abs(prediction.strain).max() < 1e-3  # a chord is shorter than its arc
+    assert prediction.positions.shape == (26, 2)
+    assert np.linalg.norm(seen - prediction.positions[10], axis=1).min() < 1e-4
+    assert prediction.interval == 0.0
+
+
+def test_steps_are_bounded_whatever_the_interval():
+    predictor = started()
+    assert predictor.step(pose(1.0 / 66.0)).substeps == 1
+    assert predictor.step(pose(1.0 / 66.0 + 1.0 / 30.0, 1e-4)).substeps == 2
+    late = predictor.step(pose(100.0, 2e-3))
+    assert late.substeps == 200
+    assert late.interval == pytest.approx(100.0 - 1.0 / 66.0 - 1.0 / 30.0)
+    assert np.abs(late.strain).max() < 1e-3
+
+
+def test_the_same_motion_in_other_samples_gives_the_same_thread():
+    fine, coarse = started(), started()
+    for k in range(1, 61):
+        prediction = fine.step(pose(k / 60.0, 5e-3 * k / 60.0, 2e-3 * (k / 60.0)))
+    for k in range(1, 16):
+        other = coarse.step(pose(k / 15.0, 5e-3 * k / 15.0, 2e-3 * (k / 15.0)))
+    difference = np.linalg.norm(prediction.positions - other.positions, axis=1).mean()
+    assert difference / THREAD.length < 2e-4
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (pose(float("nan")), "a finite time"),
+        (pose(1.0, float("nan")), "finite coordinates"),
+        (pose(1.0, 0.0, float("inf")), "finite coordinates"),
+        (pose(1.0, 1e20), "at most 1 m from the dish's centre"),
+        (pose(1.0, 0.0, -1e160), "at most 1 m from the dish's centre"),
+        (pose(1.0, 5.0), "at most 1 m from the dish's centre; given in metres?"),
+        (NeedlePose(1.0, np.zeros(2), np.array([2.0, 0.0])), "a unit vector"),
+        (NeedlePose(1.0, np.zeros(2), np.array([np.nan, 0.0])), "a unit vector"),
+        (pose(0.0), "later than"),
+        (pose(-1.0), "later than"),
+    ],
+)
+def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, words: str):
+    predictor, untouched = started(), started()
+    with pytest.raises(InvalidInputError, match=words):
+        predictor.step(bad)
+    after, expected = predictor.step(pose(0.1, 1e-4)), untouched.step(pose(0.1, 1e-4))
+    np.testing.assert_array_equal(after.positions, expected.positions)
+
+
+def test_a_start_needs_a_centreline():
+    predictor = new()
+    with pytest.raises(InvalidInputError, match="a centreline first"):
+        predictor.step(pose(0.0))
+    for centreline, words in (
+        (np.zeros((1, 2)), "1 points"),
+        (np.array([[0.0, 0.0], [np.nan, 0.0]]), "finite numbers"),
+        (np.array([[0.0, 0.0], [1e-5, 0.0]]), "1.00e-05 m long"),
+        (np.zeros((3, 2)), "0.00e[+]00 m long"),
+        (np.array([[0.005, 0.0], [0.02, 0.0]]), "5.00e-03 m from the needle's tail"),
+    ):
+        with pytest.raises(InvalidInputError, match=f"centreline.*{words}"):
+            predictor.start(pose(0.0), centreline)
+    assert not predictor.started
+
+
+def test_warming_up_leaves_no_trace():
+    warm, cold = new(), new()
+    warm.warm_up()
+    assert not warm.started
+    for predictor in (warm, cold):
+        predictor.start(pose(5.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
+    first, second = warm.step(pose(5.1, 1e-4)), cold.step(pose(5.1, 1e-4))
+    np.testing.assert_allclose(first.positions, second.positions, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("prescribed", "words"),
+    [
+        ({0: np.zeros(2)}, "node 0 follows the needle"),
+        ({26: np.zeros(2)}, "a node from 1 to 25"),
+        ({25: np.array([np.nan, 0.0])}, "position of node 25"),
+        ({25: np.zeros(3)}, "position of node 25"),
+        ({25: np.array([11.0, 0.0])}, "numbers from -1.019 to 1.019 m"),
+    ],
+)
+def test_driven_nodes_that_cannot_be_are_refused(prescribed: dict[int, np.ndarray], words: str):
+    with pytest.raises(InvalidInputError, match=words):
+        started().step(pose(0.1), prescribed)
+    with pytest.raises(InvalidInputError, match="fixed node"):
+        new(fixed_nodes=(26,))
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize("segments", [3.0, 10.0, 24.0])
+def test_a_needle_that_jumps_by_many_segments_is_followed(segments: float, formulation: str):
+    predictor = new(formulation=formulation)
+    predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
+    jump = segments * THREAD.segment_length
+    prediction = predictor.step(pose(1.0 / 60.0, -jump, 0.2 * jump))
+    assert prediction.substeps >= 2.0 * segments
+    assert np.all(np.isfinite(prediction.positions))
+    for k in range(2, 120):
+        prediction = predictor.step(pose(k / 60.0, -jump, 0.2 * jump))
+    assert prediction.strain.max() < 5e-3
+    assert prediction.residual < 1e-6
+
+
+@example(  # a disc that a segment's chord lies in, and not its arc
+    turns=[0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+    speed=0.015625,
+    disc=(0.0, 0.004, 0.001953125),
+    corners=[(0.0, 0.00390625), (1.0, 0.00390625), (2.0, 0.00390625)],
+)
+@settings(max_examples=40, deadline=None)
+@given(
+    turns=st.lists(st.floats(-0.6, 0.6), min_size=5, max_size=40),
+    speed=st.floats(0.0, 0.03),
+    disc=st.tuples(st.floats(-0.02, 0.02), st.floats(0.004, 0.012), st.floats(5e-4, 3e-3)),
+    corners=st.lists(
+        st.tuples(st.floats(0.0, 6.28), st.floats(1e-3, 4e-3)),
+        min_size=3,
+        max_size=9,
+        unique_by=lambda c: round(c[0], 1),
+    ),
+)
+def test_any_motion_keeps_the_promises(
+    turns: list[float], speed: float, disc: tuple[float, float, float], corners: list[tuple[float, float]]
+):
+    """No NaN, no segment stretched by more than half a percent, no node in an obstacle, residuals proven."""
+    outer = disc[2] + 0.5 * THREAD.diameter
+    sagitta = outer * (1.0 - np.cos(0.5 * THREAD.segment_length / outer))
+    obstacles: list[Disc | Polygon] = [Disc((disc[0], disc[1]), disc[2])]
+    angles = np.sort([corner[0] for corner in corners])
+    if np.diff(np.append(angles, angles[0] + 2.0 * np.pi)).max() < 3.0:  # else not around its middle
+        star = tuple(
+            (-0.009 + r * np.cos(a), -0.006 + r * np.sin(a)) for a, (_, r) in zip(angles, corners, strict=True)
+        )
+        polygon = Polygon(star)
+        if polygon.can_contain(0.5 * THREAD.segment_length):
+            obstacles.append(polygon.smoothed(1e-4))
+    predictor = started(tuple(obstacles))
+    around = Workspace(obstacles, 5e-3)
+    where, angle = np.zeros(2), 0.0
+    for k, turn in enumerate(turns, start=1):
+        angle += turn
+        ahead = where + speed / 30.0 * np.array([np.cos(angle), np.sin(angle)])
+        if not (around.near(ahead[None]).distance < 2e-4).any():  # the needle itself must not enter
+            where = ahead
+        prediction = predictor.step(pose(k / 30.0, where[0], where[1], angle))
+        assert np.all(np.isfinite(prediction.positions))
+        assert prediction.converged
+        assert np.abs(prediction.strain).max() < 5e-3
+        assert prediction.residual < 1e-6
+        obstacle = prediction.margins["obstacle"]
+        free = obstacle.node > 0
+        assert obstacle.value[free].min(initial=1.0) > -1e-6
+        # Around a disc it is a segment's arc that touches, and its chord lies deeper; see `find_chord_contacts`.
+        assert (obstacle.clearance + sagitta * (obstacle.obstacle == 0))[free].min(initial=1.0) > -1e-6
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    stamps=st.lists(st.floats(-6.0, 1.0), min_size=3, max_size=15),
+    seed=st.integers(0, 10_000),
+    attachment=st.sampled_from(list(Attachment)),
+    dimension=st.sampled_from([2, 3]),
+    curvature=st.floats(-100.0, 100.0),
+    fixed_nodes=st.sampled_from([(), (15,), (14, 15), (25,)]),
+)
+def test_any_thread_at_any_times_stays_whole(
+    stamps: list[float],
+    seed: int,
+    attachment: Attachment,
+    dimension: int,
+    curvature: float,
+    fixed_nodes: tuple[int, ...],
+):
+    """Intervals from a microsecond to ten seconds, in the plane and in space, curled, clamped, and fixed."""
+    random = np.random.default_rng(seed)
+    thread = Thread.of(
+        MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=attachment, rest_curvature=curvature
+    )
+    predictor = ThreadPredictor(thread, Workspace((), 5e-3, dimension), fixed_nodes=fixed_nodes)
+    east = np.eye(dimension)[0]
+    where, time = np.zeros(dimension), 0.0
+    # Not quite straight: what is, in theory, can be pushed together and does not know to which side to bend.
+    side = np.eye(dimension)[1]
+    along = np.linspace(0.0, 0.019, 50)[:, None]
+    predictor.start(NeedlePose(0.0, where, east), where - along * east + 20.0 * along**2 * side)
+    for stamp in stamps:
+        time += 10.0**stamp
+        # Towards what is fixed, so that the thread is long enough.
+        where = where + random.uniform(0.0, 1.0) * 2e-4 * (
+            random.normal(size=dimension) * (not fixed_nodes) - 0.5 * east
+        )
+        heading = east + 0.3 * random.normal(size=dimension)
+        prediction = predictor.step(NeedlePose(time, where, heading / np.linalg.norm(heading)))
+        assert np.isfinite(prediction.positions).all()
+        assert prediction.residual < 1e-6
+        assert np.abs(prediction.strain).max() < 5e-3 or not prediction.converged
+        assert np.abs(prediction.strain).max() < 5e-2

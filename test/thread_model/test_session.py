@@ -1,0 +1,482 @@
+"""A session: what waits, what is refused, what time set back does, and how it goes on with other settings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread_model import settings as model_settings
+from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from test.thread.worlds import polygon, scene_with
+
+EAST = np.array([1.0, 0.0])
+SECOND = 1_000_000_000
+SQUARE = polygon(-0.012, 0.001, -0.006, 0.001, -0.006, 0.007, -0.012, 0.007)
+
+
+def made(**values: Any) -> ThreadModelSettings:
+    """Return settings from what a setup file would hold."""
+    return from_mapping(ThreadModelSettings, values)
+
+
+def straight(scene: Scene | None = None, **values: Any) -> ThreadSession:
+    """Return a session that needs no camera."""
+    return ThreadSession(made(initial_shape="straight", **values), scene)
+
+
+def pose(stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> NeedlePose:
+    """Return a needle pose at a stamp [ns]."""
+    return NeedlePose(stamp * 1e-9, np.array([x, y]), np.array([np.cos(angle), np.sin(angle)]))
+
+
+def go(session: ThreadSession, stamp: float, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> PredictionResult:
+    """Show a session a pose at a stamp [s]."""
+    at = round(stamp * SECOND)
+    return session.on_pose(at, pose(at, x, y, angle))
+
+
+def predicted(outcome: PredictionResult) -> Prediction:
+    """Return the prediction that there must be."""
+    assert outcome.problem is None
+    assert outcome.prediction is not None
+    return outcome.prediction
+
+
+def seen(x: float = 0.0, y: float = 0.0) -> Points:
+    """Return a thread that lies straight behind a needle that points east."""
+    return np.column_stack([x - np.linspace(0.0, 0.019, 60), np.full(60, y)])
+
+
+def on_a_curve(session: ThreadSession, first: int, last: int) -> list[Prediction]:
+    """Return what a session predicts of a needle that is driven in a curve, at 30 Hz."""
+    return [
+        predicted(go(session, 1.0 + k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0))
+        for k in range(first, last)
+    ]
+
+
+def test_a_pose_waits_for_the_thread_of_its_frame():
+    session = ThreadSession(made(), None)
+    assert [go(session, 1.0 + 0.1 * k, 1e-4 * k).waiting for k in range(4)] == [True] * 4
+    # The first frame's thread was never seen.
+    found = list(session.on_measured_thread(1_100_000_000, seen(1e-4)))
+    assert [outcome.stamp for outcome in found] == [1_100_000_000, 1_200_000_000, 1_300_000_000]
+    assert [predicted(outcome).status for outcome in found] == ["started", "solved", "solved"]
+    assert predicted(go(session, 1.4, 4e-4)).interval == pytest.approx(0.1)
+
+
+def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
+    session = ThreadSession(made(), None)
+    go(session, 1.0)
+    go(session, 1.1)
+    found = list(session.on_measured_thread(SECOND, seen(y=5e-3)))
+    assert "from the needle's tail" in str(found[0].problem)
+    assert found[1].waiting
+    assert predicted(next(iter(session.on_measured_thread(1_100_000_000, seen())))).status == "started"
+
+
+@pytest.mark.parametrize("offset", [[], [1e-3, 0.0]])
+@pytest.mark.parametrize(
+    "centreline",
+    [
+        np.empty((0, 2)),
+        np.zeros((1, 2)),
+        np.full((9, 2), np.nan),
+        np.full((9, 2), np.inf),
+        np.array([[0.0, 0.0], [1e300, -1e300]]),
+        np.array([[1e-3, 0.0], [1e-3, 0.0]]),
+    ],
+)
+def test_a_centreline_that_is_none_is_refused(centreline: Points, offset: list[float]):
+    session = ThreadSession(made(attachment_offset=offset), None)
+    go(session, 1.0)
+    (outcome,) = session.on_measured_thread(SECOND, centreline)
+    assert isinstance(outcome.problem, InvalidInputError)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        NeedlePose(1.1, np.array([np.nan, 0.0]), EAST),
+        NeedlePose(1.1, np.array([1e300, 0.0]), EAST),
+        NeedlePose(1.1, np.zeros(2), 2.0 * EAST),
+        NeedlePose(0.9, np.zeros(2), EAST),
+    ],
+)
+@pytest.mark.parametrize("offset", [[], [1e-3, 5e-4]])
+def test_a_bad_pose_is_refused_and_changes_nothing(bad: NeedlePose, offset: list[float]):
+    session, other = straight(attachment_offset=offset), straight(attachment_offset=offset)
+    for one in (session, other):
+        go(one, 1.0)
+    refused = session.on_pose(round(bad.stamp * SECOND), bad)
+    assert isinstance(refused.problem, InvalidInputError)
+    assert not refused.waiting
+    np.testing.assert_array_equal(
+        predicted(go(session, 1.2, 1e-3)).positions, predicted(go(other, 1.2, 1e-3)).positions
+    )
+
+
+def test_a_step_that_is_not_solved_is_told_and_the_next_goes_on_from_before():
+    session = straight(residual_tolerance=1e-12)
+    go(session, 1.0)
+    failed = go(session, 1.001, 0.017, 0.013)
+    assert isinstance(failed.problem, SolverError)
+    assert go(session, 1.1, 1e-5).stamp == 1_100_000_000
+
+
+def test_time_set_back_starts_anew():
+    session = ThreadSession(made(), None)
+    session.on_measured_thread(100 * SECOND, seen())
+    go(session, 100.0)
+    go(session, 100.1)
+    assert go(session, 1.0).waiting  # for a thread of that time
+    assert [predicted(outcome).status for outcome in session.on_measured_thread(SECOND, seen())] == ["started"]
+    assert predicted(go(session, 1.1)).interval == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("stamp", [-(2**31) * SECOND, (2**31 - 1) * SECOND + SECOND - 1, 0])
+def test_any_stamp_that_a_message_can_hold_is_taken(stamp: int):
+    session = straight()
+    assert session.on_pose(stamp, pose(stamp)).stamp == stamp
+    assert predicted(session.on_pose(stamp + SECOND, pose(stamp + SECOND))).interval == pytest.approx(1.0, abs=1e-5)
+
+
+# --- where the thread is fixed -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("attachment", ["pinned", "clamped"])
+@pytest.mark.parametrize("offset", [[-2e-3, 0.0], [0.0, 7e-4], [0.01, 0.01]])
+def test_the_thread_hangs_where_it_is_fixed(offset: list[float], attachment: str):
+    session = straight(attachment_offset=offset, attachment=attachment)
+    for k in range(20):
+        angle = 0.02 * k
+        prediction = predicted(go(session, 1.0 + k / 30.0, 1e-4 * k, 0.0, angle))
+        along, left = offset
+        expected = [
+            1e-4 * k + along * np.cos(angle) - left * np.sin(angle),
+            along * np.sin(angle) + left * np.cos(angle),
+        ]
+        np.testing.assert_allclose(prediction.positions[0], expected, atol=1e-12)
+    assert np.abs(prediction.strain).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("offset", "begin", "end"),
+    [
+        ([2e-3, 0.0], 2e-3, 2e-3 - 0.019),  # fixed in front of the tail: what is between them is covered by the thread
+        ([-2e-3, 0.0], -2e-3, -2e-3 - 0.019),  # behind it: what is seen before belongs to the needle
+        ([0.0, 0.0], 0.0, -0.019),
+    ],
+)
+def test_a_seen_thread_begins_where_it_is_fixed(offset: list[float], begin: float, end: float):
+    session = ThreadSession(made(attachment_offset=offset), None)
+    go(session, 1.0)
+    prediction = predicted(next(iter(session.on_measured_thread(SECOND, seen()))))
+    np.testing.assert_allclose(prediction.positions[0], [begin, 0.0], atol=1e-12)
+    np.testing.assert_allclose(prediction.positions[-1], [end, 0.0], atol=1e-9)
+
+
+# --- other settings ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"material": "silk_6_0"},
+        {"viscosity": 0.3, "drag_anisotropy": 0.7},
+        {"attachment": "clamped"},
+        {"attachment_offset": [1e-3, 1e-3]},
+        {"margin_range": 1e-2},
+        {"medium": "air", "gravity": [0.0, -0.01]},
+    ],
+)
+def test_it_goes_on_from_the_present_shape(values: dict[str, Any]):
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1]
+    session.change(made(initial_shape="straight", **values), None)
+    assert session.settings == made(initial_shape="straight", **values)
+    after = on_a_curve(session, 30, 31)[0]
+    assert after.interval == pytest.approx(1 / 30.0)  # no pose was lost, and no time
+    assert after.status == "solved"
+    assert np.linalg.norm(after.positions[1:] - before.positions[1:], axis=1).max() < 1.5e-3
+    assert np.abs(after.strain).max() < 1e-3
+
+
+def test_a_scene_changes_what_is_around_and_what_the_predictions_name():
+    session, scene = straight(), scene_with(Disc((0.0, 0.02), 0.003))
+    assert [p.scene_version for p in on_a_curve(session, 0, 30)] == [""] * 30
+    session.change(session.settings, scene)
+    assert (session.scene, session.scene_version) == (scene, scene.version)
+    outcome = go(session, 2.0, 0.0068, 0.0026, 0.75)
+    assert predicted(outcome).scene_version == outcome.scene_version == scene.version
+    assert outcome.margins is not None
+    assert outcome.margins.scene_version == scene.version
+    assert go(session, 1.5).scene_version == scene.version  # refused, as it is of the past
+    session.change(session.settings, None)
+    assert go(session, 2.1, 0.0068, 0.0026, 0.75).scene_version == ""
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
+    session = straight(scene_with(), formulation=formulation, attachment="clamped")
+    go(session, 1.0, x=0.007, angle=0.2)
+    session.change(session.settings, scene_with(diameter=0.02))
+    outcomes = [go(session, 1.0 + k / 30.0, x=0.007, angle=0.2) for k in range(1, 20)]
+    last = predicted(outcomes[-1])
+    away = np.linalg.norm(last.positions[1:], axis=1).max()
+    assert away < 0.01 - 30e-6 + 1e-6
+    assert formulation == "paper" or away > 0.0099  # in which a thread that is pushed shrinks instead
+    margins = outcomes[-1].margins
+    assert margins is not None
+    assert formulation == "paper" or margins.in_contact
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize("length", [0.019, 0.15])
+def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
+    session = straight(scene_with(diameter=0.035), formulation=formulation, thread_length=length, segments=81)
+    for k in range(10):
+        prediction = predicted(go(session, 1.0 + k / 30.0, x=-0.012 + 1e-4 * k))
+        assert np.linalg.norm(prediction.positions, axis=1).max() < 0.0175 - 30e-6 + 1e-6
+    crooked = ThreadSession(made(formulation=formulation), scene_with(diameter=0.035))
+    go(crooked, 1.0, x=0.0174)
+    wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
+    wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
+    (outcome,) = crooked.on_measured_thread(SECOND, wavy)
+    assert np.linalg.norm(predicted(outcome).positions[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"segments": 60},
+        {"segments": 7},
+        {"thread_length": 0.03, "segments": 40},
+        {"thread_length": 0.01},
+        {"thread_length": 0.001, "segments": 8},
+    ],
+)
+def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1].positions
+    session.change(made(initial_shape="straight", **values), None)
+    after = on_a_curve(session, 30, 31)[0].positions
+    assert len(after) == session.thread.segments + 1
+    assert session.thread == session.settings.thread()
+    near = np.linalg.norm(after[:, None] - before, axis=2).min(axis=1)
+    along = session.thread.segment_length * np.arange(len(after))
+    assert near[along < 0.018].max() < 1e-3
+    assert np.linalg.norm(np.diff(after, axis=0), axis=1) == pytest.approx(session.thread.segment_length, rel=5e-3)
+
+
+def test_a_thread_in_air_keeps_its_speed():
+    air = {"medium": "air", "air_drag": 0.0, "initial_shape": "straight"}
+    session, other = ThreadSession(made(**air), None), ThreadSession(made(**air), None)
+    for one in (session, other):
+        for k in range(10):
+            predicted(go(one, 1.0 + k / 100.0, 1e-3 * k))
+    session.change(made(**air, margin_range=1e-2), None)
+    same, kept = (predicted(go(one, 1.1, 1e-2)).positions for one in (session, other))
+    np.testing.assert_allclose(same, kept, atol=1e-7)
+    session.change(made(**air, segments=50), None)
+    finer, kept = (predicted(go(one, 1.11, 1.1e-2)).positions for one in (session, other))
+    np.testing.assert_allclose(finer[::2], kept, atol=1e-5)
+
+
+def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():
+    session = straight()
+    before = on_a_curve(session, 0, 30)[-1].positions
+    session.change(made(initial_shape="straight", fixed_nodes=[20]), None)
+    for k in range(28, 0, -1):  # back, so that the thread gets slack
+        after = predicted(
+            go(session, 3.0 - k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
+        )
+    np.testing.assert_allclose(after.positions[20], before[20], atol=1e-12)
+    session.change(made(initial_shape="straight"), None)
+    assert np.linalg.norm(on_a_curve(session, 100, 130)[-1].positions[20] - before[20]) > 1e-3
+
+
+@pytest.mark.parametrize("values", [{}, {"formulation": "paper"}])
+def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[str, Any], monkeypatch):
+    one, other = straight(**values), straight(**values)
+    for session in (one, other):
+        on_a_curve(session, 0, 20)
+    before = one.settings
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise ConfigurationError("scene.shape_0", 1.0, "something else")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(model_settings, "ThreadPredictor", refuse)
+        with pytest.raises(ConfigurationError):
+            one.change(one.settings, scene_with(Disc((0.0, 0.01), 0.002)))
+    assert one.settings is before
+    assert one.scene is None
+    for first, second in zip(on_a_curve(one, 20, 30), on_a_curve(other, 20, 30), strict=True):
+        np.testing.assert_array_equal(first.positions, second.positions)
+
+
+def test_a_change_while_the_thread_is_waited_for_loses_no_pose():
+    session = ThreadSession(made(), None)
+    for k in range(3):
+        go(session, 1.0 + 0.1 * k)
+    session.change(made(material="silk_6_0"), None)
+    assert [predicted(outcome).stamp for outcome in session.on_measured_thread(SECOND, seen())] == pytest.approx(
+        [1.0, 1.1, 1.2]
+    )
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        Disc((-0.01, 1e-4), 0.001),  # upon the thread, a little to one side
+        Disc((-0.01, 0.0), 0.001),  # upon it: no side is nearer
+        Disc((0.0, 0.0), 0.005),  # upon the needle
+        Disc((-0.01, 0.0), 0.03),  # upon everything
+        polygon(-0.012, -0.001, -0.006, -0.001, -0.006, 0.002, -0.012, 0.002),
+    ],
+)
+def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, obstacle: Disc | Polygon):
+    """It pushes the thread out; where that is not possible, the step says so and its margins are not valid."""
+    session = straight(formulation=formulation)
+    go(session, 1.0)
+    settings = session.settings
+    session.change(settings, scene_with(obstacle))
+    proven = 0
+    for k in range(1, 15):
+        prediction = go(session, 1.0 + k / 30.0, 1e-4 * k).prediction
+        if prediction is None or not prediction.converged:
+            continue
+        proven += 1
+        margins = prediction.margins["obstacle"]
+        if isinstance(obstacle, Disc):
+            distance = obstacle.signed_distance(prediction.positions)[0] - 30e-6
+            np.testing.assert_allclose(margins.value, distance[margins.node], atol=1e-12)
+        assert margins.value.min(initial=0.0) > -1e-7
+        assert (margins.clearance <= margins.value).all()
+    assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+@pytest.mark.parametrize(
+    ("offsets", "leaves"),
+    [
+        ([(0.0, 4e-4)], True),  # of posts of 0.6 mm from the node
+        ([(0.0, 0.0)], True),
+        ([(3e-4, 4e-4), (-3e-4, 4e-4), (0.0, 9e-4)], True),
+        ([(0.0, 4e-4), (0.0, -4e-4)], False),  # in both at once, each pushes it into the other
+        ([(3e-4 * np.cos(k), 3e-4 * np.sin(k)) for k in range(7)], True),  # more shapes than it has friction with
+    ],
+)
+def test_shapes_that_appear_around_a_moving_node_are_resolved_or_reported(
+    formulation: str, offsets: list[tuple[float, float]], leaves: bool
+):
+    """No step hangs or raises, and no margins are given of a thread of which a node is still inside."""
+    session = straight(formulation=formulation)
+    node = on_a_curve(session, 0, 30)[-1].positions[12]
+    posts = [Disc(tuple(node + offset), 6e-4) for offset in offsets]
+    session.change(session.settings, scene_with(*posts))
+    given = []
+    for k in range(30, 45):
+        outcome = go(session, 1.0 + k / 30.0, 0.01 * np.sin(k / 40.0), 0.01 - 0.01 * np.cos(k / 40.0), k / 40.0)
+        given.append(outcome.margins is not None)
+        if outcome.margins is None:
+            assert outcome.reason
+            continue
+        nodes = predicted(outcome).positions[1:]
+        least = min(float(post.signed_distance(nodes)[0].min()) for post in posts) - 30e-6
+        assert least > -1e-6
+        assert outcome.margins["obstacle"].minimum_clearance <= least + 1e-12
+    assert sum(given) > 10 if leaves else sum(given) < 5
+
+
+def test_no_kernel_is_compiled_by_a_change():
+    """In a process of its own: in this one others have compiled what they need."""
+    code = """
+import gc
+import numpy as np
+from numba.core.registry import CPUDispatcher
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+
+def kernels():
+    ours = (found for found in gc.get_objects() if isinstance(found, CPUDispatcher))
+    return sum(len(f.signatures) for f in ours if f.py_func.__module__.startswith("magnetosuture_thread"))
+
+def made(**values):
+    return from_mapping(ThreadModelSettings, {"initial_shape": "straight", **values})
+
+square = Polygon(((-0.012, 0.001), (-0.006, 0.001), (-0.006, 0.007), (-0.012, 0.007)))
+disc = Disc((-0.01, 1e-4), 0.001)
+session, before, stamp = ThreadSession(made(), None), kernels(), 0
+for values in (
+    {}, {"segments": 60}, {"thread_length": 0.03}, {"material": "silk_6_0"}, {"medium": "air", "gravity": [0.0, -1.0]},
+    {"shapes": (), "diameter": 0.036}, {"shapes": (disc,)}, {"shapes": (square,)}, {"shapes": (disc, square)},
+    {"attachment": "clamped", "rest_curvature": 20.0}, {"fixed_nodes": [20]}, {"attachment_offset": [1e-3, 0.0]},
+):
+    scene = None
+    if "shapes" in values:
+        shapes = tuple(SceneShape(f"shape_{i}", "tissue", shape) for i, shape in enumerate(values.pop("shapes")))
+        scene = Scene(Dish(values.pop("diameter", 0.1)), shapes)
+    session.change(made(**values), scene)
+    for _ in range(40):
+        stamp += 33_000_000
+        at = np.array([0.0, stamp * 5e-12])
+        pose = NeedlePose(stamp * 1e-9, at, np.array([1.0, 0.0]), deviation=(1e-5, 1e-2))
+        outcome = session.on_pose(stamp, pose)
+        assert outcome.prediction is None or outcome.prediction.margins
+print(kernels() - before)
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
+    assert found.stdout.strip() == "0"
+
+
+def observed(*, complete: bool, first: PieceEnd = PieceEnd.TAIL) -> ThreadObservation:
+    """Return an observation of one piece, half of the thread unless it is complete."""
+    points = seen() if complete else seen()[: len(seen()) // 2]
+    last = PieceEnd.FREE if complete else PieceEnd.COVERED
+    piece = ThreadPiece(points, np.full(len(points), 1e-5), first, last, (0.0, 0.0))
+    return ThreadObservation((piece,), complete)
+
+
+def test_the_model_starts_from_all_of_the_thread_at_once():
+    session = ThreadSession(made(), None)
+    go(session, 1.0)
+    (outcome,) = session.on_observation(SECOND, observed(complete=True))
+    assert predicted(outcome).status == "started"
+
+
+def test_the_model_waits_for_the_rest_of_the_thread_before_it_starts_from_a_part():
+    session = ThreadSession(made(), None)
+    for k in range(10):
+        assert go(session, 1.0 + 0.1 * k).waiting
+        assert not list(session.on_observation(SECOND + k * SECOND // 10, observed(complete=False)))
+    go(session, 2.0)
+    (outcome,) = session.on_observation(2 * SECOND, observed(complete=False))
+    assert predicted(outcome).status == "started"
+    assert len(predicted(outcome).positions) == made().segments + 1  # all of it, the rest straight
+
+
+def test_the_model_does_not_start_from_a_piece_that_is_not_at_the_needle():
+    session = ThreadSession(made(), None)
+    for stamp in (SECOND, 3 * SECOND):
+        go(session, stamp / SECOND)
+        assert not list(session.on_observation(stamp, observed(complete=False, first=PieceEnd.COVERED)))
+        assert not list(session.on_observation(stamp, ThreadObservation()))

@@ -1,0 +1,148 @@
+"""Settings of the thread model: what they make, and what they refuse."""
+
+from __future__ import annotations
+
+import gc
+from typing import Any
+
+import numpy as np
+import pytest
+from numba.core.registry import CPUDispatcher
+
+from magnetosuture_thread.configuration import from_mapping
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.thread.margins import SOLID
+from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
+from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from test.thread.worlds import polygon, scene_with
+
+SQUARE = polygon(0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01)
+
+
+def made(**values: Any) -> ThreadModelSettings:
+    """Return settings from what a setup file would hold."""
+    return from_mapping(ThreadModelSettings, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"fixed_nodes": [26]}, "nodes from 1 to 25"),
+        ({"fixed_nodes": [0]}, "from 1 to"),
+        ({"formulation": "magic"}, "one of rod, paper"),
+        ({"solver": "magic"}, "one of banded, osqp"),
+        ({"medium": "honey"}, "one of liquid, air"),
+        ({"gravity": [9.81]}, "multiple of 2"),
+        ({"medium": "air", "gravity": [0.0, -9.8, 1.0, 2.0]}, "two numbers"),
+        ({"gravity": [0.0, -9.81]}, "gravity.*medium: air only"),
+        ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium: liquid only"),
+        ({"rest_curvature": 900.0}, "half a radian"),
+        ({"drag_anisotropy": 0.0}, "from 0.05 to 1"),
+        ({"drag_anisotropy": float("nan")}, "from 0.05 to 1"),
+        ({"medium": "air", "drag_anisotropy": 0.7}, "drag_anisotropy.*medium: liquid only"),
+        ({"attachment_offset": [1e-3]}, "multiple of 2"),
+        ({"attachment_offset": [1e-3, 0.0, 1e-3, 0.0]}, "attachment_offset.*two numbers, along and to the left"),
+        ({"attachment_offset": [1e-3, float("nan")]}, "from -0.01 to 0.01 m"),
+        ({"attachment_offset": [1.0, 0.0]}, "from -0.01 to 0.01 m"),
+        ({"paper_damping": 1.0}, "from 0 to 0.999"),
+        ({"paper_stiffness_weight": -1.0}, "from 0 to"),
+        ({"formulation": "paper", "medium": "air"}, "paper has no inertia"),
+        ({"formulation": "paper", "flow": [1e-3, 0.0]}, "paper has no drag"),
+        ({"flow": [1e-3]}, "multiple of 2"),
+        ({"flow": [1e-3, 1.0]}, "from -0.1 to 0.1 m/s"),
+        ({"segments": 400}, "longer than thick"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        made(**values)
+    assert "thread_model." in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"formulation": "paper"},
+        {"solver": "osqp", "attachment": "clamped"},
+        {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
+        {"fixed_nodes": [20], "rest_curvature": 30.0},
+        {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
+        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
+        {"margin_range": 0.02},
+        {"flow": [1e-3, -2e-3]},
+    ],
+)
+def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
+    predictor = made(**values).predictor(scene_with(SQUARE, diameter=0.06))
+    assert not predictor.started
+    east = np.array([1.0, 0.0])
+    tail = np.array([-0.005, -0.005])
+    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
+    for k in range(1, 6):
+        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * 5e-5 * east, east))
+    assert prediction.formulation == values.get("formulation", "rod")
+    assert prediction.solver == values.get("solver", "banded")
+    assert np.isfinite(prediction.positions).all()
+    assert prediction.residual < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        (
+            scene_with(Disc((0.0, 0.0), 1e-3), Disc((0.01, 0.0), 1e-4)),
+            r"scene\.shape_1: got 0\.0001, .* half of a segment",
+        ),
+        (scene_with(polygon(0.0, 0.0, 0.01, 0.0, 0.01, 3e-4, 0.0, 3e-4)), r"scene\.shape_0: .* half of a segment"),
+        (scene_with(diameter=0.005), r"scene\.dish\.diameter: got 0\.005, .*more than 0\.00633333 m, two segments"),
+    ],
+)
+def test_a_scene_that_the_segments_do_not_resolve_is_refused(scene: Scene, words: str):
+    settings = made(segments=25 if scene.shapes else 6)
+    with pytest.raises(ConfigurationError, match=words):
+        ThreadPredictor(settings.thread(), scene)
+    with pytest.raises(ConfigurationError, match=words):
+        settings.predictor(scene)
+    ThreadPredictor(made(segments=100).thread(), scene)
+
+
+def test_the_attachments_velocity_is_the_rate_of_its_place():
+    settings, velocity, rate, step = made(attachment_offset=[0.01, -0.005]), np.array([2e-3, -1e-3]), 3.0, 1e-6
+
+    def after(time: float) -> NeedlePose:
+        heading = np.array([np.cos(0.4 + rate * time), np.sin(0.4 + rate * time)])
+        return settings.attachment_pose(
+            NeedlePose(1.0 + time, time * velocity, heading, motion=NeedleMotion(velocity, rate))
+        )
+
+    motion = after(0.0).motion
+    assert motion is not None
+    np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
+
+
+def kernels() -> int:
+    """Return how many kernels of ours are compiled, or loaded from the cache, by now."""
+    # By their types: to look at what a weak proxy stands for raises once that is gone.
+    ours = (found for found in gc.get_objects() if issubclass(type(found), CPUDispatcher))
+    return sum(len(found.signatures) for found in ours if found.py_func.__module__.startswith("magnetosuture_thread"))
+
+
+@pytest.mark.parametrize("formulation", ["rod", "paper"])
+def test_no_kernel_is_compiled_once_the_predictor_is_made(formulation: str):
+    """Else the first callback, or the first contact in the middle of an operation, would wait for a compiler."""
+    predictor = made(formulation=formulation).predictor(
+        scene_with(SQUARE, Disc((-0.009, 0.002), 0.0015), diameter=0.05)
+    )
+    before = kernels()
+    east, tail = np.array([1.0, 0.0]), np.array([-0.001, 0.0])
+    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
+    touched = False
+    for k in range(1, 200):
+        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * np.array([0.0, 6e-5]), east))
+        touched = touched or bool(any((prediction.margins[name].clearance < 1e-5).any() for name in SOLID))
+    assert touched
+    assert kernels() == before
