@@ -27,8 +27,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND

@@ -22,9 +22,9 @@ from rclpy.executors import SingleThreadedExecutor
 
 from benchmarks.attack.hostile import Attacker
 from benchmarks.attack.probe import READY, STOP, UNARMED
+from magnetosuture_thread.commands.live import START_TIMEOUT, OwnGraph, own_graph
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, RIG_NODES, SCENE_SERVER
-from magnetosuture_thread.jobs.graph import START_TIMEOUT, OwnGraph, own_graph
 from magnetosuture_thread.setups import read_setup
 
 SETUP = "petri_35mm_polyamide"

@@ -26,9 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.bridge.drive_watch import DriveWatch
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.setups import read_setup

@@ -22,8 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
 

@@ -1,0 +1,282 @@
+"""Replaying bags through the live graph: nodes in processes of their own, outputs recorded."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import rclpy
+from magnetosuture_msgs.msg import PredictedThread
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+
+from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.live import replay_live
+from magnetosuture_thread.commands.render import render_bag
+from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
+from magnetosuture_thread.interface import (
+    ESTIMATED_THREAD,
+    MARGINS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    THREAD_OBSERVATION,
+    Channel,
+)
+from magnetosuture_thread.setups import read_setup
+
+pytestmark = pytest.mark.whole_graph
+
+
+@pytest.fixture(scope="module")
+def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
+    """Return a bag of poses of two seconds."""
+    path = tmp_path_factory.mktemp("poses") / "pull"
+    render_bag(straight_pull, read_setup("petri_35mm_polyamide"), path, pose_noise=1e-5)
+    return path
+
+
+def test_a_bag_is_replayed_judged_and_recorded_as_offline(short_bag: Path, tmp_path: Path):
+    logged: list[str] = []
+    shares: list[float] = []
+    summary = replay_live(short_bag, tmp_path / "out", log=logged.append, progress=shares.append)
+    assert "straight_pull" in summary.simulated
+    assert (summary.frames, summary.tracked, summary.predicted) == (30, 28, 28)  # the first in the third frame
+    assert summary.commands == 30
+    assert summary.driven > 0  # all of them, unless the machine is so loaded that the watchdog bites
+    assert summary.error_truth is not None
+    assert summary.error_truth["maximum"] < 1.0
+    assert {margin.kind for margin in summary.least_margins} == {"connectivity", "compression", "wall"}
+    assert summary.residual < 1e-5
+    assert all(spread is not None and spread.median > 0.0 for spread in summary.latency.values())
+    assert set(summary.dropped.values()) == {0}
+    assert any("this machine only" in line for line in logged)
+    assert shares[-1] == pytest.approx(1.0, abs=0.05)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["tracked"] == 28
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["bag", "logs", "summary.json", "summary.png"]
+    recorded = Bag(tmp_path / "out" / "bag")
+    assert recorded.damage is None
+    assert recorded.counts["/coils/currents"] >= 30
+    # It was played in real time, not all at once, from the bag's beginning on.
+    times = [record.time for record in recorded.records({"/thread/predicted"})]
+    assert (times[-1] - times[0]) * 1e-9 > 0.5
+    assert min(record.time for record in recorded.records(set(recorded.topics))) >= Bag(short_bag).start
+    replay_offline(short_bag, tmp_path / "offline")
+    agree(tmp_path / "out", tmp_path / "offline", predictions=28)
+
+
+COMPARED = (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION, PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS)
+
+
+def agree(live: Path, offline: Path, predictions: int) -> None:
+    """Check that both replays made the same of a bag, to the last bit; but for the times that steps took."""
+    made = [content(live), content(offline)]
+    for channel in COMPARED:
+        ours, theirs = ({key: what for key, what in each.items() if key[0] == channel} for each in made)
+        assert ours == theirs
+    assert sum(key[0] == PREDICTED_THREAD for key in made[0]) == predictions
+    assert sum(key[0] == ESTIMATED_THREAD for key in made[0]) >= predictions
+
+
+def content(output: Path) -> dict[tuple[Channel, int], bytes]:
+    """Return what a replay said of each stamp, without times and without what waited for the thread to be seen."""
+    bag, store = Bag(output / "bag"), typestore()
+    found = {}
+    for channel in COMPARED:
+        for each in bag.records({channel.recorded}):
+            message = each.decode()
+            if channel == PREDICTED_THREAD:
+                message.step_time = 0.0
+            if channel != MARGINS or message.valid:
+                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                found[channel, stamp] = bytes(store.serialize_cdr(message, channel.type_name))
+    return found
+
+
+@contextmanager
+def started(command: list[str], folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """Give a process that is ended by Ctrl-C if the test fails: one that goes on disturbs all others."""
+    with subprocess.Popen(
+        command,
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A test run in a shell's background inherits an ignored SIGINT; a user's terminal does not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=90)
+
+
+def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag: Path, tmp_path: Path):
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(pose_bag)]
+    with started([*command, "--output", "out", "--loop"], tmp_path) as process:
+        assert process.stdout is not None
+        lines = iter(process.stdout)
+        count_diagnostics = next(line for line in lines if "to pause: " in line)
+        found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", count_diagnostics)
+        assert found is not None
+        with Watch(int(found[1]), found[2]) as watch:
+            watch.pause(True)
+            stood = watch.newest()
+            watch.spin(0.5)
+            assert watch.newest() == stood
+            watch.pause(False)
+            watch.spin_until(lambda: watch.newest() > stood)
+            assert any("playing on until Ctrl-C" in line for line in lines)
+            assert not (tmp_path / "out").exists()
+            watch.spin_until(lambda: bool(watch.predicted) and watch.predicted[-1] < max(watch.predicted))
+            again = len(watch.predicted)
+            watch.spin_until(lambda: len(watch.predicted) > again + 10)
+            assert sorted(watch.predicted[again:]) == watch.predicted[again:]
+        process.send_signal(signal.SIGINT)
+        shown, errors = process.communicate(timeout=90)
+    assert errors == ""
+    assert process.returncode == 0
+    assert "results: out" in shown
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert Bag(tmp_path / "out" / "bag").counts["/thread/predicted"] == 60
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["predicted"] == 60
+    assert not (tmp_path / "out" / "logs" / "vision_tracker.log").exists()  # poses need no tracker
+    replay_offline(pose_bag, tmp_path / "offline")
+    agree(tmp_path / "out", tmp_path / "offline", predictions=60)
+
+
+class Watch:
+    """Somebody on another process's domain, who watches a replay and pauses it."""
+
+    def __init__(self, domain: int, service: str) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain, args=[])
+        self._node = rclpy.create_node("watch", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._clocks: list[int] = []
+        self.predicted: list[int] = []
+        self._node.create_subscription(Clock, "/clock", self._on_clock, qos_profile_sensor_data)
+        self._node.create_subscription(PredictedThread, "/thread/predicted", self._on_thread, 10)
+        self._client = self._node.create_client(SetBool, service)
+
+    def __enter__(self) -> Watch:
+        """Wait for the replay."""
+        self.spin_until(lambda: self._client.service_is_ready() and bool(self._clocks))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def newest(self) -> int:
+        """Return the simulated time last heard [ns]."""
+        return self._clocks[-1]
+
+    def pause(self, still: bool) -> None:
+        """Call the service, and take what was said before its answer."""
+        future = self._client.call_async(SetBool.Request(data=still))
+        self.spin_until(future.done)
+        assert future.result().success
+        self.spin(0.2)
+
+    def spin(self, duration: float) -> None:
+        """Listen for a while [s]."""
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def spin_until(self, condition: Callable[[], bool]) -> None:
+        """Listen until a condition holds."""
+        end = time.monotonic() + 90.0
+        while not condition():
+            assert time.monotonic() < end
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def _on_clock(self, message: Clock) -> None:
+        self._clocks.append(message.clock.sec * 10**9 + message.clock.nanosec)
+
+    def _on_thread(self, message: PredictedThread) -> None:
+        self.predicted.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+
+def test_what_is_too_short_to_go_round_is_refused(short_bag: Path, tmp_path: Path):
+    with pytest.raises(BagError, match=r"gives 0\.97 s to play over and over; expected 1\.5 s or more"):
+        replay_live(short_bag, tmp_path / "out", loop=True)
+    assert not (tmp_path / "out").exists()
+
+
+def rewritten(bag: Path, folder: Path, types: dict[str, str], notes: dict[str, str]) -> Path:
+    """Write a bag again with other types for its topics; topics without a type are left out."""
+    with BagWriter(folder, notes) as writer:
+        for topic, type_name in types.items():
+            writer.add_topic(topic, type_name)
+        for render_bag in Bag(bag).records(set(types)):
+            writer.write(render_bag.topic, render_bag.time, render_bag.data)
+    return folder
+
+
+FRAMES, COMMANDS = "/camera/image_raw/compressed", "/needle/servo_cv"
+COMPRESSED, TWIST = "sensor_msgs/msg/CompressedImage", "geometry_msgs/msg/TwistStamped"
+
+
+def test_bad_bags_are_refused_before_anything_is_written(short_bag: Path, tmp_path: Path):
+    (tmp_path / "text.mcap").write_text("hello, this is no bag")
+    (tmp_path / "empty.mcap").write_text("")
+    blind = rewritten(short_bag, tmp_path / "blind", {COMMANDS: TWIST}, {})
+    wrong = rewritten(short_bag, tmp_path / "wrong", {FRAMES: "std_msgs/msg/Header", COMMANDS: TWIST}, {})
+    odd = rewritten(short_bag, tmp_path / "odd", {FRAMES: COMPRESSED, COMMANDS: "std_msgs/msg/Header"}, {})
+    before = set(tmp_path.iterdir())
+    for bag, words in (
+        (tmp_path / "missing", "does not exist"),
+        (tmp_path / "text.mcap", "text.mcap"),
+        (tmp_path / "empty.mcap", "empty.mcap"),
+        (blind, f"has no messages on {FRAMES}"),
+        (wrong, f"topic {FRAMES} is of type std_msgs/msg/Header, expected {COMPRESSED}"),
+        (odd, f"topic {COMMANDS} is of type std_msgs/msg/Header, expected"),
+    ):
+        with pytest.raises(BagError) as caught:
+            replay_live(bag, tmp_path / "out")
+        assert words in str(caught.value)
+        assert bag.name in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_replay_that_is_terminated_ends_its_nodes_and_leaves_nothing(tmp_path: Path):
+    example = Path(__file__).parents[2] / "examples" / "post_wrap"
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "replay", str(example), "--output", "out"]
+    with started(command, tmp_path) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("playing"):
+                break
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        assert len(children) == 2  # tracker and model are in one
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=90)
+    assert process.returncode == 1
+    assert "interrupted" in errors
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
