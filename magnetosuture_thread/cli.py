@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
-from magnetosuture_thread.commands.command import FAILED, WRONG_USE, check_outputs, describe, make_console
+from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe, make_console
 from magnetosuture_thread.errors import missing_module
 
 DESCRIPTION = """\
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def run() -> int:
         options = make_parser(given[:1]).parse_args(given)
         check_outputs(options)
-        return int(options.run(options))
+        return int(options.run(options, Terminal()))
 
     return exit_code(run)
 

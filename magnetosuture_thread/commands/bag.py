@@ -17,12 +17,10 @@ from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.commands.command import (
     DONE,
     FAILED,
+    Terminal,
     add_actions,
     add_remap,
-    make_console,
-    make_log,
     output_file,
-    progress,
     write_json,
 )
 from magnetosuture_thread.commands.output import whole_folder
@@ -49,25 +47,24 @@ def add(parser: argparse.ArgumentParser) -> None:
     repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
 
 
-def run_check(options: argparse.Namespace) -> int:
+def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
     """Report what a bag holds, and whether it is intact.
 
     The whole bag is read: every checksum, and every message's time and stamp. For each topic: its type, how
     many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
     went back; the types follow. What is damaged is reported, with what is lost; all else is shown as it can be read.
     """
-    console = make_console()
-    with progress(console, "bag check") as advance:
+    with terminal.progress("bag check") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share))
-    console.print(_table(found))
+    terminal.print(_table(found))
     for line in _lines(found):
-        make_log(console)(line)
+        terminal.log(line)
     write_json(options.json, found)
     return FAILED if found["damage"] or found["refused"] or found["unverified"] else DONE
 
 
-def run_repair(options: argparse.Namespace) -> int:
+def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
     """Write every intact message of a bag into a new one.
 
     Messages, their times and numbers, definitions, attachments, metadata records and notes stay as they are; chunks,
@@ -76,9 +73,8 @@ def run_repair(options: argparse.Namespace) -> int:
 
     A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others.
     """
-    console = make_console()
-    log = make_log(console)
-    with progress(console, "bag repair") as advance:
+    log = terminal.log
+    with terminal.progress("bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         with whole_folder(options.output) as folder:
             name = options.output.name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -19,14 +19,12 @@ from magnetosuture_thread.calibration.result import CalibrationResult
 from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.commands.command import (
     DONE,
+    Terminal,
     add_source,
     add_workers,
     bag_location,
     bag_selection,
-    make_console,
-    make_log,
     output_file,
-    progress,
     runs,
     write_json,
 )
@@ -70,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_source(parser, "the bags")
 
 
-def run_calibrate(options: argparse.Namespace) -> int:
+def run_calibrate(options: argparse.Namespace, terminal: Terminal) -> int:
     """Fit the thread's parameters to recorded bags.
 
     The parameters are the thread's bending stiffness over the liquid's drag, the drag's anisotropy, the intrinsic
@@ -88,39 +86,39 @@ def run_calibrate(options: argparse.Namespace) -> int:
     Ctrl-C ends it at any moment: the best so far is written, marked as such and without intervals, and the exit code
     is 130. Before there is any, nothing is written, and it is 1.
     """
-    console = make_console()
-    log = make_log(console)
-    start = StartOfFit(options.material, options.formulation, options.against, tuple(options.parameters))
-    with progress(console, "calibrate") as advance:
-        fit = fit_bags(
-            options.bags, start, bag_selection(options), options.workers, options.scheduler, log=log, progress=advance
-        )
+    chosen = FitOptions(**{field.name: getattr(options, field.name) for field in fields(FitOptions)})
+    with terminal.progress("calibrate") as advance:
+        fit = fit_bags(options.bags, chosen, bag_selection(options), terminal.log, advance)
     fit.write(options.output, options.picture)
     values = fit.result.to_json()
     write_json(options.json, values)
-    console.print(parameter_table(values))
-    console.print(bag_table(values))
+    terminal.print(parameter_table(values))
+    terminal.print(bag_table(values))
     for line in calibration_lines(values):
-        log(line)
-    log(f"parameters: {options.output}")
+        terminal.log(line)
+    terminal.log(f"parameters: {options.output}")
     return DONE if fit.result.finished else INTERRUPTED
 
 
 @dataclass(frozen=True)
-class StartOfFit:
-    """What is fitted, and from where.
+class FitOptions:
+    """What is fitted, from where, and by which processes.
 
     Attributes:
         material: a name of `MATERIALS`, or the beginning of one; the setup's if empty.
         formulation: rod or paper; the setup's if empty.
         against: what predictions are compared with, `seen` (measured) or `truth`.
         parameters: names of settings to fit; all that the formulation has if empty.
+        workers: processes.
+        scheduler: address of a Dask scheduler, whose workers replay the bags in place of those.
     """
 
     material: str = ""
     formulation: str = ""
     against: str = "seen"
-    parameters: tuple[str, ...] = ()
+    parameters: Sequence[str] = ()
+    workers: int = 1
+    scheduler: str = ""
 
     def settings_of(self, setup: Setup) -> ThreadModelSettings:
         """Return a setup's settings of the thread, with material and formulation where they are not empty.
@@ -200,31 +198,24 @@ def calibrate_bags(
         ConfigurationError: the setup, the material or a parameter cannot be used.
         InvalidInputError: the bags are of different threads.
     """
-    start = StartOfFit(material, formulation, against, tuple(parameters))
-    fit = fit_bags(bags, start, selection, workers, scheduler, log=log, progress=progress)
+    options = FitOptions(material, formulation, against, parameters, workers, scheduler)
+    fit = fit_bags(bags, options, selection, log, progress)
     fit.write(output)
     return fit.result
 
 
 def fit_bags(
-    bags: Sequence[Path],
-    start: StartOfFit,
-    selection: BagSelection,
-    workers: int = 1,
-    scheduler: str = "",
-    *,
-    log: Log,
-    progress: Progress,
+    bags: Sequence[Path], options: FitOptions, selection: BagSelection, log: Log, progress: Progress
 ) -> ThreadFit:
     """Fit a thread's parameters to bags; see `calibrate_bags`."""
-    passages, settings = _read_runs(bags, start, selection, log, lambda share: progress(READING_SHARE * share))
+    passages, settings = _read_runs(bags, options, selection, log, lambda share: progress(READING_SHARE * share))
     best = BestSettings()
     try:
-        with replay_pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:
+        with replay_pool(passages, min(options.workers, os.cpu_count() or 1), options.scheduler) as run:
             found = calibrate(
                 passages,
                 settings,
-                start.parameters,
+                options.parameters,
                 run_tasks=run,
                 best=best,
                 progress=lambda share: progress(READING_SHARE + (1.0 - READING_SHARE) * share),
@@ -239,7 +230,7 @@ def fit_bags(
 
 
 def _read_runs(
-    bags: Sequence[Path], start: StartOfFit, selection: BagSelection, log: Log, progress: Progress
+    bags: Sequence[Path], options: FitOptions, selection: BagSelection, log: Log, progress: Progress
 ) -> tuple[list[RecordedRun], ThreadModelSettings]:
     """Return recorded runs of one thread, and the settings of the thread that a fit starts from."""
     passages: list[RecordedRun] = []
@@ -251,8 +242,8 @@ def _read_runs(
             progress((index + share) / len(bags))
 
         with open_bag(path, log, **selection) as given:
-            its = start.settings_of(given.setup)
-            choose_parameters(its.formulation, start.parameters)  # refuses wrong names before the bag is read
+            its = options.settings_of(given.setup)
+            choose_parameters(its.formulation, options.parameters)  # refuses wrong names before the bag is read
             own.append(_own_setup(given))
             for name in ("material", "thread_length"):
                 value, expected = getattr(own[-1].model, name), getattr(own[0].model, name)
@@ -265,7 +256,7 @@ def _read_runs(
             measured = given.observations(advance)
             simulated = given.recording.notes.get("simulated", "")
             try:
-                passage = read_run(str(path), measured, its, start.against, simulated, given.setup.scene)
+                passage = read_run(str(path), measured, its, options.against, simulated, given.setup.scene)
             except BagError:
                 if problem := measured.thread_problem():
                     raise BagError(path, problem) from None

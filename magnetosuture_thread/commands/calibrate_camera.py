@@ -11,9 +11,8 @@ import numpy as np
 
 from magnetosuture_thread.commands.command import (
     DONE,
+    Terminal,
     add_frames,
-    make_console,
-    make_log,
     number_argument,
     output_file,
     runs,
@@ -47,7 +46,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--output", type=output_file, required=True, metavar="FILE", help="parameter file to write")
 
 
-def run_calibrate_camera(options: argparse.Namespace) -> int:
+def run_calibrate_camera(options: argparse.Namespace, terminal: Terminal) -> int:
     """Find where the dish is in the camera's image.
 
     The result is its centre, the scale and, by markers, the rotation. FILE gets a section vision_tracker of a ROS 2
@@ -60,18 +59,22 @@ def run_calibrate_camera(options: argparse.Namespace) -> int:
     With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
     node.
     """
-    log = make_log(make_console())
     markers = tuple(options.markers) if options.markers else None
-    given = {"needle": options.needle, "remap": dict(options.remap), "camera_info": options.camera_info, "log": log}
+    given = {
+        "needle": options.needle,
+        "remap": dict(options.remap),
+        "camera_info": options.camera_info,
+        "log": terminal.log,
+    }
     found = calibrate_camera(options.frames, options.dish_diameter, options.output, markers, **given)
     u, v = found.view.centre_px
     scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
-    log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
+    terminal.log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
     by = f"markers, residual {found.residual_px:.2f} px" if markers else "the dish's rim"
-    log(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
+    terminal.log(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
     if found.needle_length is not None:
-        log(f"the needle is {1e3 * found.needle_length:.3f} mm long")
-    log(f"parameters: {options.output}")
+        terminal.log(f"the needle is {1e3 * found.needle_length:.3f} mm long")
+    terminal.log(f"parameters: {options.output}")
     return DONE
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.coils.calibration_fit import CalibrationFit, fit_calibration, read_measurements
-from magnetosuture_thread.commands.command import DONE, make_console, make_log, output_file, runs
+from magnetosuture_thread.commands.command import DONE, Terminal, output_file, runs
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.errors import BagError
 
@@ -29,7 +29,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
 
 
-def run_calibrate_coils(options: argparse.Namespace) -> int:
+def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
     """Find the coils' properties from probe measurements.
 
     The model of the coils is fitted to what a probe measured in the dish, and written as a calibration, which the
@@ -41,19 +41,17 @@ def run_calibrate_coils(options: argparse.Namespace) -> int:
     ten places or more for each coil. Some lines with a current of 0 tell the background of earth and probe
     apart, and so do both directions of current.
     """
-    console = make_console()
-    log = make_log(console)
     found = calibrate_coils(options.measurements, options.output, options.name).to_json()
-    console.print(_coil_table(found))
+    terminal.print(_coil_table(found))
     x, y = (1e6 * value for value in found["background"])
     line, worst = found["worst"]
     residual = f"{found['readings']} readings, residual {1e6 * found['residual']:.1f} uT"
-    log(f"{residual}, background {x:.1f}, {y:.1f} uT")
-    log(f"the largest difference, {1e6 * worst:.1f} uT, is in line {line}")
+    terminal.log(f"{residual}, background {x:.1f}, {y:.1f} uT")
+    terminal.log(f"the largest difference, {1e6 * worst:.1f} uT, is in line {line}")
     for coil in found["coils"]:
         if coil["poor"]:
-            log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
-    log(f"calibration: {options.output}")
+            terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
+    terminal.log(f"calibration: {options.output}")
     return DONE
 
 

@@ -37,11 +37,9 @@ from magnetosuture_thread.campaign.run import (
 from magnetosuture_thread.commands.command import (
     DONE,
     FAILED,
+    Terminal,
     add_workers,
     count_argument,
-    make_console,
-    make_log,
-    progress,
     runs,
 )
 from magnetosuture_thread.commands.output import whole_folder
@@ -86,7 +84,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
 
 
-def run_campaign(options: argparse.Namespace) -> int:
+def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
     """Run an autonomous procedure in the simulated closed loop, once for each seed.
 
     Rig, the tracker's noise or the camera and tracker themselves, estimator, planner and coil bridge run in one process
@@ -98,12 +96,11 @@ def run_campaign(options: argparse.Namespace) -> int:
     With --scheduler and --bags, DIR must be a folder that all workers have.
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
     """
-    console = make_console()
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     given = {name: getattr(options, name) for name in ("setup", "camera", "bags", "workers", "scheduler")}
-    with progress(console, "campaign") as advance:
+    with terminal.progress("campaign") as advance:
         result = simulate_campaign(
-            options.procedure, seeds, options.output, log=make_log(console), progress=advance, **given
+            options.procedure, seeds, options.output, log=terminal.log, progress=advance, **given
         )
     title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
     table = Table(title=f"{title} (simulated)", title_justify="left", title_style="bold")
@@ -121,8 +118,8 @@ def run_campaign(options: argparse.Namespace) -> int:
             f"{figures.longest_rest_s:.2f}",
             f"{figures.wrap_degrees:.0f}",
         )
-    console.print(table)
-    console.print(f"report: {options.output / PAGE}", soft_wrap=True)
+    terminal.print(table)
+    terminal.print(f"report: {options.output / PAGE}", soft_wrap=True)
     return FAILED if result.died else DONE
 
 

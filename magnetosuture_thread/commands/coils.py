@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from magnetosuture_thread.commands.command import DONE, make_console, make_log, namespace_argument, runs
+from magnetosuture_thread.commands.command import DONE, Terminal, namespace_argument, runs
 from magnetosuture_thread.nodes.clients import CoilClient
 
 ACTIONS = ("state", "arm", "disarm", "stop", "reset", "configure", "activate", "deactivate", "cleanup")
@@ -17,7 +17,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the bridge")
 
 
-def run_coils(options: argparse.Namespace) -> int:
+def run_coils(options: argparse.Namespace, terminal: Terminal) -> int:
     """Arm, disarm, stop or reset the running coil bridge.
 
     The command acts on the coil bridge that runs on this ROS domain, and shows its state.
@@ -33,13 +33,12 @@ def run_coils(options: argparse.Namespace) -> int:
     The same by any ROS 2 tool: services coils/arm (std_srvs/SetBool), coils/emergency_stop and coils/reset
     (std_srvs/Trigger).
     """
-    log = make_log(make_console())
     with CoilClient(options.namespace) as client:
         problem = "" if options.action == "state" else client.execute(options.action)
         if problem:
-            log(f"warning: {problem}")
+            terminal.log(f"warning: {problem}")
         state = client.state()
     width = max(len(name) for name in state)
     for name, value in state.items():
-        log(f"{name:{width}}  {value}")
+        terminal.log(f"{name:{width}}  {value}")
     return DONE

@@ -7,7 +7,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -26,7 +26,7 @@ STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
 EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
 OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
 
-Run: TypeAlias = Callable[[argparse.Namespace], int]
+Run: TypeAlias = "Callable[[argparse.Namespace, Terminal], int]"
 
 
 def describe(parser: argparse.ArgumentParser, text: str) -> None:
@@ -40,7 +40,8 @@ def runs(parser: argparse.ArgumentParser, run: Run) -> None:
 
     Args:
         parser: that has no arguments yet.
-        run: the command, called with the options; returns the exit code. Its docstring is the text under --help.
+        run: the command, called with options and terminal; returns the exit code. Its docstring is the text under
+            --help.
     """
     describe(parser, inspect.getdoc(run) or "")
     parser.set_defaults(run=run)
@@ -244,6 +245,23 @@ def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+class Terminal:
+    """What a command shows while it runs and when it is done.
+
+    Attributes:
+        log: called with a line for a person, which is printed as it is, however long.
+        print: called with a table.
+    """
+
+    def __init__(self) -> None:
+        self._console = make_console()
+        self.log, self.print = make_log(self._console), self._console.print
+
+    def progress(self, name: str) -> AbstractContextManager[Callable[[float], None]]:
+        """Show a progress bar; see `progress`."""
+        return progress(self._console, name)
 
 
 def write_json(path: Path | None, figures: Any) -> None:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from magnetosuture_thread.coils.coil_system import CoilSystem
-from magnetosuture_thread.commands.command import DONE, make_console, runs
+from magnetosuture_thread.commands.command import DONE, Terminal, runs
 from magnetosuture_thread.compiled import compilations
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.session import compile_planning
@@ -24,21 +24,21 @@ def add(parser: argparse.ArgumentParser) -> None:
     runs(parser, run_compile)
 
 
-def run_compile(options: argparse.Namespace) -> int:
+def run_compile(options: argparse.Namespace, terminal: Terminal) -> int:
     """Compile the functions that every node runs, so that nodes start at once.
 
     Compiled functions are cached beside the installed package, or in the user's cache where that cannot be written. A
     node compiles what the cache does not have when it first starts on a machine; this does it for all nodes beforehand,
     after an installation or an update.
     """
-    console, began = make_console(), time.perf_counter()
+    began = time.perf_counter()
     steps = kernel_steps()
     for number, (name, load) in enumerate(steps.items(), 1):
         started, before = time.perf_counter(), compilations()
         load()
         what = "compiled" if compilations() > before else "cached"
-        console.print(f"{number} of {len(steps)}  {name}: {what}, {time.perf_counter() - started:.0f} s")
-    console.print(f"all functions are compiled, {time.perf_counter() - began:.0f} s")
+        terminal.print(f"{number} of {len(steps)}  {name}: {what}, {time.perf_counter() - started:.0f} s")
+    terminal.print(f"all functions are compiled, {time.perf_counter() - began:.0f} s")
     return DONE
 
 

@@ -20,8 +20,7 @@ from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.command import (
     DONE,
-    make_console,
-    make_log,
+    Terminal,
     namespace_argument,
     runs,
     whole_number,
@@ -74,7 +73,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
 
 
-def run_console(options: argparse.Namespace) -> int:
+def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
     """Serve the operator's page.
 
     It shows the dish with needle and thread, the margins and the state of all nodes; the needle is jogged by arrow
@@ -95,7 +94,6 @@ def run_console(options: argparse.Namespace) -> int:
         raise ConfigurationError("--namespace", options.namespace, "none without --graph, as no other graph is joined")
     options.token = options.token or os.environ.pop(TOKEN, None) or None  # no node gets it
     served = {name: getattr(options, name) for name in SERVED if getattr(options, name) is not None}
-    log = make_log(make_console())
 
     def settings(setup: Setup) -> ConsoleSettings:
         return from_mapping(ConsoleSettings, {**to_mapping(setup.console), **served})
@@ -106,23 +104,23 @@ def run_console(options: argparse.Namespace) -> int:
         if options.graph:
             setup = read_setup(name)
             graph = ConsoleGraph(stack.enter_context(joined(namespace=options.namespace)), settings(setup))
-            host = RecordingHost(graph, setup, options.record, log)
+            host = RecordingHost(graph, setup, options.record, terminal.log)
         elif options.replay is not None:
-            source = GraphInput(stack.enter_context(open_bag(options.replay, log, setup_name=options.setup)))
+            source = GraphInput(stack.enter_context(open_bag(options.replay, terminal.log, setup_name=options.setup)))
             source.given.check_loop()
             shown = settings(source.given.setup)
             shown = replace(shown, image_transport=source.transport) if source.transport else shown
             place = _place(stack)
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
-            host = ReplayHost(graph, source, place, log)
-            log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
+            host = ReplayHost(graph, source, place, terminal.log)
+            terminal.log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
         else:
             shown = settings(read_setup(name))
             place = _place(stack)
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
-            host = SimulatedHost(graph, name, place, options.record, log)
-            log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
-        asyncio.run(_serve(graph, host, log))
+            host = SimulatedHost(graph, name, place, options.record, terminal.log)
+            terminal.log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
+        asyncio.run(_serve(graph, host, terminal.log))
     return DONE
 
 

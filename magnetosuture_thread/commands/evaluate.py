@@ -16,16 +16,14 @@ from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.commands.command import (
     DONE,
     FAILED,
+    Terminal,
     add_source,
     add_span,
     add_workers,
     bag_location,
     bag_selection,
     count_argument,
-    make_console,
-    make_log,
     output_file,
-    progress,
     runs,
     write_json,
 )
@@ -98,7 +96,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder")
 
 
-def run_evaluate(options: argparse.Namespace) -> int:
+def run_evaluate(options: argparse.Namespace, terminal: Terminal) -> int:
     """Score the thread model on bags, or on reference trajectories.
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
@@ -125,8 +123,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             raise ConfigurationError(f"--{name}", str(given), f"nothing: it is only {why}")
     if is_bags and options.output is None:
         raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
-    console = make_console()
-    with progress(console, "evaluate") as advance:
+    with terminal.progress("evaluate") as advance:
         if not is_bags:
             evaluation = _score_references(options, advance)
         else:
@@ -137,16 +134,16 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 formulation=options.formulation or "",
                 workers=options.workers,
                 scheduler=options.scheduler,
-                log=make_log(console),
+                log=terminal.log,
                 progress=advance,
                 **bag_selection(options),
             )
     if not is_bags:
-        console.print(evaluation_table(evaluation))
+        terminal.print(evaluation_table(evaluation))
         write_json(options.json, evaluation.to_mapping())
         return DONE
-    console.print(bags_table(rows))
-    make_log(console)(f"results: {options.output}")
+    terminal.print(bags_table(rows))
+    terminal.log(f"results: {options.output}")
     return FAILED if any(row["problem"] for row in rows) else DONE
 
 

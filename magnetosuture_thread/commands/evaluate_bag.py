@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.commands.observations import NOT_FOUND, measure_step, predictions
@@ -25,7 +26,6 @@ from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, F
 from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.tables import Row, row_of
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import CURRENTS, GROUND_TRUTH_THREAD, MEASURED_THREAD, NEEDLE_POSE, PREDICTED_THREAD
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.texts import one_line
 from magnetosuture_thread.thread_model.session import WAITING
@@ -33,7 +33,7 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.workers import Log, Progress
 
 SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")
-LATENT = dict(zip((NEEDLE_POSE, PREDICTED_THREAD, CURRENTS), STAGES, strict=True))
+LATENT = dict(zip((interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.CURRENTS), STAGES, strict=True))
 MAX_LATENCY = 10.0  # s; a median beyond is of two clocks
 MAX_WAITING = 600  # recorded predictions that may wait for their frame
 
@@ -74,7 +74,7 @@ def evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Ro
     with open_bag(task.path, log, **task.selection) as given:
         recording, span = given.recording, (given.start, given.duration)
         model = replace(given.setup.model, formulation=task.formulation or given.setup.model.formulation)
-        is_recorded = bool(recording.counts.get(PREDICTED_THREAD.recorded))
+        is_recorded = bool(recording.counts.get(interface.PREDICTED_THREAD.recorded))
         targets = _targets(given, task.against)
         metrics = RunMetrics(model.thread_length, recording.start, targets, recorded=is_recorded)
         seen = given.observations(lambda share: progress(0.95 * share))
@@ -116,11 +116,11 @@ def _targets(given: BagInput, against: str) -> list[str]:
     """
     counts = given.recording.counts
     there = {
-        "truth": bool(counts.get(GROUND_TRUTH_THREAD.recorded)),
-        "seen": given.source == "camera" or bool(counts.get(MEASURED_THREAD.recorded)),
+        "truth": bool(counts.get(interface.GROUND_TRUTH_THREAD.recorded)),
+        "seen": given.source == "camera" or bool(counts.get(interface.MEASURED_THREAD.recorded)),
     }
     if against != "auto" and not there[against]:
-        topic = GROUND_TRUTH_THREAD if against == "truth" else MEASURED_THREAD
+        topic = interface.GROUND_TRUTH_THREAD if against == "truth" else interface.MEASURED_THREAD
         raise BagError(given.recording.path, f"has no messages on {topic.recorded} ({topic.type_name})")
     return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
 
@@ -203,7 +203,7 @@ def live_figures(recording: Recording, start: float, duration: float | None) -> 
 
 def _stamp(record: RecordedMessage) -> int:
     """Return the stamp of what a message answers [ns]; 0 for currents that answer no command or are broken."""
-    if record.topic != CURRENTS.recorded:
+    if record.topic != interface.CURRENTS.recorded:
         return stamp_of(record)
     try:
         message = record.decode()
@@ -222,8 +222,8 @@ class RecordedPredictions:
     """
 
     def __init__(self, recording: Recording, start: float, duration: float | None) -> None:
-        there = bool(recording.counts.get(PREDICTED_THREAD.recorded))
-        channels = [PREDICTED_THREAD] if there else []
+        there = bool(recording.counts.get(interface.PREDICTED_THREAD.recorded))
+        channels = [interface.PREDICTED_THREAD] if there else []
         self._records: Iterator[RecordedMessage] = recording.records(channels, start=start, duration=duration)
         self._held: dict[int, RecordedMessage] = {}
         self._latest = -1

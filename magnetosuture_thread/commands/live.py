@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.observations import CHANGING
@@ -20,24 +21,6 @@ from magnetosuture_thread.commands.replay import replay_summary, write_results
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
-from magnetosuture_thread.interface import (
-    CAMERA,
-    CAMERA_INFO,
-    CURRENTS,
-    GROUND_TRUTH_PULL,
-    GROUND_TRUTH_THREAD,
-    MATERIAL,
-    MEASURED_THREAD,
-    NEEDLE_COMMAND,
-    NEEDLE_POSE,
-    NODES,
-    PAUSE_REPLAY,
-    PROCESSES,
-    SCENE,
-    STANDBY_NODES,
-    THREAD_OBSERVATION,
-    Channel,
-)
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.diagnostics import COMPILING
@@ -56,7 +39,11 @@ POLL_PERIOD = 0.02  # s between two looks at the nodes
 
 # Arguments for the nodes, after `--ros-args`. Where two cores carry the whole graph and a recording besides, the bridge
 # leaves them more of it. Whatever a setup says for a launch, nobody would activate the nodes of a command.
-OWN = ("-p", "coil_bridge:rate:=100.0", *(p for name in STANDBY_NODES for p in ("-p", f"{name}:autostart:=active")))
+OWN = (
+    "-p",
+    "coil_bridge:rate:=100.0",
+    *(p for name in interface.STANDBY_NODES for p in ("-p", f"{name}:autostart:=active")),
+)
 # Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
 FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
 # A replayed bag never moves a needle, so its bridge may arm itself.
@@ -149,12 +136,19 @@ class GraphInput:
     def __init__(self, given: BagInput) -> None:
         self.given = given
         camera = given.recording.camera if given.source == "camera" else None
-        self.transport = next((transport for transport, channel in CAMERA.items() if channel == camera), "")
-        self.nodes = tuple(name for name in NODES if self.transport or name != "vision_tracker")
-        self.processes = PROCESSES if self.transport else self.nodes
-        source = (camera, CAMERA_INFO) if camera is not None else (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
-        possible = (*source, NEEDLE_COMMAND, MATERIAL)
-        self.channels: list[Channel] = [SCENE, *(c for c in possible if given.recording.counts.get(c.recorded))]
+        self.transport = next((transport for transport, channel in interface.CAMERA.items() if channel == camera), "")
+        self.nodes = tuple(name for name in interface.NODES if self.transport or name != "vision_tracker")
+        self.processes = interface.PROCESSES if self.transport else self.nodes
+        source = (
+            (camera, interface.CAMERA_INFO)
+            if camera is not None
+            else (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        )
+        possible = (*source, interface.NEEDLE_COMMAND, interface.MATERIAL)
+        self.channels: list[interface.Channel] = [
+            interface.SCENE,
+            *(c for c in possible if given.recording.counts.get(c.recorded)),
+        ]
 
     def arguments(self, qos: Path) -> list[str]:
         """Return the nodes' arguments.
@@ -177,14 +171,14 @@ class GraphInput:
         given = self.given
         # The scene comes first: the one that is in force in the bag, or else the setup's.
         data = packed_scene(given.begin, given.setup.scene)
-        yield RecordedMessage(SCENE.recorded, SCENE.type_name, given.begin, data)
+        yield RecordedMessage(interface.SCENE.recorded, interface.SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what came before about the thread is in force
-            earlier = [channel for channel in CHANGING if channel != SCENE]
+            earlier = [channel for channel in CHANGING if channel != interface.SCENE]
             for record in given.recording.records(earlier, duration=given.start):
                 yield replace(record, time=given.begin)
         version = given.setup.scene.version
         for record in given.recording.records(self.channels, start=given.start, duration=given.duration):
-            if record.topic == SCENE.recorded:
+            if record.topic == interface.SCENE.recorded:
                 before, version = version, str(record.decode().version)
                 if version == before:
                     continue
@@ -259,7 +253,7 @@ def replay_live(
                         live.wait_for_graph()
                         speed = f" at {rate:g} times the speed" if rate != 1.0 else ""
                         log(f"playing {given.duration:.1f} s{speed}")
-                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{PAUSE_REPLAY}"
+                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.PAUSE_REPLAY}"
                         log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
                         length = max(given.duration, 1e-9)
                         live.play(source.records(), lambda time: progress(min(1.0, time / length)))
@@ -303,10 +297,10 @@ def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> 
     """Compare the outputs with what the bag holds."""
     collector = GraphCollector(given.setup.model.thread_length)
     recorded, replayed = CurrentSeries(), CurrentSeries()
-    truth = GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL
-    expected = [c for c in (*truth, CURRENTS) if given.recording.counts.get(c.recorded)]
+    truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
+    expected = [c for c in (*truth, interface.CURRENTS) if given.recording.counts.get(c.recorded)]
     for record in given.recording.records(expected, start=given.start, duration=given.duration):
-        if record.topic == CURRENTS.recorded:
+        if record.topic == interface.CURRENTS.recorded:
             recorded.add(record.decode())
         else:
             collector.add(record.topic, record.decode())
@@ -314,15 +308,15 @@ def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> 
     for record in made.records(set(made.topics)):
         message = record.decode()
         collector.add(record.topic, message)
-        if record.topic == CURRENTS.recorded:
+        if record.topic == interface.CURRENTS.recorded:
             replayed.add(message)
     metrics, losses = collector.metrics(given.recording.start), live.losses
-    frames = losses.played[NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
+    frames = losses.played[interface.NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
     if not len(metrics.series):
         health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
         things = "poses" if given.source == "poses" else "frames"
         raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
-    commands = live.published.get(NEEDLE_COMMAND.name, {})
+    commands = live.published.get(interface.NEEDLE_COMMAND.name, {})
     summary = replay_summary(
         given,
         metrics,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene, interface
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.configuration import from_mapping, to_mapping
@@ -24,18 +24,6 @@ from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import (
-    CAMERA,
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    GROUND_TRUTH_PULL,
-    GROUND_TRUTH_THREAD,
-    MATERIAL,
-    MEASURED_THREAD,
-    NEEDLE_POSE,
-    SCENE,
-    THREAD_OBSERVATION,
-)
 from magnetosuture_thread.messages.reading import (
     pose_deviation,
     read_force,
@@ -58,10 +46,10 @@ from magnetosuture_thread.workers import Progress
 MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a seen one beyond is not of this setup
 # Why frames and poses are refused, as it is counted.
 NOT_FOUND, BROKEN, NOT_NEWER = "no needle for sure", "a broken picture", "a stamp not newer than the last"
-CHANGING = (SCENE, MATERIAL)  # channels on which a bag records changes of scene and thread
+CHANGING = (interface.SCENE, interface.MATERIAL)  # channels on which a bag records changes of scene and thread
 _NOTHING, _NO_FORCE = np.empty((0, 2)), np.empty(0)
-_TRUE, _SEEN = GROUND_TRUTH_THREAD.recorded, MEASURED_THREAD.recorded
-_OBSERVED, _PULL = THREAD_OBSERVATION.recorded, GROUND_TRUTH_PULL.recorded
+_TRUE, _SEEN = interface.GROUND_TRUTH_THREAD.recorded, interface.MEASURED_THREAD.recorded
+_OBSERVED, _PULL = interface.THREAD_OBSERVATION.recorded, interface.GROUND_TRUTH_PULL.recorded
 # How a part of an observation is read, and what stands for one that is not valid.
 _READERS: dict[str, tuple[Callable[[RecordedMessage], Any], Any]] = {
     _TRUE: (read_path, _NOTHING),
@@ -79,7 +67,7 @@ def read_image(record: RecordedMessage) -> NDArray[np.uint8]:
         InvalidInputError: the image is broken.
     """
     message = record.decode()
-    if record.type_name == COMPRESSED_IMAGE.type_name:
+    if record.type_name == interface.COMPRESSED_IMAGE.type_name:
         return decode_image(message.data)
     return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
 
@@ -95,14 +83,14 @@ def chosen_source(recording: Recording, source: str) -> str:
     Raises:
         BagError: the bag does not hold what was asked for.
     """
-    has = {"camera": recording.camera is not None, "poses": bool(recording.counts.get(NEEDLE_POSE.recorded))}
+    has = {"camera": recording.camera is not None, "poses": bool(recording.counts.get(interface.NEEDLE_POSE.recorded))}
     for name in ("camera", "poses") if source == "auto" else (source,):
         if has[name]:
             return name
-    for channel in (*CAMERA.values(), NEEDLE_POSE):
+    for channel in (*interface.CAMERA.values(), interface.NEEDLE_POSE):
         if channel.recorded in recording.unfit:
             raise BagError(recording.path, recording.unfit[channel.recorded])
-    recording.require(NEEDLE_POSE if source == "poses" else COMPRESSED_IMAGE)
+    recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
     raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
 
 
@@ -149,13 +137,13 @@ class ObservationReader(Iterator[Observation]):
         self._recording, self._scene, self._length = recording, setup.scene, setup.model.thread_length
         self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
-        own = (NEEDLE_POSE, MEASURED_THREAD, THREAD_OBSERVATION)
+        own = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
         if self.source == "camera":
             assert recording.camera is not None
             warm_up()
             self._tracker = TrackerSession(setup.vision, setup.scene)
-            own = (recording.camera, CAMERA_INFO)
-        given = (GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL, *CHANGING, *own)
+            own = (recording.camera, interface.CAMERA_INFO)
+        given = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, *CHANGING, *own)
         channels = [channel for channel in given if recording.counts.get(channel.recorded)]
         begin = recording.start + round(start * 1e9)
         earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
@@ -181,7 +169,7 @@ class ObservationReader(Iterator[Observation]):
         """Return, once, the changes of scene and thread before the last observation."""
         changes, self._changes = self._changes, []
         for record in changes:
-            if record.topic == SCENE.recorded:
+            if record.topic == interface.SCENE.recorded:
                 self.on_record(stamp_of(record), record)
         return changes
 
@@ -204,7 +192,7 @@ class ObservationReader(Iterator[Observation]):
             elif record.topic in changing:
                 self._follow(record)
                 waiting.append(record)
-            elif record.topic == CAMERA_INFO.recorded:
+            elif record.topic == interface.CAMERA_INFO.recorded:
                 self._take_lens(record)
             else:
                 waiting.append(self._pose(record) if self._tracker is None else self._frame(record, self._tracker))
@@ -231,7 +219,7 @@ class ObservationReader(Iterator[Observation]):
 
     def _follow(self, record: RecordedMessage) -> None:
         """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
-        if record.topic != SCENE.recorded:
+        if record.topic != interface.SCENE.recorded:
             return
         try:
             scene = parse_scene_message(record.decode())
@@ -309,7 +297,7 @@ class ObservationReader(Iterator[Observation]):
         return Observation(
             stamp,
             np.asarray(seen.track.tail),
-            round_trip_heading(seen.track.heading, NEEDLE_POSE.name),
+            round_trip_heading(seen.track.heading, interface.NEEDLE_POSE.name),
             seen.centreline,
             processing=taken,
             observation=seen.track.observation,
@@ -418,7 +406,7 @@ def _take_changes(session: ThreadSession, given: ObservationReader) -> None:
     for record in given.changes():
         try:
             settings, scene = session.settings, session.scene
-            if record.topic == SCENE.recorded:
+            if record.topic == interface.SCENE.recorded:
                 scene = parse_scene_message(record.decode())
             else:
                 values = {**to_mapping(settings), **parse_material(record.decode())}

@@ -9,20 +9,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypedDict
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
+from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene, interface
 from magnetosuture_thread.bags.bag_folder import UNVERIFIED_NOTE
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.commands.observations import ObservationReader, chosen_source
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.interface import (
-    DISH_FRAME,
-    GROUND_TRUTH_PULL,
-    GROUND_TRUTH_THREAD,
-    MEASURED_THREAD,
-    NEEDLE_COMMAND,
-    SCENE,
-)
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
@@ -110,7 +102,9 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     """
     log(f"checking {path}")
     start, duration = selection.get("start", 0.0), selection.get("duration")
-    recording = Recording(Bag(path, remap=selection.get("remap")), dish_frame=selection.get("frame", DISH_FRAME))
+    recording = Recording(
+        Bag(path, remap=selection.get("remap")), dish_frame=selection.get("frame", interface.DISH_FRAME)
+    )
     if recording.damage is not None:
         log(f"the bag is damaged, what is intact is played: {recording.damage}")
     if recording.unverified:
@@ -122,7 +116,12 @@ def open_bag(path: Path, log: Log, **selection: Unpack[BagSelection]) -> Iterato
     if not 0.0 <= start <= recording.duration:
         raise BagError(path, f"is {recording.duration:.3f} s long; asked to start at {start:g} s")
     source = chosen_source(recording, selection.get("source", "auto"))
-    for channel in (MEASURED_THREAD, NEEDLE_COMMAND, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL):
+    for channel in (
+        interface.MEASURED_THREAD,
+        interface.NEEDLE_COMMAND,
+        interface.GROUND_TRUTH_THREAD,
+        interface.GROUND_TRUTH_PULL,
+    ):
         if channel.recorded in recording.unfit:
             raise BagError(path, recording.unfit[channel.recorded])
     left = recording.duration - start
@@ -138,7 +137,7 @@ def _scene_at(recording: Recording, start: float) -> Scene | None:
         BagError: what it tells is no scene.
     """
     found: Scene | None = None
-    for record in recording.records([SCENE]) if recording.counts.get(SCENE.recorded) else ():
+    for record in recording.records([interface.SCENE]) if recording.counts.get(interface.SCENE.recorded) else ():
         if found is not None and record.time > recording.start + round(start * 1e9):
             break
         try:

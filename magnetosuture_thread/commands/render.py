@@ -13,10 +13,8 @@ from magnetosuture_thread import Attachment, ConfigurationError, Disc, interface
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.command import (
     DONE,
-    make_console,
-    make_log,
+    Terminal,
     number_argument,
-    progress,
     runs,
     whole_number,
 )
@@ -62,7 +60,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--noise", type=number_argument(0.0, 1e-2), default=0.0, metavar="METRES", help=noise)
 
 
-def run_render(options: argparse.Namespace) -> int:
+def run_render(options: argparse.Namespace, terminal: Terminal) -> int:
     """Write a bag of simulated camera frames, or poses.
 
     A reference trajectory is rendered as the overhead camera would see it, and written as a bag: JPEG frames,
@@ -72,13 +70,12 @@ def run_render(options: argparse.Namespace) -> int:
     """
     if options.noise and not options.poses:
         raise ConfigurationError("--noise", options.noise, "none without --poses")
-    console = make_console()
     given = {name: getattr(options, name) for name in ("start", "duration", "rate", "quality", "seed")}
     given["pose_noise"] = options.noise if options.poses else None
     setup, reference = read_setup(options.setup), read_reference(options.reference)
-    with progress(console, "render") as advance:
+    with terminal.progress("render") as advance:
         frames = render_bag(reference, setup, options.output, progress=advance, **given)
-    make_log(console)(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
+    terminal.log(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
     return DONE
 
 

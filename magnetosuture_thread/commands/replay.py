@@ -10,19 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError
+from magnetosuture_thread import ConfigurationError, InvalidInputError, interface
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.command import (
     DONE,
+    Terminal,
     add_source,
     add_span,
     bag_location,
     bag_selection,
-    make_console,
-    make_log,
     number_argument,
-    progress,
     runs,
 )
 from magnetosuture_thread.commands.observations import ObservationReader, Step, measure_step, predictions, read_image
@@ -33,16 +31,6 @@ from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
-from magnetosuture_thread.interface import (
-    ESTIMATED_THREAD,
-    MARGINS,
-    MEASURED_THREAD,
-    NEEDLE_POSE,
-    PREDICTED_THREAD,
-    SCENE,
-    THREAD_OBSERVATION,
-    TRACKER_STATE,
-)
 from magnetosuture_thread.messages.outputs import (
     Outputs,
     estimate_outputs,
@@ -77,7 +65,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     add_source(parser)
 
 
-def run_replay(options: argparse.Namespace) -> int:
+def run_replay(options: argparse.Namespace, terminal: Terminal) -> int:
     """Play a recorded bag through the live graph, or offline.
 
     vision_tracker, thread_model and coil_bridge run as processes of their own, on a ROS domain that nobody else
@@ -101,18 +89,16 @@ def run_replay(options: argparse.Namespace) -> int:
     for name in ("rate", "loop"):
         if options.offline and getattr(options, name):
             raise ConfigurationError(f"--{name}", getattr(options, name), "none with --offline, which knows no time")
-    console = make_console()
-    log = make_log(console)
-    with progress(console, "replay") as advance:
-        given = {**bag_selection(options), "log": log, "progress": advance}
+    with terminal.progress("replay") as advance:
+        given = {**bag_selection(options), "log": terminal.log, "progress": advance}
         if options.offline:
             summary = replay_offline(options.bag, options.output, **given)
         else:
             from magnetosuture_thread.commands.live import replay_live  # late, as it needs ROS
 
             summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **given)
-    console.print(summary_table(summary))
-    log(f"results: {options.output}")
+    terminal.print(summary_table(summary))
+    terminal.log(f"results: {options.output}")
     return DONE
 
 
@@ -191,12 +177,19 @@ class _Output:
 
     def __init__(self, bag: BagWriter, seen: ObservationReader, given: BagInput) -> None:
         self._bag, self._version = bag, given.setup.scene.version
-        bag.add_topic(SCENE.recorded, SCENE.type_name)
-        bag.write(SCENE.recorded, given.begin, packed_scene(given.begin, given.setup.scene))
-        by_tracker = [TRACKER_STATE, THREAD_OBSERVATION] if seen.source == "camera" else []
-        if seen.source == "poses" and given.recording.counts.get(THREAD_OBSERVATION.recorded):
-            by_tracker = [THREAD_OBSERVATION]
-        for channel in (NEEDLE_POSE, *by_tracker, MEASURED_THREAD, PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS):
+        bag.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
+        bag.write(interface.SCENE.recorded, given.begin, packed_scene(given.begin, given.setup.scene))
+        by_tracker = [interface.TRACKER_STATE, interface.THREAD_OBSERVATION] if seen.source == "camera" else []
+        if seen.source == "poses" and given.recording.counts.get(interface.THREAD_OBSERVATION.recorded):
+            by_tracker = [interface.THREAD_OBSERVATION]
+        for channel in (
+            interface.NEEDLE_POSE,
+            *by_tracker,
+            interface.MEASURED_THREAD,
+            interface.PREDICTED_THREAD,
+            interface.ESTIMATED_THREAD,
+            interface.MARGINS,
+        ):
             bag.add_topic(channel.recorded, channel.type_name)
         seen.on_frame, seen.on_record = self._frame, self._record
 
@@ -212,14 +205,14 @@ class _Output:
         if seen.tracked:
             self._write(stamp, pose_outputs(stamp, track.tail, track.heading, track.covariance))
             self._write(stamp, thread_outputs(stamp, track.observation, seen.centreline))
-        self._bag.write(TRACKER_STATE.recorded, max(stamp, 0), packed_tracker_state(stamp, track))
+        self._bag.write(interface.TRACKER_STATE.recorded, max(stamp, 0), packed_tracker_state(stamp, track))
 
     def _write(self, stamp: int, outputs: Outputs) -> None:
         for channel, data in outputs:
             self._bag.write(channel.recorded, max(stamp, 0), data)
 
     def _record(self, stamp: int, record: RecordedMessage) -> None:
-        if record.topic == SCENE.recorded:
+        if record.topic == interface.SCENE.recorded:
             version = record.decode().version
             if version == self._version:
                 return  # written at the beginning

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from magnetosuture_thread.commands.command import DONE, add_actions, make_console, make_log, progress
+from magnetosuture_thread.commands.command import DONE, Terminal, add_actions
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     hernia.add_argument("--animation", action="store_true", help="draw hernia.gif as well")
 
 
-def run_hernia(options: argparse.Namespace) -> int:
+def run_hernia(options: argparse.Namespace, terminal: Terminal) -> int:
     """Replay a recorded steering around a hernia.
 
     The paper's simulated hernia repair: a needle steered by hand draws a thread through a penetration path and
@@ -33,18 +33,16 @@ def run_hernia(options: argparse.Namespace) -> int:
     """
     from magnetosuture_thread.reproduce.hernia import hernia_lines, hernia_table, replay_hernia
 
-    console = make_console()
-    log = make_log(console)
     given = {"setup_name": options.setup, "formulation": options.formulation, "animation": options.animation}
-    with progress(console, "hernia") as advance:
-        summary = replay_hernia(options.bag, options.output, log=log, progress=advance, **given)
-    console.print(hernia_table(summary))
+    with terminal.progress("hernia") as advance:
+        summary = replay_hernia(options.bag, options.output, log=terminal.log, progress=advance, **given)
+    terminal.print(hernia_table(summary))
     for line in (*hernia_lines(summary), f"results: {options.output}"):
-        log(line)
+        terminal.log(line)
     return DONE
 
 
-def run_thread_behavior(options: argparse.Namespace) -> int:
+def run_thread_behavior(options: argparse.Namespace, terminal: Terminal) -> int:
     """Compare prediction and ground truth in closed loop, by material.
 
     The paper's two thread-behavior tests in a closed loop around the simulated rig, a polyamide thread of 19 mm and
@@ -54,10 +52,8 @@ def run_thread_behavior(options: argparse.Namespace) -> int:
     """
     from magnetosuture_thread.reproduce.thread_behavior import behavior_table, thread_behavior
 
-    console = make_console()
-    log = make_log(console)
-    with progress(console, "thread-behavior") as advance:
-        runs = thread_behavior(options.output, log=log, progress=advance)
-    console.print(behavior_table(runs))
-    log(f"results: {options.output}")
+    with terminal.progress("thread-behavior") as advance:
+        runs = thread_behavior(options.output, log=terminal.log, progress=advance)
+    terminal.print(behavior_table(runs))
+    terminal.log(f"results: {options.output}")
     return DONE

@@ -14,9 +14,8 @@ from rich.text import Text
 from magnetosuture_thread import ConfigurationError, Disc, SceneShape, read_scene
 from magnetosuture_thread.commands.command import (
     DONE,
+    Terminal,
     add_actions,
-    make_console,
-    make_log,
     number_argument,
     output_file,
     write_json,
@@ -47,7 +46,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     draw.add_argument("--output", type=output_file, required=True, metavar="FILE", help=picture)
 
 
-def run_check(options: argparse.Namespace) -> int:
+def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
     """Show what a scene holds, with warnings.
 
     A scene file is read, and its dish, its version and its shapes are shown. What is allowed and yet is often a slip is
@@ -58,7 +57,6 @@ def run_check(options: argparse.Namespace) -> int:
     area_m2, vertices) and warnings (what: overlap, gap, hole or wall; shapes; value [m], of an overlap [m^2];
     place [m]; text).
     """
-    console = make_console()
     scene = read_scene(options.file)
     warnings = scene_warnings(scene, options.needle_width)
     report = {
@@ -68,15 +66,15 @@ def run_check(options: argparse.Namespace) -> int:
         "shapes": [_shape(shape) for shape in scene.shapes],
         "warnings": [asdict(warning) for warning in warnings],
     }
-    console.print(_table(report))
+    terminal.print(_table(report))
     for warning in warnings:
-        console.print("warning:", style="bold yellow", end=" ")
-        make_log(console)(warning.text)
+        terminal.print("warning:", style="bold yellow", end=" ")
+        terminal.log(warning.text)
     write_json(options.json, report)
     return DONE
 
 
-def run_draw(options: argparse.Namespace) -> int:
+def run_draw(options: argparse.Namespace, terminal: Terminal) -> int:
     """Draw a scene file from above, with names and scale, as PNG or SVG."""
     if options.output.suffix not in PICTURES:
         raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
@@ -86,7 +84,7 @@ def run_draw(options: argparse.Namespace) -> int:
     scene = read_scene(options.file)
     with whole_file(options.output) as partial:
         plot_scene(partial, scene, Path(options.file).stem)
-    make_log(make_console())(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
+    terminal.log(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
     return DONE
 
 

@@ -14,16 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread import ConfigurationError
+from magnetosuture_thread import ConfigurationError, interface
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.command import (
     DONE,
-    make_console,
-    make_log,
+    Terminal,
     number_argument,
     output_file,
-    progress,
     runs,
     write_json,
 )
@@ -43,17 +41,6 @@ from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSum
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.evaluation.tables import loop_table
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.interface import (
-    CAMERA,
-    NODES,
-    PLANNER,
-    PREDICTED_THREAD,
-    PROCESSES,
-    SCENE,
-    SCENE_MARKERS,
-    SCENE_SERVER,
-    TIP_SETPOINT,
-)
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import DONE as PROCEDURE_DONE
 from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient
@@ -64,7 +51,10 @@ from magnetosuture_thread.rig.power.stage import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 
-ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning
+ONCE = (
+    interface.SCENE.recorded,
+    interface.SCENE_MARKERS.recorded,
+)  # published while nodes start, for the bag's beginning
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
@@ -105,7 +95,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--json", type=output_file, metavar="FILE", help="write the figures to a file")
 
 
-def run_simulate(options: argparse.Namespace) -> int:
+def run_simulate(options: argparse.Namespace, terminal: Terminal) -> int:
     """Run the whole graph around a simulated rig.
 
     No robot is needed: rig_simulator stands in for coils, dish, needle, thread and camera; vision_tracker,
@@ -120,19 +110,17 @@ def run_simulate(options: argparse.Namespace) -> int:
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
     and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
-    console = make_console()
-    log = make_log(console)
     new = not options.output.exists()
     given = {name: getattr(options, name) for name in ("duration", "rate", "boards", "procedure")}
     try:
-        with progress(console, "simulate") as advance:
-            summary = simulate(options.setup, options.output, log=log, progress=advance, **given)
+        with terminal.progress("simulate") as advance:
+            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **given)
     except KeyboardInterrupt:
         if new and options.output.exists():
-            log(f"what was recorded is in {options.output}")
+            terminal.log(f"what was recorded is in {options.output}")
         raise
-    console.print(loop_table(summary))
-    log(f"bag: {options.output}")
+    terminal.print(loop_table(summary))
+    terminal.log(f"bag: {options.output}")
     write_json(options.json, summary.to_json())
     return DONE
 
@@ -206,7 +194,7 @@ def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
     collector = LoopCollector(
         setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
     )
-    camera = {channel.recorded for channel in CAMERA.values()}
+    camera = {channel.recorded for channel in interface.CAMERA.values()}
     for record in bag.records(set(bag.topics) - camera):
         collector.add(record.topic, record.time, record.decode())
     return collector
@@ -258,7 +246,7 @@ class _Path(_Steering):
     def poll(self, recorder: Recorder) -> str:
         """Take what is new; return what went wrong."""
         state, values = recorder.status_texts.get(self.node, ("", {}))
-        self.stage = 2 if recorder.taken[TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
+        self.stage = 2 if recorder.taken[interface.TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
         self.share = float(values.get("progress", 0.0))
         self.ended = state == "done" and self._duration is None
         bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
@@ -281,7 +269,7 @@ class _Procedure(_Steering):
         ConfigurationError: there is no such procedure, or it does not fit the setup's scene.
     """
 
-    node = PLANNER
+    node = interface.PLANNER
     result: dict[str, Any]
 
     def __init__(self, name: str, setup: Setup) -> None:
@@ -345,8 +333,8 @@ class _Run:
         procedures = () if self.steering.result is None else topics.PROCEDURES
         every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
         recorded = [topic for topic in every if topic is not topics.IMAGE]
-        what = f"{SCENE_SERVER}, rig_simulator, {', '.join(NODES)}"
-        processes = (SCENE_SERVER, "rig_simulator", *PROCESSES)
+        what = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
+        processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
             arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else SIMULATED_COILS
             for topic in recorded:
@@ -459,7 +447,7 @@ def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
             raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
         recorder.spin(POLL_PERIOD)
     deadline = time.monotonic() + PREDICTION_TIMEOUT
-    while not recorder.taken[PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
+    while not recorder.taken[interface.PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
         check()
         recorder.spin(POLL_PERIOD)
     recorder.spin(SETTLING_TIME)

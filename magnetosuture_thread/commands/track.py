@@ -23,12 +23,10 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import pluralize
 from magnetosuture_thread.commands.command import (
     DONE,
+    Terminal,
     add_frames,
-    make_console,
-    make_log,
     number_argument,
     output_file,
-    progress,
     runs,
     write_json,
 )
@@ -74,7 +72,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--overlay", type=Path, metavar="PATH", help=overlay)
 
 
-def run_track(options: argparse.Namespace) -> int:
+def run_track(options: argparse.Namespace, terminal: Terminal) -> int:
     """Find needle and thread in camera frames, without a graph.
 
     FRAMES are pictures, a folder of them, or a bag. Pictures are searched one by one; a bag's frames are followed
@@ -88,23 +86,21 @@ def run_track(options: argparse.Namespace) -> int:
     stamp_s, and time_s, the processor time to search the frame, on one core, without reading and decoding it;
     all is compiled before. What has no value is null.
     """
-    console = make_console()
-    log = make_log(console)
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
     if options.centre is not None:
         view["dish_centre_px"] = tuple(options.centre)
     settings = replace(setup.vision, **view)
     lens = read_lens(options.camera_info) if options.camera_info is not None else None
-    given = {"overlay": options.overlay, "remap": dict(options.remap), "lens": lens, "log": log}
-    with progress(console, "track") as advance:
+    given = {"overlay": options.overlay, "remap": dict(options.remap), "lens": lens, "log": terminal.log}
+    with terminal.progress("track") as advance:
         frames = track(options.frames, settings, setup.scene, progress=advance, **given)
     rows = [frame.to_json() for frame in frames]
-    console.print(_table(rows))
+    terminal.print(_table(rows))
     if rows:
         counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
         median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
-        log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
+        terminal.log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
     write_json(options.json, rows)
     return DONE
 

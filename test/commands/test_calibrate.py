@@ -15,7 +15,7 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.commands.calibrate import StartOfFit, calibrate_bags, material_named
+from magnetosuture_thread.commands.calibrate import FitOptions, calibrate_bags, material_named
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
@@ -71,19 +71,8 @@ def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Pat
     for workers in ("1", "2"):
         output, figures = tmp_path / f"{workers}.yaml", tmp_path / f"{workers}.json"
         bags = [str(folder / name) for name in ("one", "two")]
-        code = run(
-            folder,
-            *bags,
-            *ONE,
-            "--material",
-            "poly",
-            "--output",
-            str(output),
-            "--workers",
-            workers,
-            "--json",
-            str(figures),
-        )
+        given = ["--material", "poly", "--output", str(output), "--workers", workers, "--json", str(figures)]
+        code = run(folder, *bags, *ONE, *given)
         assert code == 0
         texts.append((output.read_bytes(), figures.read_bytes(), output.with_suffix(".png").read_bytes()))
     assert texts[0] == texts[1]
@@ -175,6 +164,6 @@ def test_a_material_is_told_by_how_it_begins():
 def test_another_material_comes_with_its_own_numbers():
     setup = read_setup("petri_35mm_polyamide")
     own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
-    assert StartOfFit("polyamide").settings_of(own) == own.model
-    silk = StartOfFit("silk", "paper").settings_of(own)
+    assert FitOptions("polyamide").settings_of(own) == own.model
+    silk = FitOptions("silk", "paper").settings_of(own)
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

@@ -8,11 +8,12 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,51 +34,39 @@ OTHER = "petri_35mm_polyamide_post"
 WAIT = 300.0  # s; the first start on a machine compiles
 
 
+@dataclass
 class Console:
-    """The command, running."""
+    """The command, running; what it prints goes to a file."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-        self.lines: list[str] = []
-        self._reading = threading.Thread(target=self._read)
-        self._reading.start()
+    process: subprocess.Popen[bytes]
+    output: Path
 
     def find(self, pattern: str) -> str:
         """Wait for a line of its output, and return what the pattern's group holds."""
         deadline = time.monotonic() + WAIT
-        while time.monotonic() < deadline:
-            for line in list(self.lines):
-                if found := re.search(pattern, line):
-                    return found[1]
-            assert self.process.poll() is None, self.lines
+        while not (found := re.search(pattern, self.output.read_text(), re.MULTILINE)):
+            assert self.process.poll() is None, self.output.read_text()
+            assert time.monotonic() < deadline, f"no {pattern} in {self.output.read_text()}"
             time.sleep(0.02)
-        raise AssertionError(f"no {pattern} in {self.lines}")
+        return found[1]
 
     def end(self) -> int:
         """Press Ctrl-C, and return its exit code."""
         self.process.send_signal(signal.SIGINT)
-        code = self.process.wait(60.0)
-        self._reading.join(10.0)
-        return code
-
-    def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
-            self.lines.append(line.rstrip())
+        return self.process.wait(60.0)
 
 
 @contextmanager
 def running(*arguments: str, **environment: str) -> Iterator[Console]:
     """Run the command on a free port; end it at the end if it has not."""
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
-    with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "MAGNETOSUTURE_TOKEN": "only-for-this-test-0123", **environment},
-    ) as process:
-        console = Console(process)
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
+    own = {**os.environ, "MAGNETOSUTURE_TOKEN": "only-for-this-test-0123", **environment}
+    with (
+        TemporaryDirectory() as folder,
+        (Path(folder) / "output").open("wb") as file,
+        subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own) as process,
+    ):
+        console = Console(process, Path(file.name))
         try:
             yield console
         finally:
@@ -173,7 +162,8 @@ def test_a_person_steers_the_simulated_rig(tmp_path: Path):
         with wire(domain) as currents:
             asyncio.run(use(url, currents))
         assert console.end() == 0
-    assert console.lines[-1] == "ended"
+        assert console.output.read_text().endswith("ended\n")
+        assert console.output.read_text().endswith("ended\n")
     first, second = map(Bag, sorted(recordings.iterdir()))  # ended by the choice of a setup, and by Ctrl-C
     assert first.damage is second.damage is None
     assert second.notes["setup"] == OTHER

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,7 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags, kind_of
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.errors import BagError, ConfigurationError
-from magnetosuture_thread.interface import (
-    NEEDLE_POSE,
-    PREDICTED_THREAD,
-)
+from magnetosuture_thread.interface import NEEDLE_POSE, PREDICTED_THREAD
 from test.bags.bags import copy_with_notes
 
 
@@ -46,15 +44,30 @@ def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
     assert "Simulated camera frame at" in page
 
 
-def test_what_is_wrong_with_one_bag_is_in_its_row(tmp_path: Path, short_bag: Path):
-    said: list[str] = []
-    rows = evaluate_bags([broken(tmp_path / "=x"), short_bag], tmp_path / "out", duration=0.4, log=said.append)
-    assert "nothing intact" in str(rows[0]["problem"])
-    assert rows[1]["problem"] == ""
-    assert not (tmp_path / "out" / "=x.html").exists()
-    with (tmp_path / "out" / "table.csv").open(newline="") as stream:
-        assert [row["bag"] for row in csv.DictReader(stream)] == ["'=x", "pull"]
-    assert any(line.startswith("=x: ") for line in said)
+def test_what_is_wrong_with_one_bag_is_in_its_row_and_ends_with_1(tmp_path: Path, short_bag: Path, capsys):
+    bags = [str(broken(tmp_path / "=x")), str(short_bag), str(shutil.copytree(short_bag, tmp_path / "again" / "pull"))]
+    output = tmp_path / "out"
+    assert cli.main(["evaluate", *bags, "--output", str(output), "--duration", "0.4", "--workers", "2"]) == 1
+    assert "=x: " in capsys.readouterr().out
+    rows = json.loads((output / "table.json").read_text())["bags"]
+    assert "nothing intact" in rows[0]["problem"]
+    assert [row["problem"] for row in rows[1:]] == ["", ""]
+    assert {path.name for path in output.glob("*.html")} == {"pull.html", "pull-2.html"}
+    with (output / "table.csv").open(newline="") as stream:
+        assert [row["bag"] for row in csv.DictReader(stream)] == ["'=x", "pull", "pull-2"]
+
+
+def test_a_table_for_duckdb_is_written_and_a_broken_pyarrow_loses_nothing(tmp_path: Path, short_bag: Path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    logged: list[str] = []
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", duration=0.4, log=logged.append)
+    assert [each["bag"] for each in parquet.read_table(tmp_path / "out" / "table.parquet").to_pylist()] == [row["bag"]]
+    (tmp_path / "pyarrow.py").write_text("raise ImportError('it is built for another NumPy')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "pyarrow")
+    evaluate_bags([short_bag], tmp_path / "other", duration=0.4, log=logged.append)
+    assert logged[-1] == "no table.parquet: pyarrow cannot be used: it is built for another NumPy"
+    assert sorted(path.name for path in (tmp_path / "other").iterdir()) == ["pull.html", "table.csv", "table.json"]
 
 
 def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_bag: Path):
@@ -85,12 +98,16 @@ def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Pat
     assert "/needle/measured_cp" in str(row["problem"])
 
 
-def test_a_wrong_set_up_is_said_at_once(tmp_path: Path, short_bag: Path):
-    with pytest.raises(ConfigurationError):
-        evaluate_bags([short_bag], tmp_path / "out", setup_name="none")
-    with pytest.raises(BagError, match="exists already"):
-        evaluate_bags([short_bag], tmp_path)
-    assert not (tmp_path / "out").exists()
+def test_what_is_wrong_for_all_bags_is_said_at_once(tmp_path: Path, short_bag: Path):
+    for paths, output, options, error, words in (
+        ([short_bag], tmp_path / "out", {"setup_name": "none"}, ConfigurationError, "setup: got 'none'"),
+        ([short_bag], tmp_path, {}, BagError, "exists already"),
+        ([tmp_path], tmp_path / "out", {}, BagError, "holds no bags"),
+        ([tmp_path / "none"], tmp_path / "out", {}, BagError, "does not exist"),
+    ):
+        with pytest.raises(error, match=words):
+            evaluate_bags(paths, output, **options)
+    assert list(tmp_path.iterdir()) == []
 
 
 def touched(*paths: Path) -> None:
@@ -106,12 +123,6 @@ def test_bags_are_found_two_folders_down_each_once(tmp_path: Path):
     touched(tmp_path / "s" / "s_0.mcap", tmp_path / "s" / "s_1.mcap", tmp_path / ".hidden" / "h.mcap")
     found = [str(path.relative_to(tmp_path)) for path in find_bags([tmp_path / "b", tmp_path])]
     assert found == ["b", "c/d", "c/e/x.mcap", "c/e/y.mcap", "s"]
-
-
-def test_where_no_bag_is_that_is_said(tmp_path: Path):
-    for path, words in ((tmp_path, "holds no bags"), (tmp_path / "none", "does not exist")):
-        with pytest.raises(BagError, match=words):
-            find_bags([path])
 
 
 def test_trajectories_and_bags_are_not_mixed(tmp_path: Path):
@@ -132,22 +143,12 @@ def test_trajectories_and_bags_are_not_mixed(tmp_path: Path):
     ],
 )
 def test_options_of_the_other_kind_are_refused(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: list[str],
-    words: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch, arguments: list[str], words: str
 ):
     touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
     monkeypatch.chdir(tmp_path)
     assert cli.main(["evaluate", *arguments]) == 2
     assert words in capsys.readouterr().err
-
-
-def test_the_command_ends_with_1_where_a_bag_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert cli.main(["evaluate", str(broken(tmp_path / "x")), "--output", str(tmp_path / "out")]) == 1
-    assert "nothing intact" in " ".join(capsys.readouterr().out.split())
-    assert (tmp_path / "out" / "table.json").exists()
 
 
 def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):

@@ -1,13 +1,11 @@
-"""Files and folders that a job makes whole or not at all, and the table of `evaluate` as Parquet."""
+"""Folders that a command makes whole or not at all."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from magnetosuture_thread.commands.evaluate import write_parquet
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import BagError
 
@@ -38,13 +36,3 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt), whole_folder(tmp_path / "new" / "out"):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
-
-
-def test_rows_become_a_parquet_table(tmp_path: Path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-    rows: list[dict[str, Any]] = [
-        {"bag": "a", "frames": 3, "error": 0.5, "problem": ""},
-        {"bag": "b", "frames": None, "error": None, "problem": "is damaged"},
-    ]
-    write_parquet(tmp_path / "table.parquet", rows)
-    assert parquet.read_table(tmp_path / "table.parquet").to_pylist() == rows

@@ -8,17 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
-import rclpy
-from magnetosuture_msgs.msg import PredictedThread
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import qos_profile_sensor_data
-from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
 from magnetosuture_thread.bags.message_types import typestore
@@ -38,7 +32,10 @@ from magnetosuture_thread.interface import (
     THREAD_OBSERVATION,
     Channel,
 )
+from magnetosuture_thread.messages.reading import nanoseconds
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.setups import read_setup
+from test.nodes.conftest import Graph, own_context
 
 pytestmark = pytest.mark.whole_graph
 
@@ -134,133 +131,69 @@ def test_time_stands_still_when_asked_and_goes_round_until_interrupted(pose_bag:
     with started([*command, "--output", "out", "--loop"], tmp_path) as process:
         assert process.stdout is not None
         lines = iter(process.stdout)
-        count_diagnostics = next(line for line in lines if "to pause: " in line)
-        found = re.search(r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) std_srvs/srv/SetBool", count_diagnostics)
+        found = re.search(
+            r"ROS_DOMAIN_ID=(\d+) ros2 service call (\S+) ", next(each for each in lines if "to pause" in each)
+        )
         assert found is not None
-        with Watch(int(found[1]), found[2]) as watch:
-            watch.pause(True)
-            stood = watch.newest()
-            watch.spin(0.5)
-            assert watch.newest() == stood
-            watch.pause(False)
-            watch.spin_until(lambda: watch.newest() > stood)
+        with own_context(int(found[1])) as context, closing(Graph(context, int(found[1]))) as graph:
+            clocks, predicted = graph.listen(topics.CLOCK), graph.listen(topics.PREDICTED_THREAD)
+            client = graph.probe.create_client(SetBool, found[2])
+            graph.wait(lambda: client.service_is_ready() and bool(clocks), "the replay")
+
+            def pause(still: bool) -> int:
+                future = client.call_async(SetBool.Request(data=still))
+                graph.wait(future.done, "an answer")
+                time.sleep(0.2)  # what was said before the answer
+                return nanoseconds(clocks[-1].clock)
+
+            def went_back() -> bool:
+                stamps = [nanoseconds(message.header.stamp) for message in list(predicted)]
+                return len(stamps) > 1 and stamps[-1] < max(stamps)
+
+            stood = pause(True)
+            time.sleep(0.5)
+            assert nanoseconds(clocks[-1].clock) == stood
+            pause(False)
+            graph.wait(lambda: nanoseconds(clocks[-1].clock) > stood, "time to go on")
             assert any("playing on until Ctrl-C" in line for line in lines)
             assert not (tmp_path / "out").exists()
-            watch.spin_until(lambda: bool(watch.predicted) and watch.predicted[-1] < max(watch.predicted))
-            again = len(watch.predicted)
-            watch.spin_until(lambda: len(watch.predicted) > again + 10)
-            assert sorted(watch.predicted[again:]) == watch.predicted[again:]
+            graph.wait(went_back, "the second pass", 90.0)
         process.send_signal(signal.SIGINT)
         shown, errors = process.communicate(timeout=90)
-    assert errors == ""
-    assert process.returncode == 0
+    assert (errors, process.returncode) == ("", 0)
     assert "results: out" in shown
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert Bag(tmp_path / "out" / "bag").counts["/thread/predicted"] == 60
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["predicted"] == 60
     assert not (tmp_path / "out" / "logs" / "vision_tracker.log").exists()  # poses need no tracker
     replay_offline(pose_bag, tmp_path / "offline")
     agree(tmp_path / "out", tmp_path / "offline", predictions=60)
 
 
-class Watch:
-    """Somebody on another process's domain, who watches a replay and pauses it."""
-
-    def __init__(self, domain: int, service: str) -> None:
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain, args=[])
-        self._node = rclpy.create_node("watch", context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._clocks: list[int] = []
-        self.predicted: list[int] = []
-        self._node.create_subscription(Clock, "/clock", self._on_clock, qos_profile_sensor_data)
-        self._node.create_subscription(PredictedThread, "/thread/predicted", self._on_thread, 10)
-        self._client = self._node.create_client(SetBool, service)
-
-    def __enter__(self) -> Watch:
-        """Wait for the replay."""
-        self.spin_until(lambda: self._client.service_is_ready() and bool(self._clocks))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Leave."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
-    def newest(self) -> int:
-        """Return the simulated time last heard [ns]."""
-        return self._clocks[-1]
-
-    def pause(self, still: bool) -> None:
-        """Call the service, and take what was said before its answer."""
-        future = self._client.call_async(SetBool.Request(data=still))
-        self.spin_until(future.done)
-        assert future.result().success
-        self.spin(0.2)
-
-    def spin(self, duration: float) -> None:
-        """Listen for a while [s]."""
-        end = time.monotonic() + duration
-        while time.monotonic() < end:
-            self._executor.spin_once(timeout_sec=0.02)
-
-    def spin_until(self, condition: Callable[[], bool]) -> None:
-        """Listen until a condition holds."""
-        end = time.monotonic() + 90.0
-        while not condition():
-            assert time.monotonic() < end
-            self._executor.spin_once(timeout_sec=0.02)
-
-    def _on_clock(self, message: Clock) -> None:
-        self._clocks.append(message.clock.sec * 10**9 + message.clock.nanosec)
-
-    def _on_thread(self, message: PredictedThread) -> None:
-        self.predicted.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+FRAMES, COMMANDS = "/camera/image_raw/compressed", "/needle/servo_cv"
+COMPRESSED, TWIST, HEADER = "sensor_msgs/msg/CompressedImage", "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Header"
 
 
-def test_what_is_too_short_to_go_round_is_refused(short_bag: Path, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("types", "words"),
+    [
+        ({COMMANDS: TWIST}, f"has no messages on {FRAMES}"),
+        ({FRAMES: HEADER, COMMANDS: TWIST}, f"topic {FRAMES} is of type {HEADER}, expected {COMPRESSED}"),
+        ({FRAMES: COMPRESSED, COMMANDS: HEADER}, f"topic {COMMANDS} is of type {HEADER}, expected"),
+    ],
+)
+def test_bags_of_other_types_are_refused_before_anything_is_written(
+    short_bag: Path, tmp_path: Path, types: dict[str, str], words: str
+):
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        for topic, type_name in types.items():
+            writer.add_topic(topic, type_name)
+        for record in Bag(short_bag).records(set(types)):
+            writer.write(record.topic, record.time, record.data)
+    with pytest.raises(BagError, match=words):
+        replay_live(tmp_path / "bag", tmp_path / "out")
     with pytest.raises(BagError, match=r"gives 0\.97 s to play over and over; expected 1\.5 s or more"):
         replay_live(short_bag, tmp_path / "out", loop=True)
     assert not (tmp_path / "out").exists()
-
-
-def rewritten(bag: Path, folder: Path, types: dict[str, str], notes: dict[str, str]) -> Path:
-    """Write a bag again with other types for its topics; topics without a type are left out."""
-    with BagWriter(folder, notes) as writer:
-        for topic, type_name in types.items():
-            writer.add_topic(topic, type_name)
-        for render_bag in Bag(bag).records(set(types)):
-            writer.write(render_bag.topic, render_bag.time, render_bag.data)
-    return folder
-
-
-FRAMES, COMMANDS = "/camera/image_raw/compressed", "/needle/servo_cv"
-COMPRESSED, TWIST = "sensor_msgs/msg/CompressedImage", "geometry_msgs/msg/TwistStamped"
-
-
-def test_bad_bags_are_refused_before_anything_is_written(short_bag: Path, tmp_path: Path):
-    (tmp_path / "text.mcap").write_text("hello, this is no bag")
-    (tmp_path / "empty.mcap").write_text("")
-    blind = rewritten(short_bag, tmp_path / "blind", {COMMANDS: TWIST}, {})
-    wrong = rewritten(short_bag, tmp_path / "wrong", {FRAMES: "std_msgs/msg/Header", COMMANDS: TWIST}, {})
-    odd = rewritten(short_bag, tmp_path / "odd", {FRAMES: COMPRESSED, COMMANDS: "std_msgs/msg/Header"}, {})
-    before = set(tmp_path.iterdir())
-    for bag, words in (
-        (tmp_path / "missing", "does not exist"),
-        (tmp_path / "text.mcap", "text.mcap"),
-        (tmp_path / "empty.mcap", "empty.mcap"),
-        (blind, f"has no messages on {FRAMES}"),
-        (wrong, f"topic {FRAMES} is of type std_msgs/msg/Header, expected {COMPRESSED}"),
-        (odd, f"topic {COMMANDS} is of type std_msgs/msg/Header, expected"),
-    ):
-        with pytest.raises(BagError) as caught:
-            replay_live(bag, tmp_path / "out")
-        assert words in str(caught.value)
-        assert bag.name in str(caught.value)
-        assert "\n" not in str(caught.value)
-    assert set(tmp_path.iterdir()) == before
 
 
 def test_a_replay_that_is_terminated_ends_its_nodes_and_leaves_nothing(tmp_path: Path):
