@@ -82,6 +82,9 @@ def test_gains_are_bounded():
 class LateLoop(ClosedLoop):
     """Poses arrive 50 to 120 ms after their frame, in order, as on a machine that hardly keeps up."""
 
+    due = 0.0
+    ages = np.random.default_rng(7)
+
     def _measure(self, frame: RigFrame) -> Measurement | None:
         measured = super()._measure(frame)
         if measured is not None:
@@ -98,7 +101,6 @@ def test_a_needle_behind_a_clamped_thread_follows_late_poses_and_is_not_stopped(
         Rig(setup.rig, setup.scene),
         lambda stamp, tail, heading, _: follower.compute_command(stamp, tail, heading).velocity,
     )
-    loop.due, loop.ages = 0.0, np.random.default_rng(7)
     fastest = 0.0
     while loop.now < START + 6.0:
         frame = loop.step()
