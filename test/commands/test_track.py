@@ -77,17 +77,13 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     capture.release()
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("nowhere", "does not exist"), ("empty", "holds no pictures"), ("file.mcap", "is empty, expected an mcap file")],
-)
-def test_paths_without_frames_are_refused_in_one_line(
-    name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file.mcap").write_bytes(b"")
-    assert cli.main(["track", str(tmp_path / name)]) == 1
-    assert words in error_of(capsys)
+    cases = {"nowhere": "does not exist", "empty": "holds no pictures", "file.mcap": "is empty, expected an mcap file"}
+    for name, words in cases.items():
+        assert cli.main(["track", str(tmp_path / name)]) == 1
+        assert words in error_of(capsys)
 
 
 def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -105,13 +101,9 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
     case, image = frame_of("distortion", 2, 31)
     assert case.lens is not None
     values = {"rows": 3, "cols": 3, "data": case.lens.matrix.ravel().tolist()}
-    info = {
-        "image_width": case.size[0],
-        "image_height": case.size[1],
-        "camera_matrix": values,
-        "distortion_model": case.lens.model,
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": case.lens.coefficients.tolist()},
-    }
+    coefficients = {"rows": 1, "cols": 5, "data": case.lens.coefficients.tolist()}
+    info = {"image_width": case.size[0], "image_height": case.size[1], "camera_matrix": values}
+    info |= {"distortion_model": case.lens.model, "distortion_coefficients": coefficients}
     frame, lens, output = tmp_path / "frame.png", tmp_path / "lens.yaml", tmp_path / "camera.yaml"
     cv2.imwrite(str(frame), image)
     lens.write_text(yaml.safe_dump(info))
