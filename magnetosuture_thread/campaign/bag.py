@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from types import TracebackType
-
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.campaign.loop import Measurement, Vector
@@ -26,46 +22,32 @@ from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread_model.session import PredictionResult
 
-OF_CAMERA = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO)
-GROUND_TRUTH = (interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL)
-OF_TRACKER = (interface.NEEDLE_POSE, interface.THREAD_OBSERVATION, interface.MEASURED_THREAD)
-OF_MODEL = (interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS)
-OF_BRIDGE = (interface.NEEDLE_COMMAND, interface.CURRENTS, interface.FILTER_STATE)
+CHANNELS = (
+    *(interface.SCENE, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL),
+    *(interface.NEEDLE_POSE, interface.THREAD_OBSERVATION, interface.MEASURED_THREAD),
+    *(interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS),
+    *(interface.NEEDLE_COMMAND, interface.CURRENTS, interface.FILTER_STATE),
+)
 
 
 class RunBag:
     """Records a run, as a `LoopRecorder`. Every message is logged at the simulated time at which a node would get it.
 
     Args:
-        folder: of the bag; made here.
+        bag: to write to.
         setup: what the nodes believe.
-        notes: of the bag.
         start: time of its begin [s].
         camera: whether frames are rendered.
-
-    Raises:
-        BagError: the folder cannot be written.
     """
 
-    def __init__(self, folder: Path, setup: Setup, notes: Mapping[str, str], start: float, *, camera: bool) -> None:
-        self._bag, self._rig, self._material = BagWriter(folder, notes), setup.rig, setup.model.material
-        frames = OF_CAMERA if camera else ()
-        for channel in (interface.SCENE, *frames, *GROUND_TRUTH, *OF_TRACKER, *OF_MODEL, *OF_BRIDGE):
-            self._bag.add_topic(channel.recorded, channel.type_name)
+    def __init__(self, bag: BagWriter, setup: Setup, start: float, *, camera: bool) -> None:
+        self._bag, self._rig, self._material = bag, setup.rig, setup.model.material
+        for channel in (*CHANNELS, *((interface.COMPRESSED_IMAGE, interface.CAMERA_INFO) if camera else ())):
+            bag.add_topic(channel.recorded, channel.type_name)
         begin = _nanoseconds(start)
-        self._bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
+        bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
         self._view = setup.rig.view(setup.scene)
         self._command = 0  # stamp of the last [ns]
-
-    def __enter__(self) -> RunBag:
-        """Use the bag in a with statement, which closes it."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the bag, so that what was written can be read whatever happened."""
-        self._bag.close()
 
     def on_frame(self, now: float, frame: RigFrame) -> None:
         """Write a frame, if it was rendered, and the ground truth."""

@@ -31,8 +31,6 @@ START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
 LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
 TAIL_DEVIATION, HEADING_DEVIATION = 1e-5, 5e-3  # m and rad; of a tracked needle, see docs/results.md
 THREAD_DEVIATION, THREAD_CORRELATION = 1e-5, 5e-4  # m; of a tracked centreline, and along it
-THREAD_POINTS = 64
-UNMEASURED = 1.0  # s; without a measurement of the thread an estimate is unsure
 
 Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
 """From stamp [s], tail [m], heading and the thread's condition to the velocity commanded of the tip [m/s]."""
@@ -205,7 +203,7 @@ class ClosedLoop:
     def _observe(self, thread: Points) -> ThreadObservation:
         """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
         length = float(arc_lengths(thread)[-1])
-        at = np.linspace(0.0, length, THREAD_POINTS)
+        at = np.linspace(0.0, length, 64)
         points = points_at(thread, at)
         knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
         noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
@@ -253,7 +251,7 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
     if margins is None:
         problem = result.reason
     estimate = result.estimate
-    if estimate is not None and estimate.unmeasured_for > UNMEASURED:
+    if estimate is not None and estimate.unmeasured_for > 1.0:  # s, after which it is unsure
         problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
     forces = result.prediction.forces if result.prediction is not None else None
     return ThreadCondition(

@@ -29,8 +29,6 @@ from magnetosuture_thread.vision.calibration import (
 )
 from magnetosuture_thread.vision.lens import read_lens
 
-MAX_FRAMES = 50  # evenly over a long bag
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -107,7 +105,7 @@ def calibrate_camera(
     """
     given = read_lens(camera_info) if camera_info is not None else None
     source = FrameSource(paths, remap, log)
-    every = -(-source.count // MAX_FRAMES)
+    every = -(-source.count // 50)  # evenly over a long bag
     images = []
     for index, frame in enumerate(source):
         if index % every or frame.image is None:

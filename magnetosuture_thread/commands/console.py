@@ -43,13 +43,6 @@ from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.workers import Log
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
-POLL_PERIOD = 0.2  # s between two checks of the nodes
-QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
-REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
-# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
-# go before the browser and the rig, and behind the bridge.
-PREFERRED, PRIORITY = "perception", 5
-SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -157,7 +150,9 @@ async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
     try:
         host.start()
-        await serve_until(ends, ConsoleServer(graph.settings, graph, host), host.watch, POLL_PERIOD, report)
+        await serve_until(
+            ends, ConsoleServer(graph.settings, graph, host), host.watch, 0.2, report
+        )  # s between two checks of the nodes
     finally:
         await host.close()
     log("ended")
@@ -178,7 +173,7 @@ class BagRecording:
     ) -> None:
         self.output = output
         self._notes = notes
-        self._inboxes = [Inbox(graph.node, topic, QUEUE_DEPTH) for topic in recorded]
+        self._inboxes = [Inbox(graph.node, topic, 1000) for topic in recorded]
         self._ending = threading.Event()
         self._writing: asyncio.Task[None] | None = None
 
@@ -226,7 +221,7 @@ class BagRecording:
             begun()
             ending = False
             while not ending:
-                ending = self._ending.wait(RECORDING_PERIOD)
+                ending = self._ending.wait(0.01)
                 for inbox in self._inboxes:
                     for data, arrived in inbox.take():
                         bag.write(inbox.topic.channel.recorded, arrived, data)
@@ -357,7 +352,8 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *SIMULATED_COILS, *FORECAST]
+        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *FORECAST]
+        arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active"]  # a person arms it
         # Here and not in another thread: the nodes end with the thread that has started them.
         self._nodes = self._place.nodes((SCENE_SERVER, RIG, *PROCESSES, PLANNER), arguments).__enter__()
         self._since = time.monotonic()
@@ -399,7 +395,9 @@ class SimulatedHost(RecordingHost):
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.
-            self.log(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
+            # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so
+            # tracker and model go before the browser and the rig, and behind the bridge.
+            self.log(f"perception: {self._nodes.prefer('perception', 5)}")
             self._block("")
             self.log(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:
@@ -437,7 +435,7 @@ class ReplayHost(RecordingHost):
         self._ending = threading.Event()
         self._playing: asyncio.Task[None] | None = None
         self.busy = f"starting the nodes for {source.given.recording.path}"
-        graph.blocked = REPLAY_BLOCKED
+        graph.blocked = "this is a replay: nothing can be jogged or armed"
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""

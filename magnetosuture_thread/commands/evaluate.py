@@ -63,12 +63,8 @@ from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_ru
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-DEPTH = 2  # folders below the one that is given
-MAX_NAME_BYTES = 200
 BAG_OPTIONS = ("output", "setup", "against", "source", "remap", "frame", "start", "duration", "workers", "scheduler")
 REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
-NEEDLE_BODY = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
-"""Of a needle whose motion is given, the body does not matter."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -243,10 +239,10 @@ def name_of(bag: Path) -> str:
     """Return the name of a bag's report: that of its folder or file."""
     path = bag if is_url(bag) else Path(os.path.abspath(bag))
     name = one_line(path.name if path.is_dir() else path.stem).lstrip(".") or "bag"
-    return name.encode()[:MAX_NAME_BYTES].decode("utf-8", "ignore")
+    return name.encode()[:200].decode("utf-8", "ignore")
 
 
-def find_bags(paths: Sequence[Path], depth: int = DEPTH) -> list[Path]:
+def find_bags(paths: Sequence[Path], depth: int = 2) -> list[Path]:
     """Return the bags at paths, in their order, each once; within a folder by name.
 
     Args:
@@ -360,6 +356,8 @@ def score_rig(
         SolverError: a step could not be solved.
     """
     count = segments or 100
+    # Of a needle whose motion is given, the body does not matter.
+    body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
 
     def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
         thread = _rig_thread(reference, path, count)
@@ -369,7 +367,7 @@ def score_rig(
         if thread.diameter >= length:
             raise BagError(path, f"has a thread of {thread.diameter:g} m in diameter, expected less than its length")
         surface, heading = Surface(discs=reference.discs), float(reference.headings[0])
-        rig = RigDynamics(NEEDLE_BODY, thread, surface, None, reference.tails[0], heading, first)
+        rig = RigDynamics(body, thread, surface, None, reference.tails[0], heading, first)
         speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)
         force = thread.drag_across * length * max(float(speed.max()), 1e-6)
 

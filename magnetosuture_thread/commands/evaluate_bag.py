@@ -32,10 +32,7 @@ from magnetosuture_thread.thread_model.session import WAITING
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.workers import Log, Progress
 
-SOFTWARE = ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless")
 LATENT = dict(zip((interface.NEEDLE_POSE, interface.PREDICTED_THREAD, interface.CURRENTS), STAGES, strict=True))
-MAX_LATENCY = 10.0  # s; a median beyond is of two clocks
-MAX_WAITING = 600  # recorded predictions that may wait for their frame
 
 
 @dataclass(frozen=True)
@@ -162,7 +159,7 @@ def _settings(settings: Configuration) -> Iterator[tuple[str, str, str]]:
 
 
 def _versions() -> Iterator[tuple[str, str]]:
-    for name in SOFTWARE:
+    for name in ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless"):
         try:
             yield name, version(name)
         except PackageNotFoundError:  # as where Ubuntu's python3-opencv is in its place
@@ -194,7 +191,7 @@ def live_figures(recording: Recording, start: float, duration: float | None) -> 
             latencies[record.topic].append((record.time - stamp) * 1e-9)
     percentiles = {LATENT[channel]: Percentiles.of(latencies[channel.recorded]) for channel in there}
     found = {stage: each for stage, each in percentiles.items() if each is not None}
-    if any(not 0.0 <= each.median <= MAX_LATENCY for each in found.values()):
+    if any(not 0.0 <= each.median <= 10.0 for each in found.values()):
         return LiveFigures(remark="not measured: stamps and times of recording are of two clocks")
     if all(each.maximum == 0.0 for each in found.values()):
         return LiveFigures(remark="not measured: the bag was made offline")
@@ -234,7 +231,7 @@ class RecordedPredictions:
         Args:
             stamp: of the frame [ns], not before those asked for until now.
         """
-        while self._latest < stamp and len(self._held) < MAX_WAITING:
+        while self._latest < stamp and len(self._held) < 600:
             record = next(self._records, None)
             if record is None:
                 break

@@ -24,6 +24,7 @@ from magnetosuture_thread.evaluation.frames import FrameResult, Observation
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.interface import Channel
 from magnetosuture_thread.messages.reading import (
     pose_deviation,
     read_force,
@@ -137,7 +138,7 @@ class ObservationReader(Iterator[Observation]):
         self._recording, self._scene, self._length = recording, setup.scene, setup.model.thread_length
         self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
-        own = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        own: tuple[Channel, ...] = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
         if self.source == "camera":
             assert recording.camera is not None
             warm_up()

@@ -49,10 +49,6 @@ from magnetosuture_thread.vision.warm_up import warm_up
 from magnetosuture_thread.workers import Log, Progress
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
-MIN_RATE, MAX_RATE = 0.1, 240.0  # frames/s, that video players show
-FRAMES_FOR_RATE = 300  # of a bag, from its beginning
-MAX_ROWS = 20  # of frames; beyond, only the summary is shown
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -234,13 +230,13 @@ class FrameSource:
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
         if self._recording is None:
-            return PICTURE_RATE
-        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), FRAMES_FOR_RATE)]
+            return 30.0
+        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), 300)]
         intervals = np.diff(stamps) * 1e-9
         if not np.any(intervals > 0.0):
-            return PICTURE_RATE
-        # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
-        return min(MAX_RATE, max(MIN_RATE, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+            return 30.0
+        # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
+        return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:
@@ -250,15 +246,14 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
         names: that may come again.
         form: of a name with its number, 2 and up, for example `{}_{}`.
     """
-    given, numbers, taken = list[str](), Counter[str](), set(names)
+    taken = dict[str, None]()
     for name in names:
-        numbers[name] += 1
-        own = name
-        while numbers[name] > 1 and (own := form.format(name, numbers[name])) in taken:
-            numbers[name] += 1
-        taken.add(own)
-        given.append(own)
-    return given
+        own, number = name, 1
+        while own in taken:
+            number += 1
+            own = form.format(name, number)
+        taken[own] = None
+    return list(taken)
 
 
 @dataclass(frozen=True)
@@ -406,7 +401,7 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     for name in ("tail", "heading", "thread", "sure", "ms"):
         table.add_column(name, justify="right", no_wrap=True)
     began = rows[0]["stamp_s"] if rows else None
-    for row in rows[:MAX_ROWS]:
+    for row in rows[:20]:
         name, status = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s", row["status"]
         cells = [""] * 4
         if row["reason"]:
@@ -420,6 +415,6 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
                 "" if row["confidence"] is None else f"{row['confidence']:.2f}",
             ]
         table.add_row(name, status, *cells, f"{row['time_s'] * 1e3:.1f}")
-    if len(rows) > MAX_ROWS:
-        table.add_row(f"and {len(rows) - MAX_ROWS} more", "", "", "", "", "", "")
+    if len(rows) > 20:
+        table.add_row(f"and {len(rows) - 20} more", "", "", "", "", "", "")
     return table
