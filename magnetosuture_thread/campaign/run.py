@@ -238,7 +238,7 @@ class RunExtremes:
         # Not wrapped at a half turn, over which noise would be a turn of the needle.
         self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
         at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * self._angle)
-        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > 5e-5:
+        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > 5e-5:  # m: it does not rest
             self._anchor = at
         found.longest_rest_s = max(found.longest_rest_s, frame.time - self._anchor[0])
         self._last.append(instant)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -90,12 +90,34 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
     With --scheduler and --bags, DIR must be a folder that all workers have.
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
     """
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    given = {name: getattr(options, name) for name in ("setup", "camera", "bags", "workers", "scheduler")}
-    with terminal.progress("campaign") as advance:
-        result = simulate_campaign(
-            options.procedure, seeds, options.output, log=terminal.log, progress=advance, **given
-        )
+    seeds, bags = range(options.first_seed, options.first_seed + options.seeds), sorted(set(options.bags))
+    procedure = read_procedure(options.procedure)
+    if not set(bags) <= set(seeds):
+        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
+    setup = read_procedure_setup(procedure, options.setup)
+    check_run(procedure, setup, vary(setup, seeds[0]))
+    result = CampaignResult(procedure, setup, options.camera, bags={seed: f"bags/seed_{seed}" for seed in bags})
+    work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)
+    with (
+        terminal.progress("campaign") as advance,
+        whole_folder(options.output) as folder,
+        make_runner(work, options.workers, options.scheduler) as runner,
+    ):
+        tasks = [(seed, folder / result.bags[seed] if seed in bags else None) for seed in seeds]
+        found: dict[int, RunResult] = {}
+        for index, made in runner.run(tasks, terminal.log, advance):
+            seed = seeds[index]
+            if isinstance(made, WorkerDiedError):
+                result.died[seed] = str(made)
+                terminal.log(f"seed {seed}: {made}")
+                continue
+            found[seed], used_time = made
+            outcome = "success" if found[seed].success else found[seed].reason
+            speed = found[seed].simulated_s / used_time
+            terminal.log(f"seed {seed}: {outcome} ({speed:.1f} times real time)")
+        result.runs.extend(found[seed] for seed in seeds if seed in found)
+        (folder / "campaign.json").write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+        (folder / "campaign.html").write_text(write_page(result), encoding="utf-8")
     title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
     table = Table(title=f"{title} (simulated)", title_justify="left", title_style="bold")
     for name in ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
@@ -133,7 +155,7 @@ class CampaignResult:
     procedure: Procedure
     setup: Setup
     camera: bool
-    runs: Sequence[RunResult]
+    runs: list[RunResult] = field(default_factory=list)
     died: dict[int, str] = field(default_factory=dict)
     bags: dict[int, str] = field(default_factory=dict)
 
@@ -158,68 +180,6 @@ class CampaignResult:
             "runs": [run.to_json() for run in self.runs],
             "died": {str(seed): reason for seed, reason in self.died.items()},
         }
-
-
-def simulate_campaign(
-    name: str,
-    seeds: range,
-    output: Path,
-    *,
-    setup: str = "",
-    camera: bool = False,
-    bags: Collection[int] = (),
-    workers: int = 1,
-    scheduler: str = "",
-    log: Log = lambda text: None,
-    progress: Progress = lambda share: None,
-) -> CampaignResult:
-    """Run a procedure once for each seed, and write `campaign.json`, a report and bags into a new folder.
-
-    The files are the same for the same seeds, however many processes run them.
-
-    Args:
-        name: of the procedure, or the path of its file.
-        seeds: of the runs.
-        output: folder to make.
-        setup: name or file of the setup; empty for the procedure's own.
-        camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
-        bags: seeds whose runs are recorded as bags.
-        workers: processes.
-        scheduler: address of a Dask scheduler, whose workers make the runs in place of those; for bags they must have
-            the output's folder too.
-        log: called with a line for a person at each run's end.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        ConfigurationError: procedure or setup cannot be used, or do not fit each other, or a bag is of no run.
-        PlanningError: there is no way to a goal from where the first run begins.
-        BagError: the output exists, or cannot be written.
-    """
-    procedure = read_procedure(name)
-    if not set(bags) <= set(seeds):
-        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
-    used = read_procedure_setup(procedure, setup)
-    check_run(procedure, used, vary(used, seeds[0]))
-    found: dict[int, RunResult] = {}
-    died: dict[int, str] = {}
-    folders = {seed: f"bags/seed_{seed}" for seed in sorted(set(bags))}
-    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera)
-    with whole_folder(output) as folder, make_runner(work, workers, scheduler) as runner:
-        tasks = [(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
-        for index, made in runner.run(tasks, log, progress):
-            seed = seeds[index]
-            if isinstance(made, WorkerDiedError):
-                died[seed] = str(made)
-                log(f"seed {seed}: {made}")
-                continue
-            run, used_time = made
-            found[seed], speed = run, run.simulated_s / used_time
-            log(f"seed {seed}: {'success' if run.success else run.reason} ({speed:.1f} times real time)")
-        ordered = tuple(found[seed] for seed in seeds if seed in found)
-        result = CampaignResult(procedure, used, camera, ordered, died, folders)
-        (folder / "campaign.json").write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
-        (folder / "campaign.html").write_text(write_page(result), encoding="utf-8")
-    return result
 
 
 def _run(

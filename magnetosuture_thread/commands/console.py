@@ -150,9 +150,8 @@ async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
     try:
         host.start()
-        await serve_until(
-            ends, ConsoleServer(graph.settings, graph, host), host.watch, 0.2, report
-        )  # s between two checks of the nodes
+        server, period = ConsoleServer(graph.settings, graph, host), 0.2  # s between two checks of the nodes
+        await serve_until(ends, server, host.watch, period, report)
     finally:
         await host.close()
     log("ended")
@@ -395,8 +394,8 @@ class SimulatedHost(RecordingHost):
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.
-            # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so
-            # tracker and model go before the browser and the rig, and behind the bridge.
+            # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key:
+            # so tracker and model go before the browser and the rig, and behind the bridge.
             self.log(f"perception: {self._nodes.prefer('perception', 5)}")
             self._block("")
             self.log(f"{self.setup.name} runs; the coils are not armed")

@@ -51,10 +51,8 @@ from magnetosuture_thread.rig.power.stage import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 
-ONCE = (
-    interface.SCENE.recorded,
-    interface.SCENE_MARKERS.recorded,
-)  # published while nodes start, for the bag's beginning
+# Published while nodes start, for the bag's beginning.
+ONCE = (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded)
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
@@ -345,8 +343,9 @@ class _Run:
         self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
         sink.running = True
         try:
-            # On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
-            audience = f"{self.steering.node}:audience:=2"  # bridge and recorder
+            # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
+            # and the bag would lack the start.
+            audience = f"{self.steering.node}:audience:=2"
             graph.nodes.start(self.steering.node, arguments=("-p", audience))
             with graph.interruption, self.steering.client:
                 return self._steer(recorder, graph.check)
