@@ -14,9 +14,8 @@ import yaml
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.observations import CHANGING
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag
+from magnetosuture_thread.commands.recorded import CHANGING, BagInput, BagSelection, open_bag
 from magnetosuture_thread.commands.replay import replay_summary, write_results
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary

@@ -23,9 +23,17 @@ from magnetosuture_thread.commands.command import (
     number_argument,
     runs,
 )
-from magnetosuture_thread.commands.observations import ObservationReader, Step, measure_step, predictions, read_image
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag
+from magnetosuture_thread.commands.recorded import (
+    BagInput,
+    BagSelection,
+    ObservationReader,
+    Step,
+    measure_step,
+    open_bag,
+    predictions,
+    read_image,
+)
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary

@@ -30,7 +30,7 @@ from magnetosuture_thread.commands.command import (
     runs,
     write_json,
 )
-from magnetosuture_thread.commands.observations import read_image
+from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.files import read_regular
