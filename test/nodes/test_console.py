@@ -22,9 +22,9 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.commands.console import BagRecording
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.console import BagRecording
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import graph as console_graph
