@@ -26,8 +26,8 @@ from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay import GraphInput
 from magnetosuture_thread.jobs.replay_inputs import DEFAULT_SETUP, SETUP_NOTE, Log, open_bag
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.graph import RECORDED_TOPICS, ConsoleGraph, Inbox
-from magnetosuture_thread.nodes.console.node import RIG, GraphHost, joined
+from magnetosuture_thread.nodes.clients import Inbox, joined
+from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.resources import share_directory

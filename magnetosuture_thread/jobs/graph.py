@@ -9,7 +9,7 @@ from pathlib import Path
 
 from magnetosuture_thread.interface import STANDBY_NODES
 from magnetosuture_thread.jobs.replay_inputs import Log
-from magnetosuture_thread.nodes.diagnostics import COMPILING
+from magnetosuture_thread.nodes.node import COMPILING
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.run import Interruption
 

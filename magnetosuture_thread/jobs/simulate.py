@@ -42,8 +42,7 @@ from magnetosuture_thread.jobs.graph import (
 from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.jobs.replay_inputs import SETUP_NOTE, Log, Progress
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import DONE, CoilClient, ProcedureClient, ProcedureReport
-from magnetosuture_thread.nodes.recorder import Recorder
+from magnetosuture_thread.nodes.clients import DONE, CoilClient, ProcedureClient, ProcedureReport, Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.rig.power.stage import board_addresses

@@ -29,10 +29,6 @@ from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSet
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
-MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
-MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
-MIN_SPEED, MAX_SPEED = 1e-5, 0.1  # m/s
-NEVER = 2**62  # ns before; earlier than any stamp that a message can hold
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
 
 
@@ -63,7 +59,7 @@ class ThreadForecasts:
     def __init__(self, node: StandbyNode[ThreadModelSettings], session: ThreadSession) -> None:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
-        self._started = -NEVER  # stamp of the last estimate that is forecast [ns]
+        self._started: int | None = None  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
         self._forecaster()
@@ -109,8 +105,11 @@ class ThreadForecasts:
         if result.estimate is None or not result.estimate.converged:
             return
         forecaster, settings = self._forecaster(), self._session.settings
-        self._last, elapsed = (result, pose), abs(result.stamp - self._started)  # either way if time is set back
-        if forecaster is None or elapsed < 1_000_000_000 * settings.forecast_period:
+        self._last = result, pose
+        elapsed = (
+            math.inf if self._started is None else 1e-9 * abs(result.stamp - self._started)
+        )  # time may be set back
+        if forecaster is None or elapsed < settings.forecast_period:
             return
         self._started = result.stamp
         commanded, filtered, source = np.zeros(2), None, ""
@@ -188,14 +187,14 @@ def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollo
         InvalidInputError: path, speed or horizon are out of bounds.
     """
     points = np.array([(point.x, point.y) for point in request.path]).reshape(-1, 2)
-    if not (0 < len(points) <= MAX_PATH_POINTS):
-        raise InvalidInputError("path", f"{len(points)} points", f"1 to {MAX_PATH_POINTS}")
-    if not (np.abs(points) <= MAX_PLACE).all():
-        raise InvalidInputError("path", "a point that is not finite or far away", f"within {MAX_PLACE:g} m")
-    if not MIN_SPEED <= request.speed <= MAX_SPEED:
-        raise InvalidInputError("speed", request.speed, f"{MIN_SPEED:g} to {MAX_SPEED:g} m/s")
-    if not (math.isfinite(request.horizon) and 0.0 < request.horizon <= MAX_PATH_HORIZON):
-        raise InvalidInputError("horizon", request.horizon, f"above 0 and at most {MAX_PATH_HORIZON:g} s")
+    if not 0 < len(points) <= 1000:
+        raise InvalidInputError("path", f"{len(points)} points", "1 to 1000")
+    if not (np.abs(points) <= 0.5).all():
+        raise InvalidInputError("path", "a point that is not finite or far away", "within 0.5 m")
+    if not 1e-5 <= request.speed <= 0.1:
+        raise InvalidInputError("speed", request.speed, "1e-05 to 0.1 m/s")
+    if not 0.0 < request.horizon <= 10.0:  # s; the node does nothing else while it is computed
+        raise InvalidInputError("horizon", request.horizon, "above 0 and at most 10 s")
     chosen = PathFollowerSettings(
         waypoints=tuple(points.ravel().tolist()),
         speed=request.speed,

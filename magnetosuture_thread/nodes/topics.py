@@ -110,7 +110,7 @@ class Topic:
             callback: called with each message that can be decoded, or with the CDR bytes of each.
             raw: whether with its bytes.
         """
-        return self._subscribe(node, callback if raw else lambda data: self._decoded(node, data, callback))
+        return self._subscribe(node, callback if raw else lambda data: self.decoded(node, data, callback))
 
     def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
@@ -126,12 +126,13 @@ class Topic:
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
                 number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
-            self._decoded(node, data, lambda message: callback(message, number))
+            self.decoded(node, data, lambda message: callback(message, number))
 
         subscription = self._subscribe(node, take)
         return subscription
 
-    def _decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+        """Call back with the message of some bytes; where they are none, the node reports that they are refused."""
         try:
             message = self.decode(data)
         except InvalidInputError as error:

@@ -14,7 +14,7 @@ from playwright.sync_api import Browser, Page, ViewportSize, expect
 
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from test.console.conftest import ServedConsole
-from test.console.scene import picture, state, thread
+from test.console.scene import estimated_state, forecast_state, picture, state, thread
 
 pytestmark = pytest.mark.slow
 
@@ -101,21 +101,6 @@ class Operator:
             [*point, radius],
         )
         return set(found)
-
-    def cut_off(self) -> list[str]:
-        """Return what is not wholly on the screen, or does not hold its text."""
-        found = self.page.evaluate(
-            """() => {
-                const words = "button, h2, .chip, figcaption";
-                const outside = ({left, top, right, bottom}) =>
-                    left < 0 || top < 0 || right > innerWidth || bottom > innerHeight;
-                const all = [...document.querySelectorAll(words + ", select, input, canvas, dd, #headline")];
-                return all.filter((element) => outside(element.getBoundingClientRect())
-                    || element.matches(words) && element.scrollWidth > element.clientWidth + 1
-                ).map((element) => element.id || element.textContent);
-            }"""
-        )
-        return [str(entry) for entry in found]
 
 
 @pytest.fixture
@@ -387,7 +372,6 @@ CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the o
     ("filter", {"slowdown": 0.001}, "At rest: slowed to 0 % by friction"),
     ("bridge", {"saturated": True}, "At rest: the coils are at their limit"),
 ]
-# As one text, and what all graphs share but once: value by value, thousands of views take the browser minutes.
 
 
 def test_a_held_key_without_motion_always_has_a_reason(operator: Operator):
@@ -402,13 +386,65 @@ def test_a_held_key_without_motion_always_has_a_reason(operator: Operator):
         assert operator.page.evaluate(script, view).startswith(expected)
 
 
-def test_nothing_is_cut_off(operator: Operator):
-    operator.served.graph.shown = state("sliding", 12)
-    for width, height in ((1366, 768), (1024, 700)):
-        operator.page.set_viewport_size({"width": width, "height": height})
-        operator.drawn("sliding")
-        expect(operator.page.locator("#friction")).to_contain_text("12 nodes")
-        assert operator.cut_off() == []
-        dish = operator.page.locator("#dish").bounding_box()
-        assert dish is not None
-        assert min(dish["width"], dish["height"]) > 0.55 * height
+def test_estimate_prediction_and_measurement_have_their_own_colours(operator: Operator) -> None:
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    graph.shown = estimated_state()
+    teal, magenta = "#00a3a8", "#99107f"
+    dish = operator.page.locator("#dish")
+    expect(dish).to_have_attribute("data-estimate", "measured")
+    assert operator.drawn("free") == "#12a150"
+    at = between(36, 37)
+    operator.until(lambda: {"#12a150", teal} <= operator.colours_at(at, 5))
+    x, y = graph.shown["predicted"]["vertices"][38]
+    operator.until(lambda: magenta in operator.colours_at((x, y), 6))
+    expect(operator.page.locator("#margins")).to_contain_text("Measured50 %")
+    expect(operator.page.locator("#margins")).to_contain_text("99 % bound")
+    legend = operator.page.locator("#legend")
+    for text in ("measured thread", "estimated", "predicted by the model alone"):
+        expect(legend).to_contain_text(text)
+    graph.shown = state()
+    expect(dish).to_have_attribute("data-estimate", "none")
+    operator.until(lambda: teal not in operator.colours_at(at, 5))
+    expect(operator.page.locator("#margins")).not_to_contain_text("99 % bound")
+
+
+def test_a_disturbance_is_marked_at_its_position_and_described(operator: Operator) -> None:
+    graph = operator.served.graph
+    operator.page.emulate_media(color_scheme="light")
+    graph.shown = estimated_state(found=True)
+    expect(operator.page.locator("#dish")).to_have_attribute("data-disturbances", "1")
+    expect(operator.page.locator("#margins")).to_contain_text("Held at 22 mm of the thread: 0.2 mN up and to the left")
+    found = graph.shown["estimated"]["disturbances"][0]
+    x, y = found["position"]
+    behind = (x - 1e-3 * found["direction"][0], y - 1e-3 * found["direction"][1])
+    operator.until(lambda: "#d1122f" in operator.colours_at(behind))
+    graph.shown = estimated_state()
+    expect(operator.page.locator("#dish")).to_have_attribute("data-disturbances", "0")
+    operator.until(lambda: "#d1122f" not in operator.colours_at(behind))
+
+
+def test_the_forecast_thread_is_drawn_as_a_ghost_beside_the_thread(operator: Operator) -> None:
+    graph, dish = operator.served.graph, operator.page.locator("#dish")
+    graph.shown = state()
+    expect(dish).to_have_attribute("data-ghosts", "0")
+    expect(operator.page.locator("#forecast-legend")).to_be_hidden()
+    ahead = forecast_state()
+    places = [tuple(ghost["vertices"][38]) for ghost in ahead["forecast"]["ghosts"]]
+    # A ghost is mixed with what is below it, so that its colour is that of no line.
+    before = [operator.colours_at(place, 0) for place in places]
+    graph.shown = ahead
+    expect(dish).to_have_attribute("data-ghosts", "3")
+
+    def all_differ() -> bool:
+        return all(operator.colours_at(place, 0) != colour for place, colour in zip(places, before, strict=True))
+
+    operator.until(all_differ)
+    expect(operator.page.locator("#forecast-legend")).to_have_text("forecast for 3.0 s, fainter the later")
+    expect(operator.page.locator("#forecast")).to_be_hidden()  # nothing happens
+
+
+def test_a_shape_with_a_hostile_name_is_shown_as_text(operator: Operator) -> None:
+    operator.served.graph.shown = forecast_state("touches the <b>ring</b> in 0.8 s")
+    expect(operator.page.locator("#forecast")).to_have_text("Touches the <b>ring</b> in 0.8 s")
+    assert operator.page.locator("#forecast b").count() == 0

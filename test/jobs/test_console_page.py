@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from examples.console_picture import AROUND, PATH, SCREEN, SPEED, WAIT, Pilot, nearby
-from magnetosuture_thread.nodes.console.graph import Inbox
+from magnetosuture_thread.nodes.clients import Inbox
 from test.console.conftest import browser
 from test.jobs.test_console import running, wire
 

@@ -137,8 +137,6 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     ("spoil", "words"),
     [
         (lambda m: setattr(m.twist.linear, "x", math.nan), "finite numbers"),
-        (lambda m: setattr(m.twist.linear, "y", -math.inf), "finite numbers"),
-        (lambda m: setattr(m.twist.linear, "z", 0.001), "x and y alone count"),
         (lambda m: setattr(m.twist.angular, "z", math.nan), "x and y alone count"),
         (lambda m: setattr(m.header, "frame_id", "base_link"), "'dish'"),
         (lambda m: setattr(m.header, "stamp", Time(sec=5)), "at most 0.1 s"),

@@ -12,7 +12,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Vector3
 from magnetosuture_msgs.msg import (
     BarrierMargin,
-    CoilBridgeState,
     EstimatedThread,
     PredictedThread,
     SafetyMargins,
@@ -21,7 +20,7 @@ from magnetosuture_msgs.msg import (
 )
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes.console import messages
+from magnetosuture_thread.nodes import console_state as messages
 from magnetosuture_thread.scene import read_scene
 from test.nodes import wire
 
@@ -128,23 +127,3 @@ def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
     heard = messages.scene(wire.scene_message(STAMP, scene))
     assert messages.shown_scene(scene) == heard
     assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
-
-
-def test_the_bridge():
-    message = CoilBridgeState(
-        state=CoilBridgeState.STATE_FAULT,
-        emergency_stopped=True,
-        reasons=["fault: emergency stop"],
-        driver="roboclaw",
-        driver_warnings=["hot"],
-        current=[1.0, 2.0],
-        measured_current=[0.9],
-        refused=3,
-    )
-    told = plain(messages.bridge(message))
-    assert told["state"] == "fault"
-    assert told["emergency_stopped"]
-    assert not told["armed"]
-    assert told["reasons"] == ["fault: emergency stop"]
-    assert (told["current"], told["measured_current"], told["refused"]) == ([1.0, 2.0], [0.9], 3)
-    assert told["driver_warnings"] == ["hot"]

@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import diagnostics, topics
-from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.node import Health
 
 
 def test_a_change_is_said_at_once_and_the_state_once_a_second(graph):

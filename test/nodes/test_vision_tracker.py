@@ -128,24 +128,6 @@ def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
     assert len(poses) == 1
 
 
-def test_a_frame_with_an_impossible_stamp_is_refused(graph, camera, thread_arc):
-    """Nothing that is published could be stamped by it."""
-    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
-    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-    image = frame(camera, thread_arc)
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=1_000_000_000)))
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=6, nanosec=0)))
-    graph.wait(lambda: bool(poses and tracking), "the second frame")
-    assert [pose.header.stamp for pose in poses] == [state.header.stamp for state in tracking] == [Time(sec=6)]
-
-    def is_reported() -> bool:
-        values = [value for array in diagnostics for value in array.status[0].values]
-        return any(value.key == "last refusal" and "nanosec" in value.value for value in values)
-
-    graph.wait(is_reported, "the refusal")
-
-
 def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_not_used(graph):
     case, image = frame_of("distortion", 2, 31)
     lens = case.lens
