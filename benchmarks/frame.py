@@ -20,7 +20,6 @@ from magnetosuture_thread.geometry.polyline import lay_behind_needle
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.setups import read_setup
 
-LIMITS = {"files": 20, "functions": 80, "calls": 1000}
 FRAMES = 20  # before the one that is counted, 33 ms apart
 PACKAGE = str(Path(__file__).parents[1] / "magnetosuture_thread")
 
@@ -31,15 +30,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
-    """Count one frame; return the figures, and whether they are within the limits."""
+    """Count one frame; return the figures, by folder and of all. There is no limit to pass."""
     calls = count_frame()
-    files = {name for name, _ in calls}
-    figures = {"files": len(files), "functions": len(calls), "calls": calls.total()}
-    if options.list:
-        for (file, function), count in sorted(calls.items()):
-            console.print(f"{count:6d}  {file}  {function}")
-    console.print(", ".join(f"{figures[name]} {name} (at most {limit})" for name, limit in LIMITS.items()))
-    return figures, all(figures[name] <= limit for name, limit in LIMITS.items())
+    figures: dict[str, Any] = {}
+    for folder in (*sorted({file.partition("/")[0] for file, _ in calls}), ""):
+        own = {key: count for key, count in calls.items() if key[0].startswith(folder)}
+        files = {file for file, _ in own}
+        figures[folder or "all"] = {"files": len(files), "functions": len(own), "calls": sum(own.values())}
+    for (file, function), count in sorted(calls.items()) if options.list else ():
+        console.print(f"{count:6d}  {file}  {function}", soft_wrap=True)
+    for folder, found in figures.items():
+        console.print(f"{folder:16}" + ", ".join(f"{count:4d} {name}" for name, count in found.items()))
+    return figures, True
 
 
 def count_frame() -> Counter[tuple[str, str]]:

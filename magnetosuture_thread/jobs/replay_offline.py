@@ -34,14 +34,14 @@ from magnetosuture_thread.jobs.replay_inputs import (
     replay_summary,
     write_results,
 )
-from magnetosuture_thread.messages.outputs import (
+from magnetosuture_thread.messages.packing import (
     Outputs,
     estimate_outputs,
+    packed_tracker_state,
     pose_outputs,
     prediction_outputs,
     thread_outputs,
 )
-from magnetosuture_thread.messages.packing import packed_tracker_state
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations

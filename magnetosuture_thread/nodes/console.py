@@ -54,10 +54,8 @@ from magnetosuture_thread.vision.images import unpack_image
 
 NAME = "console"
 RIG = "rig_simulator"
-PLAN_TIMEOUT = 60.0  # s; a long way takes some seconds, and is planned once
 NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
-LONG_PERIOD, SCENE_PERIOD = 0.1, 0.5  # s; paths and forecasts take a millisecond to read, a large scene more
 MAX_NODES = 32  # shown
 MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
 
@@ -72,23 +70,25 @@ ACTIONS: dict[str, tuple[str, Any]] = {
     "stop": (EMERGENCY_STOP, Trigger.Request()),
     "reset": (RESET, Trigger.Request()),
 }
-# Parts of the state: the topic, what reads its messages, how seldom [s], and whether the part has its age.
+# Parts of the state: the topic, what reads its messages, how seldom [s], and whether the part has its age. Paths and
+# forecasts take a millisecond to read, a large scene more.
 READERS = {
     "tracker": (topics.TRACKER_STATE, page.tracker, 0.0, True),
     "needle": (topics.NEEDLE_POSE, page.needle, 0.0, True),
-    "measured": (topics.MEASURED_THREAD, page.measured_thread, LONG_PERIOD, False),
+    "measured": (topics.MEASURED_THREAD, page.measured_thread, 0.1, False),
     "predicted": (topics.PREDICTED_THREAD, page.predicted, 0.0, True),
     "estimated": (topics.ESTIMATED_THREAD, page.estimated, 0.0, True),
-    "forecast": (topics.FORECAST, page.forecast, LONG_PERIOD, True),
+    "forecast": (topics.FORECAST, page.forecast, 0.1, True),
     "margins": (topics.MARGINS, page.margins, 0.0, False),
-    "scene": (topics.SCENE, page.scene, SCENE_PERIOD, False),
+    "scene": (topics.SCENE, page.scene, 0.5, False),
     "filter": (topics.FILTER_STATE, page.filter_state, 0.0, True),
     "bridge": (topics.BRIDGE_STATE, page.bridge, 0.0, True),
     "procedure": (topics.PROCEDURE_STATE, page.procedure, 0.0, False),
     "plan": (topics.PROCEDURE_PLAN, page.plan, 0.0, False),
 }
-_RECORDED = (topics.INPUTS, topics.OUTPUTS, topics.SIMULATED, topics.SETTINGS, topics.PROCEDURES)
-RECORDED_TOPICS = tuple({topic.name: topic for kind in _RECORDED for topic in kind}.values())
+RECORDED_TOPICS = tuple(
+    dict.fromkeys((*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *topics.PROCEDURES))
+)
 
 
 class ConsoleGraph:
@@ -149,7 +149,8 @@ class ConsoleGraph:
             return self.blocked
         if action == "plan":
             request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
-            return await self.call(PLAN_PROCEDURE, request, timeout=PLAN_TIMEOUT, retry_period=math.inf)
+            # A long way takes some seconds, and is planned once.
+            return await self.call(PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
         names = {"resume": RESUME_PROCEDURE, "pause": PAUSE_PROCEDURE, "abort": ABORT_PROCEDURE}
         return await self.call(names[action], Trigger.Request())
 

@@ -33,8 +33,7 @@ from magnetosuture_thread.nodes.parameters import (
 C = TypeVar("C", bound=Configuration)
 E = TypeVar("E", bound="Publisher | Subscription | Service | Timer")
 
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-ERROR = TransitionCallbackReturn.ERROR
+SUCCESS = TransitionCallbackReturn.SUCCESS
 INACTIVE = "inactive: messages are not used until the node is activated"
 
 
@@ -186,7 +185,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         except Exception as error:
             self.on_cleanup(state)
             self._failed(error)
-            return ERROR
+            return TransitionCallbackReturn.ERROR
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -239,7 +238,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         self.problem = error
         if not self._starts:  # at its start the node ends by this error
             self.get_logger().error(reason_of(error))
-        return FAILURE
+        return TransitionCallbackReturn.FAILURE
 
     def _check_change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Refuse to change fixed settings of a configured node, and prepare others; the value in force is no change."""

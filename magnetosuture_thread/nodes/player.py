@@ -33,8 +33,6 @@ from magnetosuture_thread.nodes.clients import Inbox, answer_requests, joined
 from magnetosuture_thread.nodes.timeline import Timeline
 
 CLOCK_PERIOD = 10_000_000  # ns of simulated time between two messages on /clock
-STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
-POLL_PERIOD = 0.002  # s between two looks at the outputs
 START_TIMEOUT = 180.0  # s for all nodes to be there
 # s after we have found all nodes, for the nodes to have found us and each other: DDS announces a node a few times as it
 # starts and then each 3 s, and on a busy machine the first of these get lost.
@@ -276,8 +274,8 @@ class LiveReplay:
         """Take outputs until a simulated time is there."""
         while (left := self._time.left(simulated)) > 0.0:
             self._take()
-            time.sleep(min(left, POLL_PERIOD))
-            if self._time.paused and time.perf_counter() - self._last_clock > STILL_PERIOD:
+            time.sleep(min(left, 0.002))
+            if self._time.paused and time.perf_counter() - self._last_clock > 0.1:
                 self._publish_clock(self._still)
 
     def _take(self) -> None:

@@ -20,8 +20,7 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface
 from magnetosuture_thread.interface import PAUSE_RIG
-from magnetosuture_thread.messages.outputs import camera_outputs, ground_truth_outputs
-from magnetosuture_thread.messages.packing import packed_image
+from magnetosuture_thread.messages.packing import camera_outputs, ground_truth_outputs, packed_image
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.nodes.parameters import declare, given_parameters

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from magnetosuture_msgs.srv import ForecastPath
@@ -18,7 +20,7 @@ from magnetosuture_thread import (
     Scene,
     ThreadForecaster,
 )
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast import Forecast, make_forecaster
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.markers import packed_forecast_markers
@@ -30,18 +32,6 @@ from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSe
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
-
-
-class ForecastTask(NamedTuple):
-    """One forecast to make: the held command, where it starts, and the stamp of its message [ns]."""
-
-    forecaster: ThreadForecaster
-    stamp: int
-    start: ForecastStart
-    commanded: np.ndarray
-    horizon: float
-    slowed: bool
-    generation: int
 
 
 class ThreadForecasts:
@@ -68,7 +58,8 @@ class ThreadForecasts:
         self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
         node.held(node.create_service(ForecastPath, FORECAST_PATH, self.on_path))
-        self._waiting: SimpleQueue[ForecastTask | None] = SimpleQueue()
+        # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
+        self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
         self._error: Exception | None = None
         self._worker = Thread(target=self._work, name="forecasts", daemon=True)
         self._worker.start()
@@ -117,29 +108,28 @@ class ThreadForecasts:
             _, commanded, filtered, source = self._command
         start = ForecastStart.of_estimate(result.estimate, pose, filtered)
         slowed = source == "operator" or settings.friction_feedback == "all"
-        horizon = settings.forecast_horizon
-        task = ForecastTask(forecaster, result.stamp, start, commanded, horizon, slowed, self._generation)
-        self._waiting.put(task)
+        make = partial(forecaster.forecast, start, commanded, settings.forecast_horizon, slowed=slowed)
+        self._waiting.put((result.stamp, self._generation, make))
 
     def _work(self) -> None:
         while self._error is None and (task := self._waiting.get()) is not None:
             try:
                 if self._waiting.empty():
-                    self._publish(task)
+                    self._publish(*task)
             except Exception as error:
                 self._error = error
 
-    def _publish(self, task: ForecastTask) -> None:
+    def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
         try:
-            forecast = task.forecaster.forecast(task.start, task.commanded, task.horizon, slowed=task.slowed)
+            forecast = make()
         except MagnetosutureError as error:
             self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
             return
-        if task.generation != self._generation:
+        if generation != self._generation:
             return
-        self._published.publish(packed_forecast(task.stamp, forecast))
+        self._published.publish(packed_forecast(stamp, forecast))
         if self._markers.get_subscription_count():
-            self._markers.publish(packed_forecast_markers(task.stamp, forecast))
+            self._markers.publish(packed_forecast_markers(stamp, forecast))
 
     def on_path(self, request: Any, answer: Any) -> Any:
         """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.

@@ -17,7 +17,7 @@ from magnetosuture_thread.configuration import to_mapping
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_thread_markers
-from magnetosuture_thread.messages.outputs import estimate_outputs, prediction_outputs
+from magnetosuture_thread.messages.packing import estimate_outputs, prediction_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.node import Health

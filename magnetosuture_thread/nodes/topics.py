@@ -49,7 +49,6 @@ MAX_BYTES = {
     "std_msgs": 1 << 12,
     "rosgraph_msgs": 1 << 12,
 }
-MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 
@@ -74,7 +73,7 @@ class Topic:
     def max_bytes(self) -> int:
         """Return how many bytes a message may have."""
         kind = self.channel.type_name
-        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], MAX_OTHER_BYTES)
+        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], 1 << 19)
 
     @property
     def message(self) -> Any:

@@ -13,8 +13,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.outputs import Outputs, pose_outputs, thread_outputs
-from magnetosuture_thread.messages.packing import packed_tracker_state
+from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.scene_follower import SceneFollower

@@ -92,7 +92,7 @@ class Graph:
         self.wait(lambda: all(s.get_publisher_count() > 0 for s in others), f"{topic.name} to be found")
         publisher.publish(message)
 
-    def call(self, kind: Any, name: str, timeout: float = 30.0, **fields: Any) -> Any:
+    def call(self, kind: Any, name: str, timeout: float = 30.0, /, **fields: Any) -> Any:
         """Call a service and return its answer."""
         client = self.probe.create_client(kind, name)
         self.wait(client.service_is_ready, f"the service {name}")

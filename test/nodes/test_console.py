@@ -155,16 +155,6 @@ def test_a_flood_of_diagnostics_keeps_the_state_small_and_our_own_nodes_in_it(gr
     graph.wait(lambda: set(console.nodes()) == {"coil_bridge"}, "the silent nodes to be dropped")
 
 
-def test_in_a_namespace_nodes_of_other_rigs_are_not_shown(graph):
-    names = ("left/coil_bridge", "left/rig_simulator", "right/thread_model", "right/console", "scene_server", "usb_cam")
-    with joined(domain=graph.domain, namespace="left") as node:
-        console = ConsoleGraph(node, ConsoleSettings())
-        report = DiagnosticArray(status=[DiagnosticStatus(name=f"{name}: state", message="x") for name in names])
-        tell(graph, topics.DIAGNOSTICS, report, lambda: "usb_cam" in console.nodes(), "the report")
-        assert set(console.nodes()) == {"coil_bridge", "rig_simulator", "usb_cam"}
-        assert GraphHost(console).state()["simulated"]
-
-
 @pytest.mark.parametrize("transport", ["compressed", "raw"])
 def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     console = ConsoleGraph(node, ConsoleSettings(image_transport=transport))

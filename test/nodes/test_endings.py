@@ -241,15 +241,6 @@ def test_a_barrier_is_imported_when_the_bridge_starts_or_not_at_all(
     assert "late_barriers" not in sys.modules
 
 
-def test_two_bridges_of_other_names_keep_their_own(graph, tmp_path: Path):
-    node = graph.add(CoilBridgeNode, stop_file=str(tmp_path / "left.stop"), **READY)
-    assert press(graph, EMERGENCY_STOP).success
-    graph.remove(node)
-    graph.remove(graph.add(CoilBridgeNode, stop_file=str(tmp_path / "right.stop"), **READY))
-    assert (tmp_path / "left.stop").read_text() == "stopped\n"
-    assert (tmp_path / "right.stop").read_text() == "disarmed\n"
-
-
 @pytest.mark.parametrize("file", ["/dev/full", "/proc/nowhere/bridge.stop", "/dev"])
 def test_a_stop_that_cannot_be_kept_is_an_error_at_configure(graph, file: str):
     with pytest.raises(InvalidInputError, match=r"coil_bridge\.stop_file: got .*, expected a file that can"):

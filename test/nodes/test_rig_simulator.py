@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
 
-from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.nodes import topics
@@ -139,28 +135,6 @@ def test_a_fault_can_be_asked_for_now(graph):
     graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
     graph.wait(lambda: any("expected KIND DURATION" in text for text in refusals(diagnostics)), "a refusal")
     assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
-
-
-def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    ports = (str(tmp_path / "a"), str(tmp_path / "b"))
-    node = graph.add(RigSimulatorNode, power_stage="roboclaw", power_stage_ports=list(ports), **SMALL)
-    driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports, roboclaw_addresses=(128, 129)))
-    driver.open()
-    try:
-        graph.wait(lambda: driver.state().ready and len(needles) > 3, "the boards")
-        assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
-
-        def pulled() -> bool:
-            driver.apply(np.array([5.0, 0.0, -2.0, 0.0]), time.monotonic())
-            return bool(needles[-1].pose.position.x > 0.0035)
-
-        graph.wait(pulled, "the needle to move")
-    finally:
-        driver.close()
-    graph.wait(lambda: bool(np.abs(node.rig.currents).max() < 1e-3), "the currents to go")
-    graph.remove(node)
-    assert not list(tmp_path.iterdir())
 
 
 def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):

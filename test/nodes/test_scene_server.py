@@ -97,15 +97,10 @@ def test_without_a_scene_only_loading_one_is_possible(graph):
 
 HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dead_end"),
-    ("load", {"file": "/dev/zero"}, "scene: got '/dev/zero', expected a YAML or GeoJSON file"),
     ("load", {"file": "FIFO"}, "scene: got '"),
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
-    ("load", {"file": "../../etc/nowhere"}, "scene: got '../../etc/nowhere', expected a YAML or GeoJSON file"),
     ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
-    ("add", {"name": "x" * 65, "shape": DISC}, "name: got '65 characters', expected at most 64"),
-    ("add", {"name": "a\nb", "shape": DISC}, "shapes: got 'a\\nb', expected names of"),
     ("add", {"name": "post", "shape": DISC}, "post: got 'a name given twice', expected a name of its own"),
-    ("add", {"name": "a", "shape": ""}, "a: got None, expected a shape, one of disc"),
     (
         "add",
         {"name": "a", "shape": "{disc: {center: [1, 2], radius: 0.5}"},
@@ -114,7 +109,6 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
     ("add", {"name": "a", "shape": "{disc: {center: [1, 1], radius: 0.1}}"}, "a: got 'a shape outside of the dish"),
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: -0.1}"}, "a.friction: got -0.1"),
-    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: 1e9}"}, "a.friction: got 1"),
     ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
     ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
     (
@@ -123,7 +117,6 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
         "shape: got '300001 characters', expected at most 300",
     ),
     ("replace", {"name": "none", "shape": DISC}, "shape.name: got 'none', expected one of post"),
-    ("remove", {"name": "none"}, "shape.name: got 'none', expected one of post"),
     ("remove", {"name": "x" * 100_000}, "shape.name: got 'xxxxxxxx"),
 ]
 

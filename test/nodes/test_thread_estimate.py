@@ -114,18 +114,6 @@ def test_every_frame_has_an_estimate_beside_the_prediction(bench: Bench):
     bench.graph.wait(bench.hears("predicting"), "the state")
 
 
-def test_a_frame_without_an_observation_is_only_predicted_and_says_since_when(bench: Bench):
-    bench.show(0)
-    for k in (1, 2, 45):
-        bench.pose(k)
-        bench.wait_for_estimate(k)
-        message = bench.estimated[-1]
-        assert (message.prediction_only, message.hidden, message.points) == (True, 1.0, 0)
-        assert message.unmeasured_for == pytest.approx(k / 30.0, abs=1e-6)
-        assert message.innovation_degrees == 0
-    bench.graph.wait(bench.hears("only a prediction since 1 s"), "a warning")
-
-
 def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(bench: Bench):
     for k in range(3):
         bench.show(k)

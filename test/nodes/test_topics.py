@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import yaml
 from rclpy.qos import DurabilityPolicy
 
@@ -26,14 +25,3 @@ def test_ros2_bag_gets_the_quality_of_service_of_topics_whose_last_message_is_ke
         for name, topic in every.items()
         if topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
     }
-
-
-@pytest.mark.parametrize("depth", [5, 300])
-def test_a_replay_makes_every_queue_reliable_and_deep(depth: int):
-    overrides = topics.lossless(depth)["/**"]["ros__parameters"]["qos_overrides"]
-    for topic in (*topics.INPUTS, *topics.OUTPUTS):
-        if topic.channel.quality is interface.Quality.LATCHED:
-            assert topic.channel.recorded not in overrides
-        else:
-            for role in ("publisher", "subscription"):
-                assert overrides[topic.channel.recorded][role] == {"reliability": "reliable", "depth": depth}
