@@ -28,14 +28,13 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.thread.formulations import RodFormulation
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import MAX_STEP_LENGTH, ThreadPredictor
-from magnetosuture_thread.thread.rod_step import ENDED, NO_ROOM
+from magnetosuture_thread.thread.program import ContactBuffers
+from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
-from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
@@ -279,12 +278,12 @@ class ThreadForecaster:
     def _buffers(self, start: ForecastStart) -> RolloutBuffers:
         """Return buffers as the step before the start left them."""
         segments, prescribed = self.thread.segments, len(self._model.prescribed)
-        step = StepBuffers.of(segments + 1, 2, segments)
+        step = self._formulation.new_buffers()
         if start.warm_start is not None and start.interval > 0.0:
             step.restore(start.warm_start)
         return RolloutBuffers(
             step=step,
-            solver=BandedSolver().buffers(segments + 1, 2, len(step.first)),
+            solver=BandedSolver().buffers(segments + 1, 2, len(step.program.first)),
             contacts=ContactBuffers.of(segments + 1, 2, len(self.scene.shapes)),
             ends=np.zeros((3, prescribed, 2)),
             pose=np.zeros(6),
