@@ -14,7 +14,7 @@ from magnetosuture_thread.thread.formulations import make_formulation
 from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
-from magnetosuture_thread.thread.rod_step import FRICTION_TOLERANCE, MAX_FRICTION_SOLVES
+from magnetosuture_thread.thread.rod import FRICTION_TOLERANCE, MAX_FRICTION_SOLVES
 from magnetosuture_thread.thread.solvers import BandedSolver, OsqpSolver
 
 

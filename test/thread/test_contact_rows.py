@@ -12,7 +12,7 @@ from magnetosuture_thread.thread.contact_rows import (
     contact_rows,
     stays_clear,
 )
-from magnetosuture_thread.thread.step_buffers import StepBuffers
+from magnetosuture_thread.thread.program import StepBuffers
 
 NODES, UNIT, RADIUS = 20, 1e-3, 5e-5
 ROUNDED = Polygon(
