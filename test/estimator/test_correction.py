@@ -23,8 +23,8 @@ from magnetosuture_thread.estimator.correction import (
 )
 from magnetosuture_thread.thread.banded import assemble_matrix, factorise
 from magnetosuture_thread.thread.formulations import RodFormulation
-from magnetosuture_thread.thread.osqp_solver import as_quadratic_program
-from magnetosuture_thread.thread.step_buffers import StepBuffers, program_of
+from magnetosuture_thread.thread.program import StepBuffers, program_of
+from magnetosuture_thread.thread.solvers import as_quadratic_program
 from magnetosuture_thread.thread_observation import ThreadObservation
 from test.estimator.threads import (
     LENGTH,
