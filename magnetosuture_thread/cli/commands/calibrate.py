@@ -103,7 +103,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     is 130. Before there is any, nothing is written, and it is 1.
     """
     from magnetosuture_thread import calibrate_bags
-    from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table
+    from magnetosuture_thread.calibration.result import bag_table, calibration_lines, parameter_table
 
     console = make_console()
     log = make_log(console)
