@@ -223,8 +223,7 @@ def packed_scene_markers(stamp: Stamp, scene: Scene) -> bytes:
             scale = (2.0 * geometry.radius, 2.0 * geometry.radius, THICKNESS)
             markers.append(Marker("shapes", index, CYLINDER, scale, colour, 0.8, place=geometry.centre))
         else:
-            cut = triangulate(geometry)
-            corners = cut.vertices[cut.triangles].reshape(-1, 2)
+            corners = triangulate(geometry).reshape(-1, 2)
             markers.append(Marker("shapes", index, TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners))
         place, size = (*shape.label_point, THICKNESS), (0.0, 0.0, NAME_SIZE * diameter)
         markers.append(Marker("names", index, TEXT, size, NAME_INK, place=place, caption=shape.name))
