@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import attack, contact, forecast, golden, keep_out, lies, page, solver
+from benchmarks import attack, contact, forecast, frame, golden, keep_out, lies, page, solver
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
 from benchmarks.network import command as network
@@ -29,7 +29,7 @@ from magnetosuture_thread.commands.command import (
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
 BENCHMARKS: dict[str, Any] = {
     **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "contact": contact, "lies": lies},
-    "golden": golden,
+    **{"golden": golden, "frame": frame},
     **{"attack": attack, "vision": vision, "estimator": estimator, "forecast": forecast, "network": network},
 }
 

@@ -214,8 +214,8 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
     """
     from magnetosuture_thread.messages.cdr import header_stamp
     from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.clients import Recorder
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
-    from magnetosuture_thread.nodes.recorder import Recorder
 
     taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
     times: dict[str, list[float]] = {channel.recorded: [] for channel in STATIONS}

@@ -144,8 +144,7 @@ def _topics_in(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
 
 def _modules_of(node: str) -> set[Path]:
     """Return the files in `nodes/` that a node consists of: its own, and all that these import."""
-    home = NODES / node
-    waiting = [home / "node.py" if home.is_dir() else home.with_suffix(".py")]
+    waiting = [NODES / f"{node}.py"]
     found: set[Path] = set()
     while waiting:
         path = waiting.pop()

@@ -6,16 +6,18 @@ from magnetosuture_thread import interface
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.campaign.loop import Measurement, Vector
 from magnetosuture_thread.coils.bridge import BridgeOutput
-from magnetosuture_thread.messages.outputs import (
+from magnetosuture_thread.messages.packing import (
     Outputs,
     camera_outputs,
     estimate_outputs,
     ground_truth_outputs,
+    packed_currents,
+    packed_filter_state,
+    packed_twist,
     pose_outputs,
     prediction_outputs,
     thread_outputs,
 )
-from magnetosuture_thread.messages.packing import packed_currents, packed_filter_state, packed_twist
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame

@@ -11,11 +11,16 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
-from magnetosuture_thread.calibration.output import bag_table, calibration_lines, parameter_table, to_yaml
 from magnetosuture_thread.calibration.parameters import choose_parameters
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
 from magnetosuture_thread.calibration.residuals import BestSettings, replay_pool
-from magnetosuture_thread.calibration.result import CalibrationResult
+from magnetosuture_thread.calibration.result import (
+    CalibrationResult,
+    bag_table,
+    calibration_lines,
+    parameter_table,
+    to_yaml,
+)
 from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.commands.command import (
     DONE,

@@ -34,8 +34,8 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.graph import RECORDED_TOPICS, ConsoleGraph, Inbox
-from magnetosuture_thread.nodes.console.node import RIG, GraphHost, joined
+from magnetosuture_thread.nodes.clients import Inbox, joined
+from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.program import STOPS
 from magnetosuture_thread.resources import share_directory

@@ -22,7 +22,7 @@ from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCo
 from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import COMPILING
+from magnetosuture_thread.nodes.node import COMPILING
 from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.run import Interruption

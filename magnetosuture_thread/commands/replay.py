@@ -39,14 +39,14 @@ from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
-from magnetosuture_thread.messages.outputs import (
+from magnetosuture_thread.messages.packing import (
     Outputs,
     estimate_outputs,
+    packed_tracker_state,
     pose_outputs,
     prediction_outputs,
     thread_outputs,
 )
-from magnetosuture_thread.messages.packing import packed_tracker_state
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.thread_model.session import WAITING

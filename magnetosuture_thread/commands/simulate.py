@@ -43,8 +43,7 @@ from magnetosuture_thread.evaluation.tables import loop_table
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import DONE as PROCEDURE_DONE
-from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient
-from magnetosuture_thread.nodes.recorder import Recorder
+from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient, Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.rig.power.stage import board_addresses

@@ -25,7 +25,7 @@ from rclpy.context import Context
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.console.graph import Inbox
+from magnetosuture_thread.nodes.clients import Inbox
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
 from test.console.visitor import Page, opened, until
 

@@ -33,16 +33,6 @@ from magnetosuture_thread.thread.margins import node_clearance
 
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts
 MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the page
-MAX_REASON_CHARS = 400
-MAX_GHOSTS = 3  # instants of a forecast that are sent to the page
-MAX_PLAN_POINTS = 400  # that are sent to the page
-DRAWN_WITHIN = 2e-4  # of the dish's diameter; a fifth of a pixel
-LEVELS = {
-    DiagnosticStatus.OK: "ok",
-    DiagnosticStatus.WARN: "warn",
-    DiagnosticStatus.ERROR: "error",
-    DiagnosticStatus.STALE: "silent",
-}
 
 
 def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
@@ -126,7 +116,7 @@ def forecast(message: ThreadForecast) -> dict[str, Any]:
         found = f"{count} positions and {instants} instants"
         raise InvalidInputError("thread/forecast", found, "as many positions at each instant")
     nodes = count // instants
-    shown = sorted({round(index) for index in np.linspace(0, instants - 1, MAX_GHOSTS + 1)[1:]})
+    shown = sorted({round(index) for index in np.linspace(0, instants - 1, 4)[1:]})
     ghosts = [
         {"time": message.time[at], "vertices": _points(message.positions[at * nodes : (at + 1) * nodes])}
         for at in shown
@@ -178,11 +168,12 @@ def scene(message: SceneMessage) -> dict[str, Any]:
 
 def shown_scene(known: Scene) -> dict[str, Any]:
     """Return a scene as the page draws it: discs as x, y and radius, others as outline and holes [m]."""
+    tolerance = 2e-4 * known.dish.diameter  # a fifth of a pixel
     return {
         "version": known.version,
         "dish_diameter": known.dish.diameter,
         "dish_depth": known.dish.depth,
-        "shapes": [_shown_shape(shape, DRAWN_WITHIN * known.dish.diameter) for shape in known.shapes],
+        "shapes": [_shown_shape(shape, tolerance) for shape in known.shapes],
     }
 
 
@@ -218,7 +209,7 @@ def procedure(message: ProcedureState) -> dict[str, Any]:
         "state": _constant(message, message.state, "STATE_", "failed"),
         "name": shortened(message.procedure),
         **_plain(message, "goals", "goal", "goals_met", "progress", "resumes", "hold_to_run"),
-        "reason": shortened(message.reason, MAX_REASON_CHARS),
+        "reason": shortened(message.reason, 400),
         "clearance": message.clearance if np.isfinite(message.clearance) else None,
     }
 
@@ -226,13 +217,14 @@ def procedure(message: ProcedureState) -> dict[str, Any]:
 def plan(message: Path) -> list[list[float]]:
     """Return where the middle of the needle is to go [m]; of a long way every second place, or fewer."""
     points = measured_thread(message)
-    return points[:: 1 + len(points) // MAX_PLAN_POINTS]
+    return points[:: 1 + len(points) // 400]
 
 
 def node_state(status: DiagnosticStatus) -> dict[str, Any]:
     """Return a node's diagnostic status."""
+    levels = {DiagnosticStatus.OK: "ok", DiagnosticStatus.WARN: "warn", DiagnosticStatus.STALE: "silent"}
     return {
-        "level": LEVELS.get(status.level, "error"),
+        "level": levels.get(status.level, "error"),
         "message": shortened(status.message),
         "values": {shortened(value.key): shortened(value.value) for value in status.values[:MAX_LISTED]},
     }
