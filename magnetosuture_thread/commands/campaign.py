@@ -22,8 +22,7 @@ from rich.table import Table
 
 from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.campaign.bag import RunBag
-from magnetosuture_thread.campaign.loop import START
+from magnetosuture_thread.campaign.loop import START, RunBag
 from magnetosuture_thread.campaign.run import (
     KEEP_OUT_TOLERANCE,
     MAX_REST,

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ from magnetosuture_thread.commands.command import (
     runs,
     whole_number,
 )
-from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, log_compiling, own_domain
+from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, Place, log_compiling, own_place
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.configuration import from_mapping, to_mapping
@@ -103,41 +103,18 @@ def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
             source.given.check_loop()
             shown = settings(source.given.setup)
             shown = replace(shown, image_transport=source.transport) if source.transport else shown
-            place = _place(stack)
+            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
             host = ReplayHost(graph, source, place, terminal.log)
             terminal.log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
         else:
             shown = settings(read_setup(name))
-            place = _place(stack)
+            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
             host = SimulatedHost(graph, name, place, options.record, terminal.log)
             terminal.log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
         asyncio.run(_serve(graph, host, terminal.log))
     return DONE
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where nodes run.
-
-    Attributes:
-        domain: ROS domain.
-        environment: for the nodes.
-        logs: folder for what each node prints.
-    """
-
-    domain: int
-    environment: dict[str, str]
-    logs: Path
-
-    def nodes(self, processes: Sequence[str], arguments: Sequence[str]) -> NodeProcesses:
-        """Return nodes that are not started yet."""
-        return NodeProcesses(processes, arguments, self.environment, self.logs)
-
-
-def _place(stack: ExitStack) -> Place:
-    return Place(*stack.enter_context(own_domain()), Path(stack.enter_context(TemporaryDirectory())))
 
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
