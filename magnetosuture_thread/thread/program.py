@@ -233,7 +233,7 @@ class RodBuffers(NamedTuple):
             array[:] = kept
 
 
-def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
+def first_rows(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     """Return the program of the first rows."""
     return ChainProgram(
         buffers.blocks,
@@ -251,9 +251,9 @@ def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     )
 
 
-program_of = compiled(_program_of)
-program_view = compiled_inline(_program_of)
-"""The same for kernels that do not count references to arrays."""
+program_of = compiled(first_rows)
+program_view = compiled_inline(first_rows)
+"""The same for kernels, and for those that do not count references to arrays."""
 
 
 class Residuals(NamedTuple):

@@ -69,7 +69,7 @@ from magnetosuture_thread.thread.program import (
     Solver,
     StepBuffers,
     Vector,
-    program_of,
+    first_rows,
     program_view,
 )
 from magnetosuture_thread.thread.self_contact import SelfContact
@@ -562,7 +562,7 @@ class RodFormulation(Formulation):
                         continue
                 break
             rows = self._rows + done.contacts
-            program = program_of(self._program, buffers.known, rows)
+            program = first_rows(self._program, buffers.known, rows)
             solution = self._solve(program, buffers.motion[VELOCITIES], added)
             self._program.multipliers[:rows], pushes = np.split(solution.multipliers, [rows])
             buffers.motion[VELOCITIES] = solution.velocities

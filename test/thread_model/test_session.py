@@ -233,21 +233,6 @@ def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
     assert formulation == "paper" or margins.in_contact
 
 
-@pytest.mark.parametrize("formulation", ["rod", "paper"])
-@pytest.mark.parametrize("length", [0.019, 0.15])
-def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
-    session = straight(scene_with(diameter=0.035), formulation=formulation, thread_length=length, segments=81)
-    for k in range(10):
-        prediction = predicted(go(session, 1.0 + k / 30.0, x=-0.012 + 1e-4 * k))
-        assert np.linalg.norm(prediction.positions, axis=1).max() < 0.0175 - 30e-6 + 1e-6
-    crooked = ThreadSession(made(formulation=formulation), scene_with(diameter=0.035))
-    go(crooked, 1.0, x=0.0174)
-    wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
-    wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
-    (outcome,) = crooked.on_measured_thread(SECOND, wavy)
-    assert np.linalg.norm(predicted(outcome).positions[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
-
-
 @pytest.mark.parametrize(
     "values",
     [

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.configuration import from_mapping
-from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.session import EstimationResult
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
@@ -226,22 +225,3 @@ def test_a_thread_that_is_fixed_beside_the_tail_is_estimated(offset: float):
     assert estimate.corrected
     assert np.linalg.norm(estimate.positions[-1] - NODES[9, -1]) < 2e-4
     np.testing.assert_allclose(estimate.positions[0], WAY[9].tail + offset * WAY[9].heading, atol=1e-12)
-
-
-@pytest.mark.parametrize("observed", [False, True])
-def test_a_pose_without_solution_restarts_the_estimate_only_of_a_thread_that_was_never_measured(
-    observed: bool, monkeypatch: pytest.MonkeyPatch
-):
-    session = ThreadSession(made(initial_shape="straight"), None)
-    for pose in WAY[:3]:
-        session.on_pose(stamp_of(pose), at(pose))
-    if observed:  # late: its pose has been
-        show(session, 2)
-    assert session._estimator is not None
-    on_pose, failure = session._estimator.on_pose, SolverError("banded", "stalled", 1.0, 1e-6)
-    results = iter((EstimationResult(None, problem=failure),))
-    monkeypatch.setattr(session._estimator, "on_pose", lambda pose: next(results, None) or on_pose(pose))
-    result = session.on_pose(stamp_of(WAY[3]), at(WAY[3]))
-    assert result.estimate_problem is (failure if observed else None)
-    after = session.on_pose(stamp_of(WAY[4]), at(WAY[4]))
-    assert (after.estimate is not None) == observed
