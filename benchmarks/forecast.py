@@ -33,8 +33,8 @@ from magnetosuture_thread import (
 )
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.campaign.run import run_procedure, vary
-from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.coils.bridge import BridgeOutput
+from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
