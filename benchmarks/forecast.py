@@ -2,8 +2,8 @@
 
 Times: one forecast of 3 s in steps at 66 Hz of a thread of 81 segments among three posts, on one core. Errors: of
 forecasts from random moments of runs of the shipped procedures in the loop of a campaign, and of a path follower, under
-the commands that were then sent, in per cent of the thread's length. What a seed varies (viscosity, stiffness, friction,
-coils) the nodes do not know.
+the commands that were then sent, in per cent of the thread's length. What a seed varies (viscosity, stiffness,
+friction, coils) the nodes do not know.
 
 In the loop (simulated rig, the tracker's noise, estimator, and coil bridge) forecasts start from the estimated thread
 and the tracked needle, as those of the node `thread_model` do. Each is given the commands of the following seconds as

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from magnetosuture_thread.thread.formulations import PrescribedMotion, ThreadState
+from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
 from test.thread.scenes import east, formulated, in_air, straight
 
 G = 9.81

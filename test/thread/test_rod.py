@@ -10,15 +10,11 @@ import pytest
 
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-from magnetosuture_thread.thread.formulations import (
-    Formulation,
-    PrescribedMotion,
-    RodFormulation,
-    ThreadState,
-)
 from magnetosuture_thread.thread.material import Attachment, Thread
 from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution, Vector
+from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
+from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, ThreadState
 from test.thread.scenes import (
     DT,
     TOLERANCE,
