@@ -1,4 +1,4 @@
-"""Compiled functions that others call: their code is linked, their results and errors are those of calls from Python."""
+"""Compiled functions that others call: their results and errors are those of calls from Python."""
 
 from __future__ import annotations
 
