@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import NeedlePose
-from magnetosuture_thread.thread.needle_motion import (
-    NeedleMotionFilter,
-)
-from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.session import NeedleMotionFilter, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 RATE = 60.0
