@@ -30,7 +30,7 @@ from magnetosuture_thread.cli.arguments import whole_number
 from magnetosuture_thread.cli.terminal import make_log, progress
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:

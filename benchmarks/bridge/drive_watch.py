@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage
 
 
 class DriveWatch:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.inputs import (
     CONSISTENT_POSES,
     TOPIC,

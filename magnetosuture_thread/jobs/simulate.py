@@ -46,7 +46,7 @@ from magnetosuture_thread.nodes.clients import DONE, CoilClient, ProcedureClient
 from magnetosuture_thread.nodes.recorder import Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file
-from magnetosuture_thread.rig.power.stage import board_addresses
+from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 
 ONCE = (SCENE.recorded, SCENE_MARKERS.recorded)  # published while nodes start, for the bag's beginning

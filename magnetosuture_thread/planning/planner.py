@@ -14,18 +14,20 @@ from scipy import ndimage
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.lattice import (
+from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
+    PREFERRED,
     STRIDE,
+    BodyPath,
     LatticeGoal,
     body_clearance,
     clearance_at,
     map_clearance,
     search_lattice,
+    smooth_path,
     turn_of,
 )
-from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
 from magnetosuture_thread.planning.procedure import (
     HEADING_TOLERANCE,
     Goal,

@@ -21,7 +21,7 @@ from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
-from magnetosuture_thread.rig.power.stage import StageProcess
+from magnetosuture_thread.rig.power import StageProcess
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.shared_parameters import shared_parameter
 

@@ -16,14 +16,14 @@ import shapely
 import shapely.geometry
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.mapping import (
+from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
+from magnetosuture_thread.scene.shapes import (
     DISH_FIELDS,
     dish_from_mapping,
     dish_to_mapping,
     make_scene,
     shape_from_mapping,
 )
-from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
 
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.bridge.drive_watch import DriveWatch
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage
 
 
 def test_coils_are_driven_while_any_board_is(tmp_path: Path):

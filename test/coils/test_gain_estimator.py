@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.coils.allocation import MAX_CHANGE, CoilGainEstimator
+from magnetosuture_thread.coils.allocation import CoilGainEstimator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True)
@@ -52,11 +52,3 @@ def test_a_needle_that_something_holds_across_the_field_says_nothing_of_the_gain
     before = estimator.gains.copy()
     lie_along_field(estimator, gains, 20, 5, turned=0.6)
     np.testing.assert_array_equal(estimator.gains, before)
-
-
-def test_gains_are_bounded():
-    estimator = CoilGainEstimator(COILS, NEEDLE.kinematics)
-    for size in np.linspace(0.0, 3.0, 200):  # slowly, so that each measurement agrees with those before
-        lie_along_field(estimator, np.array([1.0 + size, 1.0, 1.0, 1.0]), 3, round(1000 * size))
-    assert np.abs(estimator.gains - 1.0).max() <= MAX_CHANGE + 1e-12
-    assert np.abs(estimator.gains - 1.0).max() > 0.5 * MAX_CHANGE

@@ -32,7 +32,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.texts import one_line
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.coils.calibration_fit import CalibrationFit
+    from magnetosuture_thread.coils.calibration import CalibrationFit
     from magnetosuture_thread.vision.calibration import Calibration
 
 INTERRUPTED = 130  # as shells have it
@@ -256,7 +256,7 @@ def calibrate_coils(measurements: Path, output: Path, name: str = "") -> Calibra
         InvalidInputError: the measurements cannot be used; the message says which and why.
         BagError: the file cannot be written.
     """
-    from magnetosuture_thread.coils.calibration_fit import fit_calibration, read_measurements
+    from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
     from magnetosuture_thread.jobs.output import whole_file
 
     if output.exists() and output.samefile(measurements):
