@@ -108,12 +108,8 @@ VALUE_BOUNDS = {"current": (1000.0, "A"), "x": (0.5, "m"), "y": (0.5, "m"), "bx"
 MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
-MAX_DISTANCE = 1.0  # m, of a coil
 RADIUS_BOUNDS = (0.002, 0.5)  # m
 COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
-START_RATIOS = (1.0, 0.5, 2.0)  # initial distances, relative to that by the field's gradient
-MAX_RELATIVE_RESIDUAL = 0.25  # of the measured field; a larger residual means other coils
-MIN_SINGULAR_VALUE = 1e-6  # of the scaled Jacobian; below, parameters are unidentifiable
 PARAMETERS = ("angle", "distance", "radius", "field_per_current")
 # Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
 # unidentifiable. The field hardly depends on the radius, which has no such limit.
@@ -293,7 +289,8 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
     found = solve.best([np.concatenate([*starts, background / size])], JOINT_TOLERANCE)
     difference = size * found.fun.reshape(-1, 2)
     residual = float(np.sqrt(np.mean(difference**2)))
-    if residual > MAX_RELATIVE_RESIDUAL * size:
+    # A residual of more than a quarter of the measured field means other coils.
+    if residual > 0.25 * size:
         given = f"a field that differs from the model's by {residual / size:.0%}"
         raise InvalidInputError(data.source, given, "one coil on at a time, in the dish frame, in SI units")
     coils = [_coil(data, index, found.x, size, difference) for index in range(len(data.names))]
@@ -336,7 +333,8 @@ class _Problem:
         self._field = data.field[rows] / size
         nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
         low = [-np.inf, math.log(nearest), math.log(RADIUS_BOUNDS[0]), -np.inf]
-        high = [np.inf, math.log(max(MAX_DISTANCE, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf]
+        # A coil is at most 1 m away.
+        high = [np.inf, math.log(max(1.0, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf]
         count = len(coils)
         self._bounds = (np.array(low * count + [-np.inf] * 2), np.array(high * count + [np.inf] * 2))
 
@@ -379,7 +377,8 @@ def _start(data: ProbeMeasurements, index: int, background: Array, size: float) 
     angle = math.atan2(along[1], along[0])
     starts = [
         np.array([turned, math.log(share * distance), math.log(0.5 * share * distance), sign * strength / size])
-        for share in START_RATIOS
+        # Initial distances, relative to that by the field's gradient.
+        for share in (1.0, 0.5, 2.0)
         for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
     ]
     alone = _Problem(data, np.array([index]), size)
@@ -416,7 +415,8 @@ def _deviations(
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
     _, values, turned = np.linalg.svd(jacobian / scale, full_matrices=False)
     labels = [f"{coil.name}.{name}" for coil in coils for name in PARAMETERS] + ["background x", "background y"]
-    if values[-1] < MIN_SINGULAR_VALUE * values[0]:
+    # Below this ratio of singular values of the scaled Jacobian, parameters are unidentifiable.
+    if values[-1] < 1e-6 * values[0]:
         weights = np.abs(turned[-1])
         mixed = [label for label, weight in zip(labels, weights, strict=True) if weight > 0.3]
         words = "readings that tell them apart: all over the dish, and some without current"

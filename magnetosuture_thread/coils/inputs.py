@@ -20,7 +20,6 @@ Vector = NDArray[np.float64]
 
 CLOCK_TOLERANCE = 0.05  # s; clocks of two machines may differ by this much
 SILENCE_TIMEOUT = 0.5  # s; a publisher without a message for this long is gone
-MAX_GAP = 100  # consecutive messages that may get lost
 AGE_WINDOW = 5.0  # s
 SCENE_GRACE_PERIOD = 0.5  # s for which model and bridge may be on different versions of the scene during a change
 BodyVelocity = tuple[float, float, float]
@@ -28,7 +27,6 @@ BodyVelocity = tuple[float, float, float]
 ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
-SIGMA_COUNT = 3.0
 MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
 
 
@@ -114,7 +112,8 @@ class PublisherCounter:
             arrival: a monotonic time [s].
         """
         self._drop_silent(arrival)
-        before = [publisher for publisher in self._publishers if 0 < number - publisher[0] <= MAX_GAP]
+        # Up to 99 messages in a row may get lost.
+        before = [publisher for publisher in self._publishers if 0 < number - publisher[0] <= 100]
         if before:
             self._publishers.remove(max(before))
         self._publishers.append((number, arrival))
@@ -497,7 +496,7 @@ class PoseExtrapolator:
         if covariance is None or not np.isfinite(covariance).all():
             return 0.0
         square = covariance[0, 0] + covariance[1, 1] + self._needle.chord**2 * covariance[2, 2]
-        return min(MAX_POSE_UNCERTAINTY, SIGMA_COUNT * math.sqrt(max(0.0, square)))
+        return min(MAX_POSE_UNCERTAINTY, 3.0 * math.sqrt(max(0.0, square)))
 
     def _check_stall(self, arrival: float) -> None:
         """Drop the pose after a stall longer than the coils certainly hold their currents."""

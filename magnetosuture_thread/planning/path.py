@@ -24,7 +24,6 @@ from magnetosuture_thread.scene import Scene
 
 CELLS = 400  # of the clearance map across the dish
 STRIDE = 2  # of the clearance map's grid between two points of the lattice
-REVERSE_COST = 1.5  # of a way driven back, in that of the same way ahead
 MAX_STATES = 20_000_000  # to look at
 NEAR_COST = 3.0  # of a way at the required clearance, more than at the preferred one
 _QUARTER = np.array([(1, 0), (3, 1), (2, 1), (3, 2), (1, 1), (2, 3), (1, 2), (1, 3)])
@@ -232,7 +231,8 @@ def search_lattice(
                 if ni < 0 or nj < 0 or ni >= size or nj >= size:
                     continue
                 length = step * math.hypot(float(moves[direction, 0]), float(moves[direction, 1]))
-                length *= 1.0 if choice == 0 else REVERSE_COST
+                # A way driven back costs half as much again.
+                length *= 1.0 if choice == 0 else 1.5
             else:
                 nd = (direction + (1 if choice == 2 else count - 1)) % count
                 turn = abs(directions[nd] - directions[direction])
@@ -273,12 +273,9 @@ def search_lattice(
 
 
 SPACING = 1.0e-4  # m; of the tip's way between two poses
-PASSES = 400  # of the smoothing
 PULL = 0.4  # share by which a pose moves towards the middle of its neighbours in a pass
 PREFERRED = 5e-4  # m; beyond the required clearance, more is not worth a longer way
-GIVE = 1e-6  # m; by which the clearance may fall in a pass, so that a corner of the lattice can be rounded
 FILTER = 4.0  # poses; width of the last filter
-ALIGN = 0.3  # share by which its heading turns to the way
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,7 +394,8 @@ def _relax(poses: Points, body: Points, required: float, preferred: float, near:
     A clearance may not fall below the one that is preferred; where it is less already, it may not fall at all.
     """
     count = len(poses)
-    for _ in range(PASSES):
+    # Passes of the smoothing.
+    for _ in range(400):
         for k in range(1, count - 1):
             x, y, angle = poses[k, 0], poses[k, 1], poses[k, 2]
             nx = x + PULL * (0.5 * (poses[k - 1, 0] + poses[k + 1, 0]) - x)
@@ -408,8 +406,10 @@ def _relax(poses: Points, body: Points, required: float, preferred: float, near:
             if way > 0.0:
                 # Ahead or back, whichever is nearer to how it is headed; the less it goes, the less this says.
                 off = (math.atan2(wy, wx) - turned + 0.5 * math.pi) % math.pi - 0.5 * math.pi
-                turned += ALIGN * min(1.0, way / (2.0 * SPACING)) * off
-            kept = max(required, min(preferred, body_clearance(x, y, angle, body, near)) - GIVE)
+                # The heading turns to the way by 0.3 of the difference.
+                turned += 0.3 * min(1.0, way / (2.0 * SPACING)) * off
+            # The clearance may fall by 1 um in a pass, so that a corner of the lattice can be rounded.
+            kept = max(required, min(preferred, body_clearance(x, y, angle, body, near)) - 1e-6)
             if body_clearance(nx, ny, turned, body, near) >= kept:
                 poses[k, 0], poses[k, 1], poses[k, 2] = nx, ny, turned
             elif body_clearance(x, y, turned, body, near) >= kept:

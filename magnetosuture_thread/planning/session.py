@@ -32,7 +32,6 @@ from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
 NO_POSE, NO_THREAD, NO_MARGINS = "no needle pose yet", "no thread yet", "no margins of the thread yet"
-MAX_NAMED = 3  # forces, in a reason
 NOT_HELD = "nobody holds the page"
 
 
@@ -263,7 +262,8 @@ class LoopState:
         if self._estimate_problem:
             return self._estimate_problem
         new = [text for since, text in self._disturbances.items() if since not in self._accepted]
-        return f"an unmodelled contact: the thread is {'; '.join(new[:MAX_NAMED])}" if new else ""
+        # A reason names at most three forces.
+        return f"an unmodelled contact: the thread is {'; '.join(new[:3])}" if new else ""
 
 
 @dataclass(frozen=True)

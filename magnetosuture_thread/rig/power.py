@@ -22,6 +22,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO, cast
 
@@ -32,40 +33,48 @@ from magnetosuture_thread.errors import ConfigurationError, GraphError
 
 ACKNOWLEDGED = b"\xff"
 ADDRESSES = range(0x80, 0x88)
-PACKET_GAP = 0.01  # s between two bytes, after which a packet that is not complete is forgotten
 
-SET_TIMEOUT, GET_TIMEOUT, GET_VERSION = 14, 15, 21
-GET_MAIN_VOLTAGE, GET_LOGIC_VOLTAGE, GET_VOLTAGES = 24, 25, 100
-SET_DUTY_1, SET_DUTY_2, SET_DUTIES = 32, 33, 34
-GET_DUTIES, GET_CURRENTS, GET_TEMPERATURE, GET_STATUS = 48, 49, 82, 90
-SET_LIMIT_1, SET_LIMIT_2, GET_LIMIT_1, GET_LIMIT_2 = 133, 134, 135, 136
-RESET_STOP = 200
+
+class Command(IntEnum):
+    """The commands that a board knows."""
+
+    SET_TIMEOUT = 14
+    GET_TIMEOUT = 15
+    GET_VERSION = 21
+    GET_MAIN_VOLTAGE = 24
+    GET_LOGIC_VOLTAGE = 25
+    SET_DUTY_1 = 32
+    SET_DUTY_2 = 33
+    SET_DUTIES = 34
+    GET_DUTIES = 48
+    GET_CURRENTS = 49
+    GET_TEMPERATURE = 82
+    GET_STATUS = 90
+    GET_VOLTAGES = 100
+    SET_LIMIT_1 = 133
+    SET_LIMIT_2 = 134
+    GET_LIMIT_1 = 135
+    GET_LIMIT_2 = 136
+    RESET_STOP = 200
+
 
 # What each command that changes something carries, between command and checksum.
 ARGUMENTS = {
-    SET_TIMEOUT: ">B",
-    SET_DUTY_1: ">h",
-    SET_DUTY_2: ">h",
-    SET_DUTIES: ">hh",
-    SET_LIMIT_1: ">II",
-    SET_LIMIT_2: ">II",
-    RESET_STOP: ">",
+    Command.SET_TIMEOUT: ">B",
+    Command.SET_DUTY_1: ">h",
+    Command.SET_DUTY_2: ">h",
+    Command.SET_DUTIES: ">hh",
+    Command.SET_LIMIT_1: ">II",
+    Command.SET_LIMIT_2: ">II",
+    Command.RESET_STOP: ">",
 }
 # Those that only ask come without a checksum.
-QUESTIONS = frozenset(
-    {
-        *(GET_TIMEOUT, GET_VERSION, GET_MAIN_VOLTAGE, GET_LOGIC_VOLTAGE, GET_VOLTAGES, GET_DUTIES, GET_CURRENTS),
-        *(GET_TEMPERATURE, GET_STATUS, GET_LIMIT_1, GET_LIMIT_2),
-    }
-)
+QUESTIONS = frozenset(command for command in Command if command.name.startswith("GET"))
 
 FULL = 32767  # duty of the whole supply voltage
-VERSION = b"RoboClaw simulated 2x15A v4.2.4\n\x00"
 FACTORY_LIMIT = 3000  # in units of 10 mA
 FACTORY_TIMEOUT = 0  # none
 EMERGENCY_STOP = 0x0001
-AT_LIMIT = 0.999
-KEPT = 10_000
 
 
 class RoboClawBoard:
@@ -111,7 +120,7 @@ class RoboClawBoard:
         self.ignored: set[int] = set()
         self.mismeasured = 0.0
         self.broken: set[int] = set()
-        self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=KEPT)
+        self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=10_000)
         self.heard = -math.inf
         self._parser = _Parser()
         self._time = -math.inf
@@ -150,7 +159,7 @@ class RoboClawBoard:
 
     def _output(self, channel: int) -> int:
         duty, limit = self.duties[channel], 0.01 * self.limits[channel]
-        if abs(self.currents[channel]) < AT_LIMIT * limit or duty * self.currents[channel] <= 0.0:
+        if abs(self.currents[channel]) < 0.999 * limit or duty * self.currents[channel] <= 0.0:
             return duty
         most = FULL * limit * self.resistance / self.supply
         return round(max(-most, min(most, duty)))
@@ -185,37 +194,37 @@ class RoboClawBoard:
         return ACKNOWLEDGED
 
     def _obey(self, command: int, values: tuple[int, ...]) -> None:
-        if command == SET_TIMEOUT:
+        if command == Command.SET_TIMEOUT:
             self.timeout = values[0]
-        elif command in (SET_LIMIT_1, SET_LIMIT_2):
-            self.limits[command - SET_LIMIT_1] = values[0]
-        elif command == RESET_STOP:
+        elif command in (Command.SET_LIMIT_1, Command.SET_LIMIT_2):
+            self.limits[command - Command.SET_LIMIT_1] = values[0]
+        elif command == Command.RESET_STOP:
             self.errors &= ~EMERGENCY_STOP
         elif not self.errors:
-            first = values[0] if command != SET_DUTY_2 else self.duties[0]
-            second = values[-1] if command != SET_DUTY_1 else self.duties[1]
+            first = values[0] if command != Command.SET_DUTY_2 else self.duties[0]
+            second = values[-1] if command != Command.SET_DUTY_1 else self.duties[1]
             self._set((first, second), self._time)
 
     def _data(self, command: int) -> bytes:
         """Return what the answer to a question says."""
-        if command == GET_VERSION:
-            return VERSION
-        if command == GET_TIMEOUT:
+        if command == Command.GET_VERSION:
+            return b"RoboClaw simulated 2x15A v4.2.4\n\x00"
+        if command == Command.GET_TIMEOUT:
             return bytes((self.timeout,))
-        if command == GET_STATUS:
+        if command == Command.GET_STATUS:
             return struct.pack(">I", self.warnings << 16 | self.errors)
-        if command in (GET_LIMIT_1, GET_LIMIT_2):
-            return struct.pack(">II", self.limits[command - GET_LIMIT_1], 0)
-        if command == GET_DUTIES:
+        if command in (Command.GET_LIMIT_1, Command.GET_LIMIT_2):
+            return struct.pack(">II", self.limits[command - Command.GET_LIMIT_1], 0)
+        if command == Command.GET_DUTIES:
             return struct.pack(">hh", *self.outputs)
-        if command == GET_CURRENTS:
+        if command == Command.GET_CURRENTS:
             return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
         volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
         return {
-            GET_MAIN_VOLTAGE: volts,
-            GET_LOGIC_VOLTAGE: logic,
-            GET_VOLTAGES: volts + logic,
-            GET_TEMPERATURE: struct.pack(">H", 250),
+            Command.GET_MAIN_VOLTAGE: volts,
+            Command.GET_LOGIC_VOLTAGE: logic,
+            Command.GET_VOLTAGES: volts + logic,
+            Command.GET_TEMPERATURE: struct.pack(">H", 250),
         }[command]
 
     def _reported(self, channel: int) -> int:
@@ -262,7 +271,8 @@ class _Parser:
 
     def feed(self, data: bytes, time: float) -> list[bytes]:
         """Receive bytes at a time [s] and return the packets that they complete, checksums not yet verified."""
-        if time - self._heard > PACKET_GAP:
+        # A packet that is not complete is forgotten after a gap of 10 ms.
+        if time - self._heard > 0.01:
             self._bytes = b""
         self._heard = time
         self._bytes += data
@@ -283,10 +293,8 @@ class _Parser:
 
 
 TICK = 0.01  # s between two looks at the boards' own timeouts
-CHUNK = 4096
 ASK = b"?"
 TIMEOUT = 5.0  # s for the boards to be taken away
-AHEAD = -10  # of the processes that boards would not share a processor with, where the user may say so
 
 
 @dataclass
@@ -402,7 +410,7 @@ class Line:
             readable, _, _ = select.select([self._host], [], [], self._patience())
             if readable:
                 with suppress(OSError):
-                    self._receive(os.read(self._host, CHUNK))
+                    self._receive(os.read(self._host, 4096))
             self.advance()
             while self._late and self._late[0][0] <= self._clock():
                 with suppress(OSError):  # nobody reads, and the line is full
@@ -586,6 +594,7 @@ def serve(stage: PowerStage, asks: BinaryIO, answers: BinaryIO) -> int:
 
 if __name__ == "__main__":
     with suppress(OSError):  # only some may
-        os.nice(AHEAD)
+        # Before the processes that boards would not share a processor with, where the user may say so.
+        os.nice(-10)
     with open(sys.stdin.fileno(), "rb", 0) as asking, open(sys.stdout.fileno(), "wb", 0) as answering:
         sys.exit(serve(PowerStage(*json.loads(sys.argv[1])), asking, answering))

@@ -186,7 +186,6 @@ class SceneServerSettings(Configuration):
 
 
 MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
-MAX_PATH_CHARS = 4096
 
 
 class SceneEditor:
@@ -206,7 +205,7 @@ class SceneEditor:
 
     def load(self, file: str) -> None:
         """Load the scene of a file, given as a path or as the name of one that ships with the package."""
-        _require_length("file", file, MAX_PATH_CHARS)
+        _require_length("file", file, 4096)
         self.scene = read_scene(file)
 
     def add(self, name: str, shape: str) -> None:

@@ -113,7 +113,6 @@ def _ring(fields: ShapeFields, field: str, value: Any) -> Ring:
 
 
 ARC_TOLERANCE = 2e-6  # m; greatest distance of an arc from its chords
-MAX_ARC_STEP = math.pi / 18  # rad; of one chord
 DECIMALS = 12  # of a computed coordinate [m]: what machines compute differently is far below, and scenes stay equal
 
 
@@ -138,7 +137,8 @@ def arc(
 
 def arc_step(radius: float) -> float:
     """Return the angle of a chord that is within `ARC_TOLERANCE` of its arc [rad]."""
-    return min(MAX_ARC_STEP, 2.0 * math.acos(max(0.0, 1.0 - ARC_TOLERANCE / radius)))
+    # A chord spans at most 10 degrees.
+    return min(math.pi / 18, 2.0 * math.acos(max(0.0, 1.0 - ARC_TOLERANCE / radius)))
 
 
 def _rounded_point(x: float, y: float) -> tuple[float, float]:
@@ -250,7 +250,6 @@ SHAPES: dict[str, Callable[[ShapeFields, float], Disc | Polygon]] = {
 }
 """The shapes that a scene file may name, and what makes the geometry of each."""
 
-ROUNDABLE = ("annular_sector", "rectangle", "polygon")
 
 DISH_FIELDS = ("diameter", "depth", "wall_friction", "self_contact")
 MAX_CORNER_RADIUS = 0.1  # m
@@ -281,7 +280,7 @@ def shape_from_mapping(name: str, description: Any, source: str = "") -> SceneSh
     radius = description.get("corner_radius", 0.0)
     if not is_number(radius) or not 0.0 <= radius <= MAX_CORNER_RADIUS:
         raise scene_error(f"{name}.corner_radius", radius, f"a number from 0 to {MAX_CORNER_RADIUS:g} m", source)
-    if radius > 0.0 and type_name not in ROUNDABLE:
+    if radius > 0.0 and type_name not in ("annular_sector", "rectangle", "polygon"):
         raise scene_error(f"{name}.corner_radius", radius, f"0 m: a {type_name} has no corners", source)
     fields = ShapeFields(name, type_name, description[type_name], source)
     kind = description.get("kind", "tissue")

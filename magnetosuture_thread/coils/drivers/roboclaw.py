@@ -32,17 +32,11 @@ from magnetosuture_thread.errors import DriverError
 
 FULL_DUTY = 32767  # duty of the full supply voltage
 MIN_RETRY_DELAY, MAX_RETRY_DELAY = 0.1, 2.0  # s between two attempts to connect
-SUPPLY_VOLTAGE_RANGE = (5.0, 80.0)  # V, over all models of boards
 DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the supply
-LIMITING_RATIO = 0.8  # of the maximum current, above which a board may reduce its duty
-OVERCURRENT_RATIO = 1.2  # of the maximum current
 MAX_OVERCURRENTS = 3  # consecutive measurements that are a fault
-MIN_EXPECTED_CURRENT = 0.5  # A; below, a missing current cannot be detected
-MIN_CURRENT_RATIO = 0.5  # of the expected current; below, a warm coil is no explanation
 # Consecutive measurements below that ratio: a fifth of a second and more at 200 Hz, so that neither a change of
 # the current nor the coil's L / R looks like a broken wire.
 MAX_SHORTFALLS = 12
-MAX_MISMATCHES = 2  # consecutive; the first may be a lost packet
 
 # Errors in the boards' manual that the manufacturer's library lacks.
 DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
@@ -105,7 +99,8 @@ def is_short(expected: float, measured: float) -> bool:
     >>> is_short(0.4, 0.0)
     False
     """
-    return abs(expected) >= MIN_EXPECTED_CURRENT and abs(measured) < MIN_CURRENT_RATIO * abs(expected)
+    # Below 0.5 A a missing current cannot be detected; below half of the expected one a warm coil is no explanation.
+    return abs(expected) >= 0.5 and abs(measured) < 0.5 * abs(expected)
 
 
 def describe_bits(bits: int, descriptions: Mapping[int, str], kind: str) -> tuple[str, ...]:
@@ -138,7 +133,8 @@ def duties_match(
     """
     for target, actual, current in zip(written, reported, currents, strict=True):
         exact = abs(target - actual) <= (DUTY_TOLERANCE if target else 0)
-        limited = abs(current) >= LIMITING_RATIO * max_current and min(0, target) <= actual <= max(0, target)
+        # Above 80 % of the maximum current a board may reduce its duty.
+        limited = abs(current) >= 0.8 * max_current and min(0, target) <= actual <= max(0, target)
         if not exact and not limited:
             return False
     return True
@@ -341,7 +337,8 @@ class Board:
         self._poll_index = 0
         self._supply_too_low = self._limited = False
         self._conditions: tuple[str, ...] = ()
-        self._mismatches = ConsecutiveCounter(MAX_MISMATCHES)
+        # Two in a row: the first may be a lost packet.
+        self._mismatches = ConsecutiveCounter(2)
         self._excesses = ConsecutiveCounter(MAX_OVERCURRENTS)
         self._shortfalls = [ConsecutiveCounter(MAX_SHORTFALLS) for _ in self._coils]
         self._coil_warnings = ["", ""]
@@ -444,7 +441,8 @@ class Board:
 
     def _check_voltage(self) -> None:
         self.voltage = self._query(self._device.GetVolts)[0] / 10.0
-        low, high = SUPPLY_VOLTAGE_RANGE
+        # The range of all models of boards [V].
+        low, high = 5.0, 80.0
         if not low <= self.voltage <= high:
             raise DeviceError(f"{self._name}: a supply of {self.voltage:g} V")
 
@@ -467,7 +465,8 @@ class Board:
         )
         self.currents = (first, second)
         worst = max(self.currents, key=abs)
-        if self._excesses.update(abs(worst) > OVERCURRENT_RATIO * self._max_current):
+        # A board may exceed the maximum current by 20 % for a moment.
+        if self._excesses.update(abs(worst) > 1.2 * self._max_current):
             raise DeviceError(f"{self._name}: a current of {worst:.2f} A, more than {self._max_current:g} A")
         expected = steady_currents(self._written, self._resistances, self.voltage)
         for channel, (coil, counter) in enumerate(zip(self._coils, self._shortfalls, strict=True)):
@@ -537,10 +536,7 @@ class Board:
 
 KEEP_ALIVE_PERIOD = 0.02  # s, maximum between two writes; a board's own timeout is at least five times as long
 POLL_PERIOD = 0.02  # s, maximum between two queries, however often currents are commanded
-SHUTDOWN_TIMEOUT = 0.12  # s in which boards are set to zero at the end
-DEFAULT_ADDRESS = 128  # of a board as delivered
 MIN_BAUD_RATE = 38400  # at which a board's longest answer arrives in time
-CLOSE_TIMEOUT = 0.3  # s
 
 
 class Mailbox:
@@ -725,7 +721,8 @@ class LineThread:
 
     def _leave(self, port: ExchangePort) -> None:
         """Set every board to zero; one that does not acknowledge stops by its own timeout."""
-        remaining, until = list(self._boards.values()), time.monotonic() + SHUTDOWN_TIMEOUT
+        # The boards have 0.12 s to take zero at the end.
+        remaining, until = list(self._boards.values()), time.monotonic() + 0.12
         self._leaving = True
         while remaining and time.monotonic() < until:
             remaining = [board for board in remaining if not _set_zero(board)]
@@ -828,7 +825,7 @@ class RoboClawDriver:
 
     def close(self) -> None:
         """Set all currents to zero and disconnect, within 0.3 s; no effect if not open."""
-        until = time.monotonic() + CLOSE_TIMEOUT
+        until = time.monotonic() + 0.3
         for line in self._lines:
             line.stop()
         for line in self._lines:
@@ -858,7 +855,8 @@ def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[
         expected = f"at least {MIN_BAUD_RATE}, so that answers come in time"
         raise DriverError("roboclaw", f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")
     found: dict[str, dict[int, int]] = {}
-    for number, (path, address) in enumerate(zip(ports, addresses or [DEFAULT_ADDRESS] * len(ports), strict=True)):
+    # A board is delivered with the address 128.
+    for number, (path, address) in enumerate(zip(ports, addresses or [128] * len(ports), strict=True)):
         on_port = found.setdefault(path, {})
         if address in on_port.values():
             raise DriverError("roboclaw", f"two boards on {path} have address {address}, expected an address for each")

@@ -21,7 +21,6 @@ from magnetosuture_thread.geometry.obstacles import Disc
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
-MAX_CLEARANCE = 8.0  # cells; clearances are not found beyond
 
 
 class Shapes(NamedTuple):
@@ -166,7 +165,8 @@ def polygon_gap(x: float, y: float, shapes: Shapes, p: int) -> tuple[float, floa
 
 @compiled
 def _find_clearances(shapes: Shapes) -> None:
-    most, side = MAX_CLEARANCE * shapes.grid[2], shapes.grid[2]
+    # Clearances are not found beyond 8 cells.
+    most, side = 8.0 * shapes.grid[2], shapes.grid[2]
     for i in range(shapes.clearances.shape[0]):
         for j in range(shapes.clearances.shape[1]):
             x, y = shapes.grid[0] + (j + 0.5) * side, shapes.grid[1] + (i + 0.5) * side

@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.rig.power import ACKNOWLEDGED, SET_DUTIES, StageProcess, checksum
+from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, StageProcess, checksum
 
-HALF_AND_BACK = bytes((129, SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))  # of the supply: a half, and a quarter reversed
+HALF_AND_BACK = bytes(
+    (129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00)
+)  # of the supply: a half, and a quarter reversed
 RIG = """
 import sys, time
 from magnetosuture_thread.rig.power import StageProcess

@@ -23,7 +23,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.rig import power as packets
 from magnetosuture_thread.rig.power import RoboClawBoard
 
-SUPPLY = packets.answer(128, packets.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
+SUPPLY = packets.answer(128, packets.Command.GET_MAIN_VOLTAGE, struct.pack(">H", 240))
 ANSWER_TIMEOUT = CoilBridgeSettings().roboclaw_answer_timeout
 
 
@@ -131,7 +131,9 @@ def test_only_the_right_byte_acknowledges(peer, port, reply: bytes):
         board(port).write_zero()
 
 
-@pytest.mark.parametrize(("command", "name"), [(packets.SET_DUTIES, "DutyM1M2"), (packets.SET_TIMEOUT, "SetTimeout")])
+@pytest.mark.parametrize(
+    ("command", "name"), [(packets.Command.SET_DUTIES, "DutyM1M2"), (packets.Command.SET_TIMEOUT, "SetTimeout")]
+)
 def test_an_acknowledgement_is_not_taken_for_that_of_the_next_request(peer, port, command: int, name: str):
     """Of a board that from some request on answers each packet only when the next one comes, however late that is."""
     wait_for(port, 2.0)
@@ -197,7 +199,7 @@ def test_a_second_attempt_takes_what_is_newest(peer, port):
     made.voltage = 24.0
     newest = iter([(np.array([3.0, -6.0]), math.inf), (None, math.inf)])  # stopped after the first
     made.write(lambda: next(newest))
-    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.SET_DUTIES] == [
+    assert [packet[2:6] for packet in peer.heard if packet[1] == packets.Command.SET_DUTIES] == [
         struct.pack(">hh", 4095, -8191),
         bytes(4),
     ]

@@ -200,9 +200,9 @@ def test_too_much_current_is_a_loss(bench):
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (packets.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
-        (packets.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
-        (packets.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.Command.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
+        (packets.Command.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.Command.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
     ],
 )
 def test_a_board_that_does_not_take_its_limits_is_never_ready(bench, command: int, words: str):
@@ -217,7 +217,7 @@ def test_a_board_that_does_not_take_its_limits_is_never_ready(bench, command: in
 
 def test_a_board_that_acknowledges_duties_and_does_not_take_them_is_found(bench):
     driver = bench.open()
-    bench.boards[0].ignored.add(packets.SET_DUTIES)
+    bench.boards[0].ignored.add(packets.Command.SET_DUTIES)
     with bench.held(driver, *CURRENTS):
         bench.wait(lambda: "has duties (0, 0) instead of (4095, -8191)" in driver.state().problem, "the problem")
         bench.wait(lambda: bench.duties(1) == (0, 0), "zero")
@@ -240,7 +240,7 @@ def tapped(board: RoboClawBoard, then: Callable[[bytes], bytes]) -> list[tuple[i
 
     def hear(data: bytes, now: float) -> bytes:
         answer = receive(data, now)
-        if data[:2] != bytes((board.address, packets.SET_DUTIES)):
+        if data[:2] != bytes((board.address, packets.Command.SET_DUTIES)):
             return answer
         driven = any(any(pair) for pair in heard)
         heard.append(struct.unpack(">hh", data[2:6]))
