@@ -79,18 +79,13 @@ class StampAges:
         while entries and entries[-1][1] >= age:  # later and less: those before will not be the minimum again
             entries.pop()
         entries.append((arrival, age))
-        self._drop_old(entries, arrival)
 
     def minimum(self, arrival: float) -> dict[str, float]:
         """Return the minimum age of each topic with a message in the last `AGE_WINDOW` before a monotonic time [s]."""
         for entries in self._ages.values():
-            self._drop_old(entries, arrival)
+            while entries and arrival - entries[0][0] > AGE_WINDOW:
+                entries.popleft()
         return {topic: entries[0][1] for topic, entries in self._ages.items() if entries}
-
-    @staticmethod
-    def _drop_old(entries: deque[tuple[float, float]], arrival: float) -> None:
-        while entries and arrival - entries[0][0] > AGE_WINDOW:
-            entries.popleft()
 
 
 class PublisherCounter:

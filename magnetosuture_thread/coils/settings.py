@@ -259,8 +259,7 @@ class CoilBridgeSettings(Configuration):
         """Reject too few coils, a coiled needle, and limits that cannot be kept."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
-            name = f"{self.GROUP}.coil_angles"
-            raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")
+            raise self.refused("coil_angles", "at least 3 coils' angles [rad]")
         if self._calibration is not None:
             count, known = len(self._calibration.coils), len(self.coil_angles)
             if count != known:
