@@ -59,7 +59,7 @@ class Command(IntEnum):
 
 
 # What each command that changes something carries, between command and checksum.
-ARGUMENTS = {
+ARGUMENTS: dict[int, str] = {
     Command.SET_TIMEOUT: ">B",
     Command.SET_DUTY_1: ">h",
     Command.SET_DUTY_2: ">h",
@@ -69,7 +69,7 @@ ARGUMENTS = {
     Command.RESET_STOP: ">",
 }
 # Those that only ask come without a checksum.
-QUESTIONS = frozenset(command for command in Command if command.name.startswith("GET"))
+QUESTIONS: frozenset[int] = frozenset(command for command in Command if command.name.startswith("GET"))
 
 FULL = 32767  # duty of the whole supply voltage
 FACTORY_LIMIT = 3000  # in units of 10 mA
@@ -220,12 +220,13 @@ class RoboClawBoard:
         if command == Command.GET_CURRENTS:
             return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
         volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
-        return {
+        answers: dict[int, bytes] = {
             Command.GET_MAIN_VOLTAGE: volts,
             Command.GET_LOGIC_VOLTAGE: logic,
             Command.GET_VOLTAGES: volts + logic,
             Command.GET_TEMPERATURE: struct.pack(">H", 250),
-        }[command]
+        }
+        return answers[command]
 
     def _reported(self, channel: int) -> int:
         """Return the current that it reports, in units of 10 mA."""

@@ -326,7 +326,8 @@ class Board:
         self._signs = [1, 1]
         limits = (self._device.ReadM1MaxCurrent, self._device.ReadM2MaxCurrent)
         # Settings that a board loses with its supply; after a short loss, nothing else shows it.
-        self._setting_checks = (self._check_timeout, *(partial(self._check_limit, read) for read in limits))
+        limit_checks = [partial(self._check_limit, read) for read in limits]
+        self._setting_checks: tuple[Callable[[], None], ...] = (self._check_timeout, *limit_checks)
         # With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
         always = (self._check_duties, self._check_currents)
         self._polls = [
