@@ -25,7 +25,7 @@ import shapely
 from rich.console import Console
 
 from magnetosuture_thread.coils.bridge import CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSettings
 from magnetosuture_thread.commands.command import make_log

@@ -27,7 +27,7 @@ from rich.table import Table
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
 from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage
 from magnetosuture_thread.setups import read_setup
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at

@@ -12,7 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.coils.calibration_fit import fit_calibration, read_measurements
+from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
 from magnetosuture_thread.commands.command import DONE, Terminal, output_file, runs
 from magnetosuture_thread.commands.output import whole_file
 

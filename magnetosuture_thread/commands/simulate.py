@@ -46,7 +46,7 @@ from magnetosuture_thread.nodes.clients import DONE as PROCEDURE_DONE
 from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient, Recorder
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file
-from magnetosuture_thread.rig.power.stage import board_addresses
+from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 

@@ -28,16 +28,12 @@ ToCanvas = Callable[[Points], NDArray[np.int32]]
 OVERSAMPLING = 4
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
-LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 NOISE_FIELDS = 12
-NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
 REACH_PX = 24.0  # of shadows and blur around what moves
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
-DROP_SHADOW_PX = np.array([3.0, 4.0])
-LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
 
 
@@ -246,7 +242,8 @@ class DishCamera:
         at = np.linspace(0.07, 0.77, 15)
         points, along = needle_axis(tail, heading, scene.needle_length, scene.needle_curvature, at)
         aside = np.column_stack([-along[:, 1], along[:, 0]])
-        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ LAMP)[:, None] * aside)
+        # Direction towards the lamp, in the dish frame.
+        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ (-0.5, 0.86))[:, None] * aside)
 
     def _through_lens(self, light: Light) -> Light:
         return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
@@ -255,7 +252,8 @@ class DishCamera:
         """Return noise for white light of level 1; the sensor's colour interpolation spreads it a little."""
         width, height = self.size
         noise = self._random.standard_normal((height, width, 3), dtype=np.float32)
-        level = np.float32(self._lighting.noise * NOISE_LEVEL / np.sqrt(90.0))
+        # 1.6 at a light of level 90, before the sensor's interpolation spreads it.
+        level = np.float32(self._lighting.noise * 1.6 / np.sqrt(90.0))
         return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
 
     def _noise_in(self, box: Box, chosen: int) -> Light:
@@ -345,7 +343,7 @@ class _StillLife:
         def solid(of: Sequence[Points]) -> Light:
             return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
 
-        shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
+        shade = cv2.GaussianBlur(solid([ring + np.array([3.0, 4.0]) for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
         top = solid(rings)
         colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
@@ -369,7 +367,8 @@ class _StillLife:
         slope = np.stack(
             [cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=0.125)]
         )
-        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray(LAMP_PX, np.float32), slope, axes=1)
+        # Direction towards the lamp, in the image.
+        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray((-0.5, -0.86), np.float32), slope, axes=1)
         edge = np.asarray(look.edge_bgr, dtype=np.float32)
         return np.asarray(edge + height[:, :, None] * (colour - edge) + lit[:, :, None], dtype=np.float32)
 

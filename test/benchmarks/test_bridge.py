@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.bridge.command import DriveWatch, bridge_table, measure_bridge, zero_delays
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage
 
 
 @pytest.mark.slow

@@ -1,44 +1,42 @@
-"""A RoboClaw board on a serial line: commands, queries and verification.
+"""Coil driver for RoboClaw boards: coil currents in, duties out; a thread for each serial port.
 
-A port bounds the time of each exchange. The rules for duties, limits, status bits and polling do no input or output.
+A port bounds the time of each exchange. The rules for duties, limits and status bits do no input or output.
 """
 
 from __future__ import annotations
 
 import ctypes
-import enum
 import errno
 import logging
 import math
+import os
 import select
 import termios
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import serial
 from basicmicro import Basicmicro
 from basicmicro.exceptions import BasicmicroError
-from numpy.typing import NDArray
 
+from magnetosuture_thread.coils.drivers import DriverState, Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-
-Vector = NDArray[np.float64]
+from magnetosuture_thread.errors import DriverError
 
 FULL_DUTY = 32767  # duty of the full supply voltage
 MIN_RETRY_DELAY, MAX_RETRY_DELAY = 0.1, 2.0  # s between two attempts to connect
-SUPPLY_VOLTAGE_RANGE = (5.0, 80.0)  # V, over all models of boards
 DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the supply
-LIMITING_RATIO = 0.8  # of the maximum current, above which a board may reduce its duty
-OVERCURRENT_RATIO = 1.2  # of the maximum current
 MAX_OVERCURRENTS = 3  # consecutive measurements that are a fault
-MIN_EXPECTED_CURRENT = 0.5  # A; below, a missing current cannot be detected
-MIN_CURRENT_RATIO = 0.5  # of the expected current; below, a warm coil is no explanation
 # Consecutive measurements below that ratio: a fifth of a second and more at 200 Hz, so that neither a change of
 # the current nor the coil's L / R looks like a broken wire.
 MAX_SHORTFALLS = 12
-MAX_MISMATCHES = 2  # consecutive; the first may be a lost packet
 
 # Errors in the boards' manual that the manufacturer's library lacks.
 DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
@@ -46,28 +44,6 @@ ACK = b"\xff"
 MAX_ATTEMPTS = 2
 # Pause after a failure, in which the board drops a partial packet.
 RETRY_DELAY = 0.015  # s
-
-
-class Query(enum.Enum):
-    """A query to a board between two writes."""
-
-    DUTIES = enum.auto()
-    CURRENTS = enum.auto()
-    STATUS = enum.auto()
-    VOLTAGES = enum.auto()
-    TIMEOUT = enum.auto()
-    LIMIT_1 = enum.auto()
-    LIMIT_2 = enum.auto()
-
-
-# Settings that a board loses with its supply; after a short loss, nothing else shows it.
-SETTING_QUERIES = (Query.TIMEOUT, Query.LIMIT_1, Query.LIMIT_2)
-# With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
-POLL_SEQUENCE = tuple(
-    query
-    for setting in SETTING_QUERIES
-    for query in (Query.DUTIES, Query.CURRENTS, Query.STATUS, Query.DUTIES, Query.CURRENTS, Query.VOLTAGES, setting)
-)
 
 
 def retry_delay(failures: int) -> float:
@@ -123,7 +99,8 @@ def is_short(expected: float, measured: float) -> bool:
     >>> is_short(0.4, 0.0)
     False
     """
-    return abs(expected) >= MIN_EXPECTED_CURRENT and abs(measured) < MIN_CURRENT_RATIO * abs(expected)
+    # Below 0.5 A a missing current cannot be detected; below half of the expected one a warm coil is no explanation.
+    return abs(expected) >= 0.5 and abs(measured) < 0.5 * abs(expected)
 
 
 def describe_bits(bits: int, descriptions: Mapping[int, str], kind: str) -> tuple[str, ...]:
@@ -156,7 +133,8 @@ def duties_match(
     """
     for target, actual, current in zip(written, reported, currents, strict=True):
         exact = abs(target - actual) <= (DUTY_TOLERANCE if target else 0)
-        limited = abs(current) >= LIMITING_RATIO * max_current and min(0, target) <= actual <= max(0, target)
+        # Above 80 % of the maximum current a board may reduce its duty.
+        limited = abs(current) >= 0.8 * max_current and min(0, target) <= actual <= max(0, target)
         if not exact and not limited:
             return False
     return True
@@ -314,6 +292,7 @@ class Board:
         no_retry: returns whether there is no time for a second attempt.
 
     Attributes:
+        number: of the board.
         version: firmware version.
         voltage: of its supply [V].
         currents: measured in its two coils [A].
@@ -330,7 +309,7 @@ class Board:
         no_retry: Callable[[], bool],
     ) -> None:
         self._port, self._address, self._name, self._no_retry = port, address, name, no_retry
-        self._coils = (2 * number, 2 * number + 1)
+        self.number, self._coils = number, (2 * number, 2 * number + 1)
         self._timeout = round(10.0 * settings.driver_timeout)  # in tenths of a second
         self._max_current, self._limit = settings.max_current, round(100.0 * settings.max_current)
         self._resistances = np.array(settings.resistances()[2 * number : 2 * number + 2])
@@ -345,10 +324,22 @@ class Board:
         self._expires = math.inf  # of the values of an exchange
         self._written = (0, 0)
         self._signs = [1, 1]
+        limits = (self._device.ReadM1MaxCurrent, self._device.ReadM2MaxCurrent)
+        # Settings that a board loses with its supply; after a short loss, nothing else shows it.
+        limit_checks = [partial(self._check_limit, read) for read in limits]
+        self._setting_checks: tuple[Callable[[], None], ...] = (self._check_timeout, *limit_checks)
+        # With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
+        always = (self._check_duties, self._check_currents)
+        self._polls = [
+            check
+            for setting in self._setting_checks
+            for check in (*always, self._check_status, *always, self._check_voltage, setting)
+        ]
         self._poll_index = 0
         self._supply_too_low = self._limited = False
         self._conditions: tuple[str, ...] = ()
-        self._mismatches = ConsecutiveCounter(MAX_MISMATCHES)
+        # Two in a row: the first may be a lost packet.
+        self._mismatches = ConsecutiveCounter(2)
         self._excesses = ConsecutiveCounter(MAX_OVERCURRENTS)
         self._shortfalls = [ConsecutiveCounter(MAX_SHORTFALLS) for _ in self._coils]
         self._coil_warnings = ["", ""]
@@ -394,9 +385,9 @@ class Board:
         self._set(self._device.SetTimeout, 0.1 * (self._timeout + 0.5))
         self._set(self._device.SetM1MaxCurrent, self._limit, 0)
         self._set(self._device.SetM2MaxCurrent, self._limit, 0)
-        first_currents = [Query.CURRENTS] * MAX_OVERCURRENTS
-        for query in (*SETTING_QUERIES, Query.STATUS, *first_currents, Query.VOLTAGES):
-            self._poll(query)
+        currents = [self._check_currents] * MAX_OVERCURRENTS
+        for check in (*self._setting_checks, self._check_status, *currents, self._check_voltage):
+            check()
 
     def write(self, latest: Callable[[], tuple[Vector | None, float]]) -> None:
         """Command the latest currents of its two coils.
@@ -438,28 +429,23 @@ class Board:
         Raises:
             DeviceError: the board does not answer or reports a fault.
         """
-        self._poll(POLL_SEQUENCE[self._poll_index])
+        self._polls[self._poll_index]()
         if not self._mismatches.count:  # else the same query again, at once
-            self._poll_index = (self._poll_index + 1) % len(POLL_SEQUENCE)
+            self._poll_index = (self._poll_index + 1) % len(self._polls)
 
-    def _poll(self, query: Query) -> None:
-        if query is Query.DUTIES:
-            self._check_duties()
-        elif query is Query.CURRENTS:
-            self._check_currents()
-        elif query is Query.STATUS:
-            self._check_status()
-        elif query is Query.TIMEOUT:
-            tenths = tuple(round(10.0 * seconds) for seconds in self._query(self._device.GetTimeout))
-            self._verify("serial timeout in tenths of a second", tenths, (self._timeout,))
-        elif query in (Query.LIMIT_1, Query.LIMIT_2):
-            first = query is Query.LIMIT_1
-            limits = self._query(self._device.ReadM1MaxCurrent if first else self._device.ReadM2MaxCurrent)
-            self._verify("current limit in 10 mA", limits[:1], (self._limit,))
-        else:
-            self.voltage = self._query(self._device.GetVolts)[0] / 10.0
-            if not SUPPLY_VOLTAGE_RANGE[0] <= self.voltage <= SUPPLY_VOLTAGE_RANGE[1]:
-                raise DeviceError(f"{self._name}: a supply of {self.voltage:g} V")
+    def _check_timeout(self) -> None:
+        tenths = tuple(round(10.0 * seconds) for seconds in self._query(self._device.GetTimeout))
+        self._verify("serial timeout in tenths of a second", tenths, (self._timeout,))
+
+    def _check_limit(self, read: Callable[..., Any]) -> None:
+        self._verify("current limit in 10 mA", self._query(read)[:1], (self._limit,))
+
+    def _check_voltage(self) -> None:
+        self.voltage = self._query(self._device.GetVolts)[0] / 10.0
+        # The range of all models of boards [V].
+        low, high = 5.0, 80.0
+        if not low <= self.voltage <= high:
+            raise DeviceError(f"{self._name}: a supply of {self.voltage:g} V")
 
     def _check_duties(self) -> None:
         reported = self._query(self._device.ReadPWMs)
@@ -480,7 +466,8 @@ class Board:
         )
         self.currents = (first, second)
         worst = max(self.currents, key=abs)
-        if self._excesses.update(abs(worst) > OVERCURRENT_RATIO * self._max_current):
+        # A board may exceed the maximum current by 20 % for a moment.
+        if self._excesses.update(abs(worst) > 1.2 * self._max_current):
             raise DeviceError(f"{self._name}: a current of {worst:.2f} A, more than {self._max_current:g} A")
         expected = steady_currents(self._written, self._resistances, self.voltage)
         for channel, (coil, counter) in enumerate(zip(self._coils, self._shortfalls, strict=True)):
@@ -546,3 +533,352 @@ class Board:
         result = self._attempt(self._device.ReadMainBatteryVoltage, self._address)  # no such answer begins with an ACK
         self._port.is_drained = result is not None and bool(result[0])
         return self._port.is_drained
+
+
+KEEP_ALIVE_PERIOD = 0.02  # s, maximum between two writes; a board's own timeout is at least five times as long
+POLL_PERIOD = 0.02  # s, maximum between two queries, however often currents are commanded
+MIN_BAUD_RATE = 38400  # at which a board's longest answer arrives in time
+
+
+class Mailbox:
+    """Latest currents, kept only while every line is ready, and the boards of all lines. Time comes in [s].
+
+    A call blocks only while another call runs.
+
+    Args:
+        coils: number of coils.
+        problems: initial problem of each line, until it is ready.
+        timeout: currents are valid for this long [s].
+
+    Attributes:
+        wake_events: for each line, set when currents change or a line fails.
+    """
+
+    def __init__(self, coils: int, problems: Sequence[str], timeout: float) -> None:
+        self.wake_events = [threading.Event() for _ in problems]
+        self._coils, self._timeout = coils, timeout
+        self._lock = threading.Lock()
+        self._problems = list(problems)  # a line without a problem is ready
+        self._boards: list[Sequence[Board]] = [()] * len(problems)  # of each line, while it is ready
+        self._currents: Vector | None = None
+        self._computed = 0.0
+        self._timed_out = False
+        self._losses = 0
+
+    def put(self, currents: Vector, computed: float) -> None:
+        """Set the currents, shape (m,) [A], and when they were computed; dropped unless every line is ready."""
+        with self._lock:
+            if any(self._problems):
+                return
+            self._currents, self._computed, self._timed_out = currents.copy(), computed, False
+        self._wake()
+
+    def latest(self, now: float) -> tuple[Vector | None, float]:
+        """Return the currents to apply now, shape (m,) [A], None for zero in all coils, and until when [s]."""
+        with self._lock:
+            if self._currents is not None and now - self._computed > self._timeout:
+                self._timed_out = bool(np.any(self._currents))
+                self._currents = None
+            return self._currents, math.inf if self._currents is None else self._computed + self._timeout
+
+    def set_ready(self, line: int, boards: Sequence[Board]) -> None:
+        """Mark a line as ready, with its boards."""
+        with self._lock:
+            self._problems[line] = ""
+            self._boards[line] = boards
+
+    def set_failed(self, line: int, problem: str) -> None:
+        """Mark a line as not ready; the currents of all lines are dropped."""
+        with self._lock:
+            self._losses += not any(self._problems)
+            self._problems[line] = problem
+            self._boards[line] = ()
+            self._currents = None
+            self._timed_out = False
+        self._wake()
+
+    def state(self) -> DriverState:
+        """Return the state of all lines."""
+        with self._lock:
+            boards = sorted((board for boards in self._boards for board in boards), key=lambda board: board.number)
+            problem = "; ".join(problem for problem in self._problems if problem)
+            warnings = [warning for board in boards for warning in board.warnings]
+            if self._timed_out:
+                warnings.append(f"no currents were commanded within {self._timeout:g} s: coils at zero")
+            currents = np.array([current for board in boards for current in board.currents])
+            measured = currents if len(currents) == self._coils else None
+            voltages = tuple(board.voltage for board in boards)
+            return DriverState(not problem, problem, self._losses, tuple(warnings), measured, voltages)
+
+    def _wake(self) -> None:
+        for wake in self.wake_events:
+            wake.set()
+
+
+class LineThread:
+    """Connects to the boards of a port, writes duties and polls the boards; reconnects until it is stopped.
+
+    This is where the driver waits for hardware, so it reads the clock itself.
+
+    Args:
+        number: of the line.
+        path: of its port.
+        boards: number and address of each board on it.
+        settings: of the bridge.
+        mailbox: source of currents, and destination of reports.
+        others: addresses that none of the boards may answer to.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        path: str,
+        boards: dict[int, int],
+        settings: CoilBridgeSettings,
+        mailbox: Mailbox,
+        others: Sequence[int] = (),
+    ) -> None:
+        self._number, self._path, self._addresses, self._others = number, path, boards, others
+        self._settings, self._mailbox = settings, mailbox
+        self._wake = mailbox.wake_events[number]
+        self._stopping = threading.Event()
+        self._boards: dict[int, Board] = {}
+        self._leaving = False
+        self._thread = threading.Thread(target=self._run, name=f"roboclaw {path}", daemon=True)
+
+    def start(self) -> None:
+        """Start to connect."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Request the end of the thread, with all currents at zero."""
+        self._stopping.set()
+        self._wake.set()
+
+    def join(self, timeout: float) -> None:
+        """Wait for the end of the thread, for at most a time [s]."""
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        failures = 0
+        while not self._stopping.is_set():
+            ready_at = None
+            problem = "closed"
+            port = None
+            try:
+                port = ExchangePort(
+                    self._path, self._settings.roboclaw_baud_rate, self._settings.roboclaw_answer_timeout
+                )
+                self._connect(port)
+                ready_at = time.monotonic()
+                self._serve()
+            except DeviceError as error:
+                problem = str(error)
+            except Exception as error:  # the line reconnects after any error
+                problem = f"{self._path}: {type(error).__name__}: {error}"
+            self._mailbox.set_failed(self._number, problem)
+            if port is not None:
+                self._leave(port)
+            if ready_at is not None and time.monotonic() - ready_at > MAX_RETRY_DELAY:
+                failures = 0
+            failures += 1
+            self._stopping.wait(retry_delay(failures))
+
+    def _connect(self, port: ExchangePort) -> None:
+        self._leaving = False
+        self._boards = {
+            number: Board(
+                port,
+                number,
+                address,
+                f"board {number} ({self._path}, address {address})",
+                self._settings,
+                self._no_retry,
+            )
+            for number, address in self._addresses.items()
+        }
+        for board in self._boards.values():  # all, before any can acknowledge
+            board.identify(self._others)
+        for board in self._boards.values():
+            board.configure()
+        self._mailbox.set_ready(self._number, tuple(self._boards.values()))
+
+    def _serve(self) -> None:
+        turn, polled_at = 0, 0.0
+        while not self._stopping.is_set():
+            self._wake.wait(KEEP_ALIVE_PERIOD)
+            self._wake.clear()
+            for number, board in self._boards.items():
+                board.write(partial(self._latest, number))
+            # New currents go first, but the boards must be polled all the same.
+            if not self._wake.is_set() or time.monotonic() - polled_at > POLL_PERIOD:
+                list(self._boards.values())[turn % len(self._boards)].poll()
+                turn, polled_at = turn + 1, time.monotonic()
+
+    def _latest(self, number: int) -> tuple[Vector | None, float]:
+        """Return the currents of a board to apply now, shape (2,) [A], None for zero in both coils, and until when."""
+        currents, until = self._mailbox.latest(time.monotonic())
+        return (None if currents is None else currents[2 * number : 2 * number + 2]), until
+
+    def _leave(self, port: ExchangePort) -> None:
+        """Set every board to zero; one that does not acknowledge stops by its own timeout."""
+        # The boards have 0.12 s to take zero at the end.
+        remaining, until = list(self._boards.values()), time.monotonic() + 0.12
+        self._leaving = True
+        while remaining and time.monotonic() < until:
+            remaining = [board for board in remaining if not _set_zero(board)]
+        self._boards = {}
+        with suppress(Exception):
+            port.reset_output_buffer()  # or closing may wait for the output
+        with suppress(Exception):
+            port.close()
+
+    def _no_retry(self) -> bool:
+        return self._leaving or self._stopping.is_set()
+
+
+def _set_zero(board: Board) -> bool:
+    """Set a board to zero, and return whether it acknowledged."""
+    try:
+        board.write_zero()
+    except Exception:
+        return False
+    return True
+
+
+class RoboClawDriver:
+    """Driver for RoboClaw boards of two coils each: coils 0 and 1 are on the first board, 2 and 3 on the second.
+
+    d = I R / U with the duty d from -1 to 1, the current I [A], the resistance R [ohm] of that coil, from the
+    calibration or else `coil_resistance`, and the voltage U [V] of the board's supply as it measures it. A board
+    sets the mean voltage at a coil, not its current: the current settles with the coil's L / R, and is lower in
+    a coil that is warmer than R assumes. Above U / R the duty is clipped, with a warning. Another warning names a
+    coil whose measured current stays under half of that expected, of at least 0.5 A, as with a broken wire; it
+    ends when they agree or less is commanded.
+
+    Each serial port has its own thread. It applies the latest currents while every board is ready, and zero
+    otherwise: if one board fails, if the currents are older than `apply_timeout`, and after every loss until the
+    first `apply` after all are ready again. Currents are read again for each board and each attempt to write, so
+    that a stop takes effect in between, and their age is checked once more when the packet is about to be written.
+
+    Every board has its own current limit, and stops by itself without a packet for `driver_timeout`; a board that
+    does not confirm both is never ready. Both are polled, with two boards on a line within about a second: a board
+    whose supply fails forgets them, which is a loss however soon it is back.
+
+    Each board has to be identified before any is driven, at the start and after every loss: it answers to its own
+    address and, unless the path of its port is stable (see `is_stable`), to none of the boards on other ports.
+
+    Args:
+        settings: of the bridge.
+        coils: number of coils; that of the settings' angles if None.
+        apply_timeout: currents older than this are zero [s]; if None the smaller of `command_timeout` and
+            `driver_timeout`, after which the boards have stopped by themselves.
+
+    Raises:
+        DriverError: ports, addresses, baud rate or timeout are invalid.
+    """
+
+    def __init__(
+        self, settings: CoilBridgeSettings, coils: int | None = None, apply_timeout: float | None = None
+    ) -> None:
+        self._settings = settings
+        self._coils = len(settings.coil_angles) if coils is None else coils
+        usual = min(settings.command_timeout, settings.driver_timeout)
+        self._apply_timeout = usual if apply_timeout is None else apply_timeout
+        self._ports = _boards_by_port(settings, self._coils)
+        self._mailbox: Mailbox | None = None
+        self._lines: list[LineThread] = []
+
+    def open(self) -> None:
+        """Start to connect, with all currents at zero; no effect if open."""
+        if self._mailbox is not None:
+            return
+        mailbox = Mailbox(self._coils, [f"connecting to {path}" for path in self._ports], self._apply_timeout)
+        self._lines = [
+            LineThread(number, path, boards, self._settings, mailbox, _others(self._ports, path))
+            for number, (path, boards) in enumerate(self._ports.items())
+        ]
+        self._mailbox = mailbox
+        for line in self._lines:
+            line.start()
+
+    def apply(self, currents: Vector, computed: float) -> None:
+        """Set the current of each coil from now on, for `apply_timeout` at the most; ignored while not ready.
+
+        Args:
+            currents: of the coils, shape (m,) [A].
+            computed: the time of `time.monotonic` for which they were computed [s].
+
+        Raises:
+            ValueError: the number of currents is wrong, or one is not finite.
+        """
+        if currents.shape != (self._coils,) or not np.all(np.isfinite(currents)):
+            raise ValueError(f"{self._coils} finite currents expected, got {currents.tolist()}")
+        if self._mailbox is not None:
+            limit = self._settings.max_current
+            self._mailbox.put(np.clip(currents, -limit, limit), computed)
+
+    def state(self) -> DriverState:
+        """Return the present state."""
+        if self._mailbox is None:
+            return DriverState(False, "not open")
+        return replace(self._mailbox.state(), timeout=self._settings.driver_timeout)
+
+    def close(self) -> None:
+        """Set all currents to zero and disconnect, within 0.3 s; no effect if not open."""
+        until = time.monotonic() + 0.3
+        for line in self._lines:
+            line.stop()
+        for line in self._lines:
+            line.join(max(0.0, until - time.monotonic()))
+        self._lines = []
+        self._mailbox = None
+
+
+def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[int, int]]:
+    """Return number and address of the boards on each port.
+
+    Raises:
+        DriverError: the settings are invalid.
+    """
+    ports, addresses = settings.roboclaw_ports, settings.roboclaw_addresses
+    if not ports:
+        raise DriverError("roboclaw", "roboclaw_ports is empty, expected the serial port of each board")
+    if 2 * len(ports) != coils:
+        raise DriverError("roboclaw", f"roboclaw_ports has {len(ports)}, expected one for two of the {coils} coils")
+    if addresses and len(addresses) != len(ports):
+        expected = f"one for each of the {len(ports)} roboclaw_ports, or none"
+        raise DriverError("roboclaw", f"roboclaw_addresses has {len(addresses)}, expected {expected}")
+    tenths = 10.0 * settings.driver_timeout
+    if abs(tenths - round(tenths)) > 1e-6:
+        raise DriverError("roboclaw", f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second")
+    if settings.roboclaw_baud_rate < MIN_BAUD_RATE:
+        expected = f"at least {MIN_BAUD_RATE}, so that answers come in time"
+        raise DriverError("roboclaw", f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")
+    found: dict[str, dict[int, int]] = {}
+    # A board is delivered with the address 128.
+    for number, (path, address) in enumerate(zip(ports, addresses or [128] * len(ports), strict=True)):
+        on_port = found.setdefault(path, {})
+        if address in on_port.values():
+            raise DriverError("roboclaw", f"two boards on {path} have address {address}, expected an address for each")
+        on_port[number] = address
+    for path, boards in found.items():
+        if shared := set(boards.values()).intersection(_others(found, path)):
+            expected = "different addresses, or a path of each that stays with its plug, as under /dev/serial/by-path"
+            problem = f"{path} and another port have boards of address {min(shared)}, expected {expected}"
+            raise DriverError("roboclaw", problem)
+    return found
+
+
+def is_stable(path: str) -> bool:
+    """Return whether a port's path stays with one plug: a link, as udev makes them, there already or not yet.
+
+    What the kernel numbers (`/dev/tty...`, `/dev/pts/...`) goes to whatever board is found first.
+    """
+    return not Path(path).name.startswith("tty") and (os.path.islink(path) or not os.path.exists(path))
+
+
+def _others(ports: Mapping[str, Mapping[int, int]], path: str) -> tuple[int, ...]:
+    """Return the addresses of boards on other ports, for which one here may be taken; none where the path is stable."""
+    others = {address for other, boards in ports.items() if other != path for address in boards.values()}
+    return () if is_stable(path) else tuple(sorted(others))
