@@ -46,7 +46,7 @@ from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.offline.observations import NOT_NEWER, ObservationReader
 from magnetosuture_thread.offline.predictions import Step, predictions, read_observations
 from magnetosuture_thread.thread_model.session import WAITING
-from magnetosuture_thread.vision.session import FrameMeasurement
+from magnetosuture_thread.vision.tracker import FrameMeasurement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -26,11 +26,9 @@ from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image, image_header, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
-from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.coils.drivers import DriverState
     from magnetosuture_thread.estimator import ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
-    from magnetosuture_thread.vision.look import Track
+    from magnetosuture_thread.vision.tracker import Track
 
 Vector = NDArray[np.float64]
 

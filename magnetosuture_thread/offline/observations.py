@@ -41,8 +41,7 @@ from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import lens_of
-from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up
 
 MEASURED = 8  # the length of each so many seen threads is looked at
 MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a seen one beyond is not of this setup

@@ -20,8 +20,8 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.cli.commands.calibrate import calibrate_camera
 from magnetosuture_thread.jobs.track import track
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import State
 from test.bags.bags import copy_with_notes
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"

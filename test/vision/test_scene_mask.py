@@ -13,11 +13,9 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.rig import camera as drawn
 from magnetosuture_thread.rig.camera import DishCamera, Look
 from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
-from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.vision.look import Track
 from magnetosuture_thread.vision.scene_mask import scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import Track, VisionTracker
 from test.vision.scenes import PIXEL, VIEW, Pose, line_error, random_thread
 
 STEEL = Look((70.0, 66.0, 62.0), (60.0, 56.0, 52.0), 0.2e-3, 10.0, 3.0)
@@ -133,19 +131,3 @@ def test_solid_and_depth_agree_with_the_geometry(factor: int):
     inside = mask.solid[tuple(pixels.astype(int).T[::-1] // factor)] > 0
     assert (exact[inside] > 3e-4 / view.metres_per_pixel - 1.5).all()
     assert inside.sum() > 20
-
-
-def test_the_set_ups_camera_sees_the_needle_among_dark_tissue():
-    setup = read_setup("hernia_ring")
-    scene = read_scene("hernia_ring")
-    rig = setup.rig
-    what = drawn.CameraScene(
-        dish_diameter=0.05, needle_length=0.0025, needle_width=0.00035, obstacles=scene.obstacles, looks=[STEEL] * 3
-    )
-    tail, heading = np.array([0.004, -0.012]), 2.0
-    thread = np.linspace(tail, tail - 0.012 * np.array([np.cos(heading), np.sin(heading)]), 40)
-    image = DishCamera(what, rig.view(scene), (rig.camera_width, rig.camera_height)).render(tail, heading, thread)
-    seen = VisionTracker(setup.vision, scene).look(image)
-    assert seen.reason == ""
-    assert np.linalg.norm(seen.tail - tail) < 2.0 * rig.view(scene).metres_per_pixel
-    assert VisionTracker(setup.vision, Scene(scene.dish)).look(image).reason

@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.vision.look import State
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import State, VisionTracker
 
 PLACES = {  # tail [m] and heading [rad]
     "free": (0.004, -0.012, 2.0),

@@ -45,7 +45,7 @@ def kernel_steps() -> dict[str, Callable[[], object]]:
     from magnetosuture_thread.rig.rig import Rig
     from magnetosuture_thread.setups import read_setup
     from magnetosuture_thread.thread_model.session import ThreadSession
-    from magnetosuture_thread.vision.warm_up import warm_up
+    from magnetosuture_thread.vision.tracker import warm_up
 
     setup = read_setup(SETUP)
     return {
