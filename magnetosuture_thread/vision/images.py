@@ -1,14 +1,11 @@
-"""Images: from bytes to pixels, what of them is measured on, and samples between pixels.
-
-Size and orientation are read from the header, before anything is decoded: a megabyte may decode to gigabytes.
-"""
+"""Images: from bytes to pixels, what of them is measured on, and samples between pixels."""
 
 from __future__ import annotations
 
 import io
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +19,6 @@ from magnetosuture_thread.untrusted import MAX_PIXELS
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
-FORMATS = ("JPEG", "PNG", "BMP", "TIFF", "WEBP")
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
@@ -176,21 +172,34 @@ def glare_mask(picture: Picture) -> np.ndarray:
 def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     """Decode a JPEG, PNG, BMP, TIFF or WebP image to BGR, its pixels as they are stored.
 
-    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. See
-    `image_header` to know of it.
+    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. Size
+    and kind are read from the header before any pixel is decoded: a megabyte may decode to gigabytes.
 
     Raises:
         InvalidInputError: the bytes are no image that can be decoded, or of more than `MAX_PIXELS`.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
+    width, height = _size_of(buffer)
+    if width * height > MAX_PIXELS:
+        raise InvalidInputError("image.data", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
     try:
-        known = image_header(buffer) is not None
-        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if known else None
+        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if width else None
     except cv2.error:  # some headers promise more than can be made
         image = None
     if image is None:
         raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image, or BMP, TIFF, WebP")
     return image
+
+
+def _size_of(buffer: np.ndarray) -> tuple[int, int]:
+    """Return width and height by a picture's header, 0 and 0 where the bytes are none."""
+    try:
+        with Image.open(io.BytesIO(buffer), formats=("JPEG", "PNG", "BMP", "TIFF", "WEBP")) as picture:
+            return picture.size
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:  # far more pixels than we take
+        raise InvalidInputError("image.data", str(error), f"at most {MAX_PIXELS} pixels") from None
+    except Exception:  # a damaged picture raises whatever its reader did not expect
+        return 0, 0
 
 
 def unpack_image(
@@ -235,44 +244,6 @@ def check_image(image: np.ndarray) -> None:
 def measured_channel(image: np.ndarray) -> np.ndarray:
     """Return the channel to measure on: green, which a colour sensor samples twice as densely."""
     return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
-
-
-class ImageHeader(NamedTuple):
-    """What a picture says of itself.
-
-    Attributes:
-        width: columns.
-        height: rows.
-        orientation: by EXIF, 1 to 8; 1 is upright, and what a picture without any has.
-    """
-
-    width: int
-    height: int
-    orientation: int = 1
-
-
-def image_header(data: bytes | memoryview | np.ndarray) -> ImageHeader | None:
-    """Return size and orientation of a JPEG, PNG, BMP, TIFF or WebP; None where the bytes are none of them.
-
-    No pixel is decoded.
-
-    Raises:
-        InvalidInputError: it has more than `MAX_PIXELS`.
-    """
-    try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
-            exif = Image.Exif()
-            exif.load(picture.info.get("exif", b""))
-            orientation = int(getattr(picture, "tag_v2", exif).get(274, 1))  # TIFF's tag, which EXIF has too
-            header = ImageHeader(*picture.size, orientation)
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:  # far more pixels than we take
-        raise InvalidInputError("image.data", str(error), f"at most {MAX_PIXELS} pixels") from None
-    except Exception:  # a damaged picture raises whatever its reader did not expect
-        return None
-    if header.width * header.height > MAX_PIXELS:
-        size = f"{header.width} x {header.height} pixels"
-        raise InvalidInputError("image.data", size, f"at most {MAX_PIXELS} pixels")
-    return header
 
 
 def middle(values: np.ndarray) -> float:
