@@ -135,7 +135,9 @@ def _dish(random: Random, picture: Plane, camera: _Camera, at: tuple[float, floa
         level = random.uniform(90.0, 235.0)
         cv2.circle(picture, place.tolist(), max(1, int(scale * random.uniform(0.01, 0.06))), (level,) * 3, -1)
     spot = camera.pixels(np.array([[at[0] - 0.3, at[1] + 0.2, 0.0]]))[0].astype(int)
-    cv2.putText(picture, "A7 02.11.", spot.tolist(), 3, scale / 90.0, (30.0, 30.0, 60.0), max(1, int(scale / 45.0)))
+    ink = np.zeros(picture.shape[:2], np.uint8)
+    cv2.putText(ink, "A7 02.11.", spot.tolist(), cv2.FONT_HERSHEY_COMPLEX, scale / 180.0, 1, max(1, int(scale / 90.0)))
+    picture[ink > 0] = (30.0, 30.0, 60.0)
     sign = random.choice((-1.0, 1.0))
     rims = [(0.0, 1.015, sign), (WALL, 1.03, -sign), (WALL, 1.06, sign)]
     rims += [(WALL + 0.06, 1.09, sign), (WALL + 0.06, 1.12, -sign)] if lid else []
