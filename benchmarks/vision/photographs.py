@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
@@ -237,37 +237,20 @@ def ellipse_error(found: FoundDish, diameter: float, points: NDArray[np.float64]
     return float(np.mean(np.abs(np.hypot(*offset.T) / radius - 1.0)))
 
 
-@dataclass(frozen=True)
-class PhotoRow:
-    """A class of photographs.
-
-    Attributes:
-        name: of the class.
-        count: of photographs.
-        found: with a dish.
-        right: of these, with an ellipse within `RIGHT` of the wall's inner edge, at the floor or at the top.
-        median_ms: CPU time.
-        max_ms: the longest.
-    """
-
-    name: str
-    count: int
-    found: int
-    right: int
-    median_ms: float
-    max_ms: float
-
-
 def photo_of(name: str, index: int, seed: int) -> Photograph:
     """Return a photograph of a class with a number."""
     return PHOTOGRAPHS[name](np.random.default_rng([seed, index, len(name), *name.encode()]))
 
 
-def measure_photographs(names: list[str], count: int, seed: int) -> tuple[list[PhotoRow], dict[str, Any]]:
-    """Look for the dish in photographs of each class; return the rows, and them as figures."""
+def measure_photographs(names: list[str], count: int, seed: int) -> dict[str, Any]:
+    """Look for the dish in photographs of each class.
+
+    Returns:
+        A row of figures of each class: in how many a dish is found, and of these, how many with an ellipse within
+        `RIGHT` of the wall's inner edge, at the floor or at the top; and the CPU time of a frame.
+    """
     rows = []
     settings = VisionTrackerSettings()
-    see_dish(photo_of("photo_any", 0, seed).image, settings, DIAMETER)
     for name in names:
         found, right, times = 0, 0, []
         for index in range(count):
@@ -278,5 +261,6 @@ def measure_photographs(names: list[str], count: int, seed: int) -> tuple[list[P
             if dish is not None:
                 found += 1
                 right += min(ellipse_error(dish, DIAMETER, at) for at in (photo.floor, photo.top)) < RIGHT
-        rows.append(PhotoRow(name, count, found, right, float(np.median(times)), max(times)))
-    return rows, {"count": count, "seed": seed, "rows": [asdict(row) for row in rows]}
+        figures = {"found": found, "right": right, "median_ms": float(np.median(times)), "max_ms": max(times)}
+        rows.append({"name": name, "count": count, **figures})
+    return {"count": count, "seed": seed, "rows": rows}
