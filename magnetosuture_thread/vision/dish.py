@@ -530,7 +530,8 @@ def fit_circle(points: Points, agreement: float) -> tuple[float, float, float, i
             return None
         mean = kept.mean(axis=0)  # around which the equations are well conditioned
         x, y = (kept - mean).T
-        (u, v, c), *_ = np.linalg.lstsq(np.column_stack([2.0 * x, 2.0 * y, np.ones_like(x)]), x * x + y * y, rcond=None)
+        basis = np.stack([2.0 * x, 2.0 * y, np.ones_like(x)])
+        u, v, c = np.linalg.solve(basis @ basis.T + 1e-9 * np.eye(3), basis @ (x * x + y * y))
         radius, centre = math.sqrt(max(c + u * u + v * v, 0.0)), mean + np.array([u, v])
         kept = points[np.abs(np.hypot(*(points - centre).T) - radius) < tolerance]
     return float(centre[0]), float(centre[1]), radius, len(kept)

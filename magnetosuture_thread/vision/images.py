@@ -263,15 +263,11 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
 
     Its shape is (...), for an image with colours (..., colours).
     """
-    rows, columns = image.shape[:2]
-    u, v = np.clip(points[..., 0], 0.0, columns - 1.001), np.clip(points[..., 1], 0.0, rows - 1.001)
-    column, row = u.astype(np.intp), v.astype(np.intp)
-    right, below = u - column, v - row
     if image.ndim == 3:
-        right, below = right[..., None], below[..., None]
-    upper = image[row, column] * (1.0 - right) + image[row, column + 1] * right
-    lower = image[row + 1, column] * (1.0 - right) + image[row + 1, column + 1] * right
-    return np.asarray(upper * (1.0 - below) + lower * below)
+        return np.stack([sampled(colour, points) for colour in cv2.split(image)], axis=-1)
+    values = np.empty(points.shape[:-1])
+    sample_all(np.ascontiguousarray(image), np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1))
+    return values
 
 
 def straightened(image: NDArray[Any], axis: tuple[float, float, float, float], along: Points, aside: Points) -> Points:
@@ -299,6 +295,13 @@ def within(image, u, v):
     u = min(max(u, 0.0), image.shape[1] - 1.001)
     v = min(max(v, 0.0), image.shape[0] - 1.001)
     return sample(image, u, v)
+
+
+@compiled
+def sample_all(image, points, values):
+    """Fill in an image at points, shape (m, 2); see `within`."""
+    for index in range(len(points)):
+        values[index] = within(image, points[index, 0], points[index, 1])
 
 
 @compiled

@@ -39,14 +39,11 @@ class Arc:
         s = np.asarray(along, dtype=float)
         half = 0.5 * self.curvature * s
         middle, turned = self.angle + half, self.angle + 2.0 * half
-        chord = s * np.sinc(half / np.pi)
-        return np.stack(
-            [
-                self.start[0] + chord * np.cos(middle) - aside * np.sin(turned),
-                self.start[1] + chord * np.sin(middle) + aside * np.cos(turned),
-            ],
-            axis=-1,
-        )
+        chord = 2.0 / self.curvature * np.sin(half) if abs(self.curvature) > 1e-12 else s
+        result = np.empty((*s.shape, 2))
+        result[..., 0] = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
+        result[..., 1] = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
+        return result
 
     @property
     def axis(self) -> tuple[float, float, float, float]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -102,8 +103,10 @@ class Strand:
 
 def tangents_of(points: Points) -> Points:
     """Return unit tangents at the vertices of a polyline, shape (m, 2)."""
-    along = np.gradient(points, axis=0)
-    return np.asarray(along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9))
+    along = np.empty_like(points)
+    along[1:-1] = points[2:] - points[:-2]
+    along[0], along[-1] = points[1] - points[0], points[-1] - points[-2]
+    return np.asarray(along / np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None])
 
 
 def across(points: Points, aside: Values) -> Points:
@@ -325,8 +328,10 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Gray, NDArr
     light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
     at_small = cv2.resize(light, size).reshape(size[1], size[0], -1)
     v, u = SHRUNK * np.arange(size[1])[:, None] - wall.centre[1], SHRUNK * np.arange(size[0]) - wall.centre[0]
-    unlike = small.reshape(at_small.shape) / at_small - np.float32(1.0)
-    found = (np.abs(unlike.mean(axis=2)) > bounds[0]) | (np.ptp(unlike, axis=2) > bounds[1])
+    # Colour by colour: numpy is slow along a short last axis.
+    unlike = [one / other - 1.0 for one, other in zip(cv2.split(small), cv2.split(at_small), strict=True)]
+    apart = reduce(np.maximum, unlike) - reduce(np.minimum, unlike)
+    found = (np.abs(sum(unlike)) > bounds[0] * len(unlike)) | (apart > bounds[1])
     found &= u * u + v * v < near.radius**2
     opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
@@ -334,7 +339,7 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Gray, NDArr
     large[0] = False
     objects = cv2.resize(np.where(large, 255, 0).astype(np.uint8)[labels], (columns, rows))
     objects = cv2.dilate(objects, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
-    darkest = light.min(axis=2)
+    darkest = reduce(np.minimum, cv2.split(light))
     return cv2.compare(objects, 127, cv2.CMP_GT), cv2.resize(darkest, (columns, rows))
 
 
