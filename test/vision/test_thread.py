@@ -235,7 +235,7 @@ TAIL = line((80.0, 200.0), (149.0, 200.0)), (0, 1)
 def order_of(*pieces: tuple[np.ndarray, tuple[int, int]], longest: float = 260.0) -> list[Placed]:
     """Return the order of pieces, given with the areas that their ends run into."""
     lines, areas = zip(*pieces, strict=True)
-    return find_order(list(lines), list(areas), bare_dish(), longest, SCALE)
+    return find_order(list(lines), list(areas), bare_dish(), (0.92 * longest, longest), SCALE)
 
 
 def test_the_straight_way_below_a_cover_is_taken():
@@ -244,6 +244,12 @@ def test_the_straight_way_below_a_cover_is_taken():
     low, high = second.arc_length
     assert low == pytest.approx(69.0 + 102.0)
     assert low < high <= 260.0 - 79.0 + 1e-9
+
+
+def test_an_order_that_ends_in_sight_and_is_too_short_is_not_told():
+    beyond = line((251.0, 200.0), (330.0, 200.0)), (1, 0)
+    assert len(order_of(TAIL, beyond, longest=260.0)) == 2
+    assert len(order_of(TAIL, beyond, longest=420.0)) == 1  # as when a loop is left out
 
 
 @pytest.mark.parametrize("worse", [0.0, 3.0])

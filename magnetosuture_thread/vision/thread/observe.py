@@ -214,12 +214,13 @@ def _joined(
     """
     longest = length * (1.0 + LENGTH_TOLERANCE)
     lines = [strand.points for strand in strands]
-    order = find_order(lines, areas, hiding, longest, in_dish.view.metres_per_pixel)
+    shortest = length * (1.0 - LENGTH_TOLERANCE)
+    order = find_order(lines, areas, hiding, (shortest, longest), in_dish.view.metres_per_pixel)
     # The only end on bare floor is the thread's where it is the last in the order, and the lengths add up.
     bare = [(number, side) for number, both in enumerate(ends) for side in (0, 1) if both[side] is PieceEnd.FREE]
     last = order[-1]
     low, high = (arc + float(arc_lengths(lines[last.index])[-1]) for arc in last.arc_length)
-    adds_up = low < longest + END_ERROR_PX and high > length * (1.0 - LENGTH_TOLERANCE) - END_ERROR_PX
+    adds_up = low < longest + END_ERROR_PX and high > shortest - END_ERROR_PX
     if not adds_up or bare != [(last.index, 0 if last.turned else 1)]:
         for number, side in bare:
             ends[number][side] = PieceEnd.UNKNOWN
@@ -281,7 +282,11 @@ class _Gap:
 
 
 def find_order(
-    lines: list[Points], areas: list[tuple[int, int]], hiding: Hiding, longest: float, metres_per_pixel: float
+    lines: list[Points],
+    areas: list[tuple[int, int]],
+    hiding: Hiding,
+    length: tuple[float, float],
+    metres_per_pixel: float,
 ) -> list[Placed]:
     """Find where the thread surely runs from its first piece on.
 
@@ -290,13 +295,13 @@ def find_order(
             [px].
         areas: number of the hiding area that both ends of each piece run into, 0 for none.
         hiding: these areas, where the thread can't be seen.
-        longest: greatest length of the whole thread [px].
+        length: least and greatest of the whole thread [px].
         metres_per_pixel: of the picture [m].
 
     Returns:
         The pieces in their order.
     """
-    lengths = [float(arc_lengths(line)[-1]) for line in lines]
+    lengths, longest = [float(arc_lengths(line)[-1]) for line in lines], length[1]
     placed, end = [Placed(0, False, (0.0, 0.0))], (0, 1)
     way = [lengths[0]]  # lengths of pieces and gaps along the thread, in turn
     while area := areas[end[0]][end[1]]:
@@ -323,6 +328,9 @@ def find_order(
         placed.append(Placed(index, side == 1, arc, last.chance * float(chances[best])))
         way += [gap.chord, lengths[index]]
         end = (index, 1 - side)
+    last = placed[-1]
+    if not areas[end[0]][end[1]] and last.arc_length[1] + lengths[last.index] < length[0]:
+        return placed[:1]  # It ends in sight and is too short: a piece between two of these is left out.
     rest = np.cumsum(way[::-1])[::-1][::2]  # from the beginning of each piece on, at least
     result = []
     for each, later in zip(placed, rest, strict=True):
