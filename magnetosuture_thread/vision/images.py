@@ -263,8 +263,11 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
 
     Its shape is (...), for an image with colours (..., colours).
     """
-    if image.ndim == 3:
-        return np.stack([sampled(colour, points) for colour in cv2.split(image)], axis=-1)
+    if image.ndim == 3:  # of few points
+        left, top = np.maximum(np.floor(points.reshape(-1, 2).min(axis=0)), 0.0).astype(int)
+        right, bottom = np.ceil(points.reshape(-1, 2).max(axis=0)).astype(int) + 2
+        near = cv2.split(image[top : max(top + 2, bottom), left : max(left + 2, right)])
+        return np.stack([sampled(colour, points - (left, top)) for colour in near], axis=-1)
     values = np.empty(points.shape[:-1])
     sample_all(np.ascontiguousarray(image), np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1))
     return values

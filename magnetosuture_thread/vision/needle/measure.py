@@ -240,13 +240,14 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         if settled is None:
             return ALIKE
         fit, is_known = settled
-    if reason := _what_prolongs(steel, fit, width, is_known):
+    beyond_tip, beyond_tail, _ = _excess(steel.surely, fit, width)
+    if reason := _what_prolongs(steel, fit, (beyond_tip, beyond_tail), is_known):
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
     # A thread as wide as the needle draws a measured tail outwards by 1.5 px, one deviation.
-    pull = 1.5 * max(0.0, _excess(steel.surely, fit, width)[1])
+    pull = 1.5 * beyond_tail
     if not is_measured:
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
@@ -343,9 +344,9 @@ def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit) -> str:
     return ""
 
 
-def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bool) -> str:
-    """Say at which end something goes on that is too wide for a thread; empty if nothing does."""
-    beyond_tip, beyond_tail, _ = _excess(steel.surely, fit, width)
+def _what_prolongs(steel: SteelMap, fit: TemplateFit, beyond: tuple[float, float], is_known: bool) -> str:
+    """Say at which end something goes on that is too wide for a thread; empty if nothing does. See `_excess`."""
+    beyond_tip, beyond_tail = beyond
     if min(beyond_tip, beyond_tail) > 0.2:  # A thread leaves or passes at one only.
         return "something at both ends"
     if beyond_tip > MAX_BEYOND:
@@ -531,10 +532,11 @@ def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> tuple[float, fl
     along, aside = _across(fit, half)
     drawn = drawn_needle(along, aside, fit.length, half, 0.5 * fit.width + BLOOM_PX - half, THIN)
     more = np.maximum(straightened(dark, fit.arc.axis, along, aside) - drawn, 0.0)
-    inside, body = np.abs(aside) < half + 0.5, (along > 0.0) & (along < fit.length)
-    tip, tail = ((end[:, None] & inside) for end in (along > fit.length + 1.0, along < -1.5))
-    beyond_tip, beyond_tail = (more[end].sum() / max((1.0 - drawn)[end].sum(), 1e-9) for end in (tip, tail))
-    sides = [more[body][:, side].min(axis=1, initial=1.0) > 0.5 for side in (aside < -half - 1.5, aside > half + 1.5)]
+    outside, beside = int((np.abs(aside) >= half + 0.5).sum()) // 2, int((aside > half + 1.5).sum())
+    across, tip, tail = slice(outside, len(aside) - outside), along > fit.length + 1.0, along < -1.5
+    beyond_tip, beyond_tail = (more[e, across].sum() / max((1.0 - drawn[e, across]).sum(), 1e-9) for e in (tip, tail))
+    body = more[(along > 0.0) & (along < fit.length)]
+    sides = [side.min(axis=1, initial=1.0) > 0.5 for side in (body[:, :beside], body[:, len(aside) - beside :])]
     return float(beyond_tip), float(beyond_tail), float(max(side.mean() for side in sides))
 
 

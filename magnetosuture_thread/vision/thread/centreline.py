@@ -251,12 +251,14 @@ def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> Gray:
     """
     half, length = 0.5 * needle.width_px + BLOOM_PX, needle.length_px
     outline = needle.arc.at(np.linspace(0.0, length, 24))
-    rows, columns = channel.pixels.shape
-    reach = half + BESIDE_PX
-    near = np.zeros((rows, columns), np.uint8)
-    at = [np.round(outline * 16.0).astype(np.int32)]
-    cv2.polylines(near, at, False, 255, 2 * math.ceil(reach + 1.0), cv2.LINE_8, 4)
+    breadth, (rows, columns) = math.ceil(half + BESIDE_PX + 1.0), channel.pixels.shape
+    left, top = np.maximum(outline.min(axis=0) - breadth, 0.0).astype(int)
+    right, bottom = np.minimum(outline.max(axis=0) + breadth + 1.0, (columns, rows)).astype(int)
+    near = np.zeros((max(0, bottom - top), max(0, right - left)), np.uint8)
+    at = [np.round((outline - (left, top)) * 16.0).astype(np.int32)]
+    cv2.polylines(near, at, False, 255, 2 * breadth, cv2.LINE_8, 4)
     v, u = np.nonzero(near)
+    v, u = v + top, u + left
     s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
     own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
     share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)
