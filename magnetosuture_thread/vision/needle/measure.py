@@ -179,12 +179,15 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     ends = np.array([0.0, length])
     guesses: list[np.ndarray] = []  # both ends of each
     fits: list[TemplateFit] = []
-    for guess in axis_guesses(steel.surely > 0.5, length, width):
-        at = guess.at(ends)
-        if not any(np.abs(at - other).max() < 1.5 for other in guesses):
-            guesses.append(at)
-            fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
-    fits.sort(key=lambda fit: fit.cost)
+    for level in (0.5, 0.7):  # share of steel: more of a thread over the needle is dark, less of one beside it
+        for guess in axis_guesses(steel.surely > level, length, width):
+            at = guess.at(ends)
+            if not any(np.abs(at - other).max() < 1.5 for other in guesses):
+                guesses.append(at)
+                fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
+        fits.sort(key=lambda fit: fit.cost)
+        if fits and fits[0].cost < 0.03 * length:  # px^2: nothing else is better
+            break
     found: MeasuredNeedle | str = NO_SHAPE if fits else "no arc"
     for rough in fits[:3]:
         if rough.cost > HOPELESS * MAX_COST * length:
