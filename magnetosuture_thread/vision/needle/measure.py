@@ -334,15 +334,16 @@ def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit) -> str:
     """Say what covers a drawn needle; empty if nothing does. Glare, which `shown` leaves out, may hide the tail."""
     if fit.cost > MAX_COST * fit.length:
         return NO_SHAPE
-    share, _, greatest = _steel_rows(shown, fit, THIN)
+    rows = _steel_rows(shown, fit, THIN)
+    share, _, greatest = rows
     tip = int(0.8 * len(share))
     even = np.convolve(share[:tip], np.full(5, 0.2), "valid")
     if even.max() > 0.13 or share[:END_ROWS].mean() > MAX_MISSING_END:  # of the steel may be missing
         return "something over it or against it"
     if np.mean(greatest[:tip] > 0.75) < 0.97:
         return "no needle's darkness"
-    missing, total, _ = (values[tip:] for values in _steel_rows(steel, fit, THIN))
-    if missing @ total > 0.2 * total.sum():
+    missing, total, _ = rows if shown is steel else _steel_rows(steel, fit, THIN)
+    if missing[tip:] @ total[tip:] > 0.2 * total[tip:].sum():
         return "something over it or against it"
     return ""
 
