@@ -99,17 +99,6 @@ def test_a_tilted_camera_is_warned_of_and_its_errors_are_within_the_covariance(d
     assert not VisionTracker(VisionTrackerSettings(), SCENE).look(frame_of("usual", 0, SEED)[1]).warning
 
 
-def test_over_time_a_tilted_camera_on_a_dark_floor_is_tracked_as_in_each_frame():
-    image = 255 - frame_of("tilt_6deg", 1, SEED)[1]
-    tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
-    alone = tracker.look(image)
-    for index in range(3):
-        seen = tracker.track(image, 0.1 * index)
-        assert seen.state is State.TRACKED
-        assert seen.warning == alone.warning != ""
-        np.testing.assert_allclose(seen.tail, alone.tail, atol=2e-5)
-
-
 def test_the_view_of_a_large_frame_is_in_its_own_pixels():
     case, image = frame_of("width_1920", 0, SEED)
     tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)

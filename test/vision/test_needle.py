@@ -128,12 +128,6 @@ def test_where_both_ends_look_alike_the_direction_it_must_have_decides():
         assert deviations[2] > np.pi
 
 
-def test_a_needle_without_contrast_is_not_seen():
-    frame = render(Pose(np.zeros(2), 0.3))
-    faint = (200 + 0.2 * (frame.astype(float) - 200)).astype(np.uint8)
-    assert find(faint)[0] == []
-
-
 def test_speckles_are_not_searched_for_long():
     speckled = np.full((480, 640, 3), 220, np.uint8)
     for u in range(180, 460, 30):

@@ -15,7 +15,7 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
 from magnetosuture_thread.vision.images import Wall, prepare
 from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.appearance import Appearance, Hiding, Strand, appearance_of
+from magnetosuture_thread.vision.thread.appearance import Appearance, Hiding, Strand
 from magnetosuture_thread.vision.thread.centreline import WALL_PX, find_centreline, without_needle
 from magnetosuture_thread.vision.thread.observe import BARE_COLOUR, Placed, find_order, is_bare_beyond, observe
 from magnetosuture_thread.vision.thread.walk import smoothed
@@ -180,10 +180,6 @@ def test_no_piece_is_said_to_lie_where_it_does_not_and_no_part_is_taken_for_all(
     assert (row(name).misplaced, row(name).incomplete, row(name).not_free) == (0, 0, 0)
 
 
-def test_a_thread_in_sight_is_complete():
-    assert (row("usual").complete, row("usual").incomplete) == (FRAMES, 0)
-
-
 def test_a_covered_end_is_neither_free_nor_is_the_thread_complete():
     assert (row("cover_end").complete, row("cover_end").free) == (0, 0)
     for index in range(FRAMES):
@@ -274,16 +270,6 @@ def test_pieces_are_joined_below_the_object_that_the_thread_went_below(
 ):
     tail, beyond = line((80.0, row), (149.0, row)), line((251.0, row), (330.0, row))
     assert (len(order_of((tail, (0, areas[0])), (beyond, (areas[1], 0)), longest=longest)) == 2) == joined
-
-
-def test_width_and_strength_of_a_thread_are_those_of_its_profile():
-    aside = np.arange(80.0)[:, None] - 40.0
-    image = np.round(120.0 - 60.0 * np.exp(-0.5 * aside**2) * np.ones(160)).astype(np.uint8)
-    points = np.column_stack([np.arange(20.0, 140.0, 2.0), np.full(60, 40.0)])
-    picture = prepare(image, 1)
-    found = appearance_of(picture, picture.darkest.pixels, points, np.ones(60, np.bool_))
-    assert found.strength == pytest.approx(60.0, rel=0.03)
-    assert found.width_px == pytest.approx(2.355, abs=0.5)
 
 
 @pytest.mark.parametrize(
