@@ -400,9 +400,8 @@ class VisionTracker:
         if key not in self._masks:
             if len(self._masks) >= 8:
                 self._masks.clear()
-            factor = search_factor(self._settings.needle_width / view.metres_per_pixel)
             tolerance = self._settings.outline_tolerance
-            self._masks[key] = scene_mask(self._scene, rounded, image.shape[:2], factor, tolerance, FLOOR_FACTOR)
+            self._masks[key] = scene_mask(self._scene, rounded, image.shape[:2], tolerance, FLOOR_FACTOR)
         return self._masks[key]
 
     def _advance(self, time_s: float) -> None:

@@ -133,7 +133,7 @@ def _dark_components(picture: Picture, view: DishView, radius_px: float, area: f
     mask = np.zeros(dark.shape, np.uint8)
     cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
     if picture.mask is not None:
-        cut = picture.mask.inside if tight else picture.mask.solid
+        cut = picture.mask.solid(picture.brightest.small.shape[::-1], 0.0 if tight else picture.mask.tolerance_px)
         cv2.subtract(mask, cut[window], mask)
     cv2.bitwise_and(dark, mask, dark)
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
