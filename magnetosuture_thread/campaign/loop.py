@@ -39,7 +39,7 @@ from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.session import TrackerSession
+from magnetosuture_thread.vision.tracker import TrackerSession
 
 Vector = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from magnetosuture_thread.planning.session import compile_planning
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.thread_model.session import ThreadSession
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import warm_up
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -44,8 +44,7 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings, pars
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import lens_of
-from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

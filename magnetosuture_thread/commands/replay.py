@@ -50,8 +50,7 @@ from magnetosuture_thread.messages.packing import (
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.thread_model.session import WAITING
-from magnetosuture_thread.vision.session import FrameMeasurement
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import FrameMeasurement, VisionTracker
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

@@ -41,10 +41,8 @@ from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
-from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
-from magnetosuture_thread.vision.tracker import VisionTracker
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
 from magnetosuture_thread.workers import Log
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")

@@ -20,10 +20,8 @@ from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
-from magnetosuture_thread.vision.look import State, no_pose
-from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import FrameMeasurement, State, TrackerSession, no_pose, warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
