@@ -511,7 +511,8 @@ def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
     """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
     line = respaced(line, 1.0)
     others = np.vstack([line, *(respaced(other, 1.0) for other in known)])
-    near = np.linalg.norm(line[:, None] - others, axis=2) < 2.5  # px: it shows the same thread, unless it only crosses it
+    # Within 2.5 px it shows the same thread, unless it only crosses it.
+    near = np.linalg.norm(line[:, None] - others, axis=2) < 2.5
     near[:, : len(line)] &= np.tri(len(line), k=-int(MAX_TWICE_PX) - 1, dtype=np.bool_)  # its own from long before
     twice = near.any(axis=1)
     for first, last in runs(twice):
