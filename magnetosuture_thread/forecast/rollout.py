@@ -253,7 +253,7 @@ def record_margins(
     rod, positions, to = model.step.rod, state.positions, buffers.contacts
     nodes, count = len(positions), 0
     margin, node, shape = record.margin[k], record.node[k], record.shape[k]
-    if len(model.around.frames) > 1 or model.around.wall_radius < np.inf:
+    if len(model.around.order) > 0 or model.around.wall_radius < np.inf:
         count = find_contacts(positions, model.around, to.node, to.obstacle, to.distance, to.normal, to.nearest)
     if count < 0:
         return False

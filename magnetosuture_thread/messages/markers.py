@@ -249,8 +249,7 @@ def packed_scene_markers(stamp: Stamp, scene: Scene) -> bytes:
             scale = (2.0 * geometry.radius, 2.0 * geometry.radius, thickness)
             markers.append(Marker("shapes", index, MarkerType.CYLINDER, scale, colour, 0.8, place=geometry.centre))
         else:
-            cut = triangulate(geometry)
-            corners = cut.vertices[cut.triangles].reshape(-1, 2)
+            corners = triangulate(geometry).reshape(-1, 2)
             markers.append(
                 Marker("shapes", index, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners)
             )

@@ -22,7 +22,7 @@ import math
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles import FRICTION, WorkspaceData, find_contacts
+from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import SPAN, Mask, Vector
@@ -200,8 +200,8 @@ def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> No
 def knows_friction(workspace: WorkspaceData) -> bool:
     """Return whether any shape or the wall has friction."""
     largest = 0.0
-    for row in range(len(workspace.frames)):
-        largest = max(largest, workspace.frames[row, FRICTION])
+    for k in range(len(workspace.friction)):
+        largest = max(largest, workspace.friction[k])
     return largest > 0.0
 
 
@@ -244,7 +244,7 @@ def friction_rows(
                     continue
                 grip, limit, c = buffers.grip[kind, i, slot], 0.0, best[kind, i, slot]
                 if c >= 0:
-                    limit = workspace.frames[shape + 1, FRICTION] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
+                    limit = workspace.friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
                 change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
                 if limit == 0.0:
                     continue
@@ -292,7 +292,7 @@ def keep_grips(buffers: StepBuffers, multipliers: Vector, row: int, workspace: W
             buffers.grip[kind, i, slot, 3] = buffers.limit[r]
             buffers.grip[kind, i, slot, 4] = place
             continue
-        if not (multipliers[r] > 0.0 and workspace.frames[shape + 1, FRICTION] > 0.0):
+        if not (multipliers[r] > 0.0 and workspace.friction[shape + 1] > 0.0):
             continue
         if slot < 0:
             slot = _slot_of(buffers, kind, i, NO_SHAPE)

@@ -1,4 +1,4 @@
-"""Polygons: what is refused, what is normalised, what smoothing touches."""
+"""Shapes: polygons that are refused, normalised, smoothed and cut into triangles; discs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Polygon
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
 
 SQUARE = ((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01))
 
@@ -101,3 +101,34 @@ def test_an_arc_that_meets_a_hole_is_made_smaller():
     assert smooth.area < shape.area
     with pytest.raises(ConfigurationError, match="radius"):
         shape.smoothed(-1.0)
+
+
+def test_triangles_cover_the_polygon_and_every_edge_of_it_is_one_of_a_single_triangle():
+    hole = square(0.002, 0.002, 0.003)
+    for polygon in (Polygon(SQUARE), Polygon(SQUARE, (hole,)), Polygon(SQUARE).smoothed(0.001)):
+        found = triangulate(polygon)
+        (ax, ay), (bx, by), (cx, cy) = np.moveaxis(found, 0, -1)
+        areas = 0.5 * ((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
+        assert (areas > 0.0).all()
+        assert areas.sum() == pytest.approx(polygon.area)
+        directed = [(tuple(t[k]), tuple(t[k - 2])) for t in found.tolist() for k in range(3)]
+        assert len(directed) == len(set(directed))
+        rings = [ring.tolist() for ring in polygon.rings]
+        boundary = {(tuple(ring[k - 1]), tuple(ring[k])) for ring in rings for k in range(len(ring))}
+        assert boundary == {(a, b) for a, b in directed if (b, a) not in directed}
+
+
+def test_corners_apart_by_less_than_rounding_cannot_be_cut_into_triangles():
+    needle = Polygon(((0.0, 0.0), (0.005, 0.0), (0.0, 0.005))).smoothed(1e-320)
+    with pytest.raises(ConfigurationError, match="can be cut into triangles"):
+        triangulate(needle)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_signed_distance_of_a_disc_and_its_gradient(dimension: int):
+    disc = Disc(tuple(0.1 * np.arange(dimension)), 0.5)
+    points = np.vstack([np.random.default_rng(0).uniform(-1.0, 1.0, (50, dimension)), disc.centre])
+    distance, normal = disc.signed_distance(points)
+    np.testing.assert_allclose(distance, np.linalg.norm(points - disc.centre, axis=1) - 0.5)
+    np.testing.assert_allclose(disc.centre + (0.5 + distance[:, None]) * normal, points, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)  # at the centre too
