@@ -12,7 +12,7 @@ from typing import Any
 
 import magnetosuture_thread
 from magnetosuture_thread import MATERIALS, interface
-from magnetosuture_thread.cli.main import make_parser
+from magnetosuture_thread.cli import make_parser
 from magnetosuture_thread.configuration import Configuration, ConfigurationField, configuration_fields
 from magnetosuture_thread.setups import SETTINGS_CLASSES
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS

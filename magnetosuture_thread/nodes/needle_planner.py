@@ -42,8 +42,12 @@ from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
-from magnetosuture_thread.planning.session import ProcedureSession, ProcedureStatus, compile_planning
-from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+from magnetosuture_thread.planning.session import (
+    NeedlePlannerSettings,
+    ProcedureSession,
+    ProcedureStatus,
+    compile_planning,
+)
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed

@@ -14,7 +14,7 @@ from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.scene_follower import initial_scene
-from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
+from magnetosuture_thread.scene.files import SceneEditor, SceneServerSettings
 
 
 class SceneServerNode(StandbyNode[SceneServerSettings]):

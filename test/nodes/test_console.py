@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 
-from magnetosuture_thread.cli.main import main
+from magnetosuture_thread.cli import main
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import console as console_graph

@@ -13,7 +13,7 @@ from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
-from magnetosuture_thread.scene.editing import MAX_SHAPE_CHARS
+from magnetosuture_thread.scene.files import MAX_SHAPE_CHARS
 from test.scene.scenes import every_shape
 
 SERVICES = {
