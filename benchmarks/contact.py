@@ -36,7 +36,7 @@ from magnetosuture_thread.reproduce.hernia import (
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.thread.formulations import RodFormulation
+from magnetosuture_thread.thread.rod import RodFormulation
 
 STEERING = Path("examples/hernia_steering")
 TRUE_SEGMENTS = 240

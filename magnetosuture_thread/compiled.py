@@ -12,12 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba import _dynfunc
-from numba.core import event
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder, _LowerResult
-from numba.core.compiler_machinery import register_pass
-from numba.core.typed_passes import NativeLowering
+from numba.core import codegen, compiler, compiler_machinery, event, typed_passes
 
 PACKAGE = Path(__file__).parent
 COMPILED_MARK = b"magnetosuture_thread.compiled"
@@ -28,12 +23,18 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # Said of every function, as numba takes it over from whatever calls one first where it is not said.
 # Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-_EVENTS = cast(Any, event)  # without types
+# Of numba, without types.
+_EVENTS = cast(Any, event)
+_CodeLibrary, _CompilerBase, _Lowering = (
+    cast(Any, each) for each in (codegen.JITCodeLibrary, compiler.CompilerBase, typed_passes.NativeLowering)
+)
+_passes, _register_pass = cast(Any, compiler.DefaultPassBuilder), cast(Any, compiler_machinery.register_pass)
+
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
 
 
-class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
+class _LinkedLibrary(_CodeLibrary):  # type: ignore[misc]
     """Code of a function that another one calls: optimised and assembled as a part of the one called from Python.
 
     numba optimises and assembles each function by itself, then again in each that calls it, and so on: in a tree of
@@ -48,8 +49,8 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
 
-@register_pass(mutates_CFG=True, analysis_only=False)
-class _LinkedLowering(NativeLowering):  # type: ignore[misc]
+@_register_pass(mutates_CFG=True, analysis_only=False)
+class _LinkedLowering(_Lowering):  # type: ignore[misc]
     """Lower a function to code that is linked; see `_LinkedLibrary`."""
 
     _name = "linked_lowering"
@@ -59,22 +60,22 @@ class _LinkedLowering(NativeLowering):  # type: ignore[misc]
         state.library = library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
-        described, helper, _, environment = state["cr"]
-        # The key by which numba finds the code is a function of Python without an address.
-        key = _dynfunc.make_function(described.lookup_module(), described.qualname, "", 0, environment, (library,))
-        state.targetctx.insert_user_function(key, described, [library])
-        state["cr"] = _LowerResult(described, helper, cfunc=key, env=environment)
+        lowered = state["cr"]
+        # The key by which numba finds the code is a builtin function, and each has to have its own: nobody calls it.
+        key = [library].copy
+        state.targetctx.insert_user_function(key, lowered.fndesc, [library])
+        state["cr"] = lowered._replace(cfunc=key)
         return True
 
 
-class _LinkedCompiler(CompilerBase):  # type: ignore[misc]
+class _LinkedCompiler(_CompilerBase):  # type: ignore[misc]
     """Compiles functions that only compiled code calls."""
 
     def define_pipelines(self) -> list[Any]:
         """Return numba's own passes with the last but one replaced."""
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_LinkedLowering, NativeLowering)
-        passes.passes = [each for each in passes.passes if each[0] is not NativeLowering]
+        passes = _passes.define_nopython_pipeline(self.state)
+        passes.add_pass_after(_LinkedLowering, _Lowering)
+        passes.passes = [each for each in passes.passes if each[0] is not _Lowering]
         passes.finalize()
         return [passes]
 

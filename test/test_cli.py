@@ -11,7 +11,7 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.cli import COMMANDS, make_parser
-from magnetosuture_thread.thread.formulations import FORMULATIONS
+from magnetosuture_thread.thread.predictor import FORMULATIONS
 from magnetosuture_thread.thread.solvers import SOLVERS
 
 

@@ -30,7 +30,8 @@ LAYERS = (
     {"messages", "bags", "setups", "console", "workers"},
     {"evaluation", "calibration", "campaign"},
     {"nodes"},
-    {"commands", "reproduce"},
+    {"commands"},
+    {"reproduce"},
     {"cli"},
 )
 

@@ -1,8 +1,8 @@
 """Time the coil bridge: how long until the duties of two simulated RoboClaw boards are zero.
 
 The boards are on pseudo-terminals. Measured after a commander fell silent and after kill -9 of commander,
-tracker and bridge; also how even the bridge's loop is. Meanwhile all cores are kept busy. Takes nine minutes.
-Hostile messages are those of `python -m benchmarks attack nodes`.
+tracker and bridge; also how even the bridge's loop is, and what hostile messages can do. Meanwhile all cores
+are kept busy. Takes nine minutes.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
 from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power import PowerStage
@@ -41,6 +42,7 @@ RESTART_AFTER = 6  # attempts; on a busy machine a bridge takes a minute to star
 START_TIMEOUT = 60.0  # s for processes to start and to be heard, on a busy machine
 REARM_AFTER = 10.0  # s without current, after which the bridge is armed again
 TIMEOUT = 30.0  # s for anything to happen
+FULL = 32767  # duty of the full supply
 KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
 SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
 
@@ -72,6 +74,7 @@ class DriveWatch:
 
     Attributes:
         turns: when the coils were driven from then on, or not any more: (time [s], driven).
+        largest: greatest duty of any coil since it was set to zero.
     """
 
     def __init__(self, stage: PowerStage) -> None:
@@ -79,6 +82,7 @@ class DriveWatch:
         self._on = [False] * len(stage.boards)
         self._seen = [-np.inf] * len(stage.boards)
         self.turns: list[tuple[float, bool]] = []
+        self.largest = 0
 
     @property
     def driven(self) -> bool:
@@ -96,6 +100,7 @@ class DriveWatch:
             changes += [(at, index, duties) for at, duties in timeline if at > self._seen[index]]
             self._seen[index] = timeline[-1][0] if timeline else self._seen[index]
         for at, index, duties in sorted(changes):
+            self.largest = max(self.largest, *(abs(duty) for duty in duties))
             self._on[index] = any(duties)
             if any(self._on) != self.driven:
                 self.turns.append((at, any(self._on)))
@@ -137,7 +142,7 @@ class BridgeBench:
         self.restarts = 0
 
     def start(self, name: str, **parameters: float | str) -> None:
-        """Start the bridge, or a stand-in for a commander or a tracker."""
+        """Start the bridge, or a stand-in for a commander, a tracker or a fuzzer."""
         if name == "coil_bridge":
             self._nodes.start(name)
             self.arm()
@@ -180,6 +185,33 @@ class BridgeBench:
             self._progress((done + 1) / times)
             self.start(name)
         return delays
+
+    def fuzz(self, count: int) -> float:
+        """Publish hostile messages and see that the bridge works afterwards.
+
+        Returns:
+            The greatest current asked of a board meanwhile [A].
+
+        Raises:
+            GraphError: it does not.
+        """
+        for name in ("commander", "tracker"):
+            self._nodes.kill(name)
+        # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
+        self.wait(lambda: not self._driven(), "zero")
+        time.sleep(2.0 * SILENCE_TIMEOUT)
+        self.watch.look()
+        self.watch.largest = 0
+        self.start("fuzzer", count=count)
+        self.wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", TIMEOUT + count / 200.0)
+        self._nodes.kill("fuzzer")  # whose work is done
+        self.watch.look()
+        greatest = self.watch.largest / FULL * SUPPLY / RESISTANCE
+        self.arm()
+        self.start("tracker")
+        self.start("commander")
+        self.drive()
+        return greatest
 
     def drive(self) -> None:
         """Wait until the coils have been driven for a while, and start all anew where they are not."""
@@ -238,6 +270,7 @@ class BridgeBench:
 def measure_bridge(
     trials: int,
     kills: int,
+    hostile: int,
     *,
     busy: bool = True,
     log: Log = print,
@@ -248,14 +281,15 @@ def measure_bridge(
     Args:
         trials: of a commander that falls silent.
         kills: of each process.
+        hostile: messages.
         log: called with a line for a person at each stage.
         progress: called with the share of a stage done, 0 to 1.
         busy: whether to keep all cores busy meanwhile; else boards have more time for an answer.
 
     Returns:
         The figures: `delays` as of `zero_delays`; `loop`, by how much an interval of the loop differs from its period
-        (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`;
-        `restarts` as of `BridgeBench`.
+        (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`; `hostile` messages,
+        the `greatest_current` meanwhile and its limit `max_current` [A]; `restarts` as of `BridgeBench`.
     """
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes.clients import CoilClient
@@ -301,11 +335,14 @@ def measure_bridge(
                 for victim in ("commander", "tracker", "coil_bridge"):
                     log(f"{kills} times kill -9 of the {victim}")
                     add(f"kill -9 of {victim}", bench.kills(victim, kills), KILL_BOUND)
+                log(f"{hostile} hostile messages")
+                greatest = bench.fuzz(hostile)
         finally:
             stage.close()
     return {
         "delays": delays,
-        **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "restarts": bench.restarts},
+        **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
+        **{"greatest_current": greatest, "max_current": settings.max_current, "restarts": bench.restarts},
     }
 
 
@@ -327,6 +364,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for name, default, what in (
         ("trials", 500, "a commander that falls silent"),
         ("kills", 20, "kill -9 of each process"),
+        ("hostile", 10_000, "hostile messages"),
     ):
         parser.add_argument(
             f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what} (default: {default})"
@@ -336,7 +374,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
     with progress(console, "bridge") as advance:
-        figures = measure_bridge(options.trials, options.kills, log=make_log(console), progress=advance)
+        figures = measure_bridge(
+            options.trials, options.kills, options.hostile, log=make_log(console), progress=advance
+        )
     console.print(bridge_table(figures))
     return figures, True
 
@@ -352,5 +392,7 @@ def bridge_table(figures: dict[str, Any]) -> Table:
         values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest", "bound"))
         table.add_row(each["event"], *values, f"{each['beyond']}/{each['count']}")
     table.add_row("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", "")
+    current, limit = f"{figures['greatest_current']:.2f} A", f"{figures['max_current']:.2f} A"
+    table.add_row(f"{figures['hostile']} hostile messages", "", "", current, limit, "alive")
     table.add_row("restarts after a kill", "", "", "", "", str(figures["restarts"]))
     return table

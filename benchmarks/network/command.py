@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 DELAY, LOSS = 0.05, 0.05  # s, and share of packets
 SETUP = "petri_35mm_polyamide"
+DOMAIN = 1  # of ROS, on hosts that have no other graph
 AT_THE_RIG = ("scene_server", "rig_simulator", "vision_tracker", "coil_bridge")
 AT_THE_DESK = ("thread_model", "path_follower", "console")
 # Not by TCP, whose packets wait for one that was lost.
@@ -107,39 +108,24 @@ class RigWatch:
         since: when it began to do so without a pause of `DRIVEN_TIME` [s].
         armed: whether the bridge is armed.
         reasons: why the currents are zero.
+        spin: takes what comes for a while [s].
+        close: leaves the graph.
 
     Args:
         processes: none of which may end.
     """
 
     def __init__(self, processes: Sequence[NodeProcesses]) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-
         from magnetosuture_thread.nodes import topics
-        from magnetosuture_thread.nodes.node import GuardedNode
+        from magnetosuture_thread.nodes.clients import Recorder
 
-        self._processes, self._context = processes, rclpy.Context()
-        rclpy.init(context=self._context, args=[])
-        self._node = GuardedNode("rig_watch", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        topics.RIG_CURRENTS.subscribe(self._node, self._on_currents)
-        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
+        self._processes, self._state = processes, topics.BRIDGE_STATE
+        self._currents = topics.RIG_CURRENTS
+        taken = [self._currents, self._state]
+        self._recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
+        self.close, self.spin = self._recorder.close, self._recorder.spin
         self.driven = self.since = -np.inf
         self.armed, self.reasons = False, ""
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin(self, duration: float) -> None:
-        """Take what comes for a while."""
-        end = time.monotonic() + duration
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.02))
 
     def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
         """Take what comes until a condition holds.
@@ -153,22 +139,24 @@ class RigWatch:
                 each.check()
             if time.monotonic() > end:
                 raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
-            self._executor.spin_once(timeout_sec=0.02)
+            self.spin(0.02)
 
     def is_driven(self) -> bool:
         """Whether the coils are driven, and have been for a while."""
         now = time.time()
         return now - self.driven < DRIVEN_TIME <= now - self.since
 
-    def _on_currents(self, message: Any) -> None:
+    def _receive(self, topic: str, arrival: int, data: bytes) -> None:
+        if topic == self._state.channel.recorded:
+            state = self._state.decode(data)
+            self.armed, self.reasons = state.armed, "; ".join(state.reasons)
+            return
+        message = self._currents.decode(data)
         if np.any(np.abs(message.current) > 0.0):
             given = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
             if given - self.driven > DRIVEN_TIME:
                 self.since = given
             self.driven = given
-
-    def _on_state(self, message: Any) -> None:
-        self.armed, self.reasons = message.armed, "; ".join(message.reasons)
 
 
 class TwoHostBench:
@@ -237,7 +225,7 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
         # Imported here: threads that it starts have to be on the rig's host.
         from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment
 
-        environment = {**graph_environment(1), **ENVIRONMENT}
+        environment = {**graph_environment(DOMAIN), **ENVIRONMENT}
         path = ",".join(map(str, (*setup.follower.waypoints,) * ROUNDS))
         shared = ["--params-file", str(setup.path.resolve()), *_parameters(BEST_EFFORT)]
         at_the_rig = [*shared, *_parameters(BRIDGE)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -26,7 +27,6 @@ from magnetosuture_thread.commands.command import (
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.texts import one_line
 
-MAX_NOTE_CHARS = 200  # of a note that are shown; one may hold a whole setup
 MAX_PLACES = 100  # of damage that are shown; `--json` writes all
 
 DESCRIPTION = """\
@@ -73,35 +73,29 @@ def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
 
     A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others.
     """
-    log = terminal.log
     with terminal.progress("bag repair") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
         with whole_folder(options.output) as folder:
             name = options.output.name
             report = write_repaired_bag(bag, folder, name, lambda share: advance(0.5 + 0.5 * share))
-    if bag.damage is not None:
-        log(str(bag.damage))
-    for line in (f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks):
-        log(line) if line else None
-    if report.is_same and not (bag.damage or bag.unverified or bag.unchecked or bag.remarks):
-        log("is not damaged: the new bag holds the same messages, definitions, attachments, metadata records and notes")
-    for reason, lost in report.refused.items():
-        log(f"{reason}: {pluralize(lost, 'message')} lost")
-    for reason, lost in report.dropped.items():
-        log(f"not kept: {lost} of this: {reason}")
+    places = bag.damage.regions if bag.damage is not None else ()
+    doubts = [str(bag.damage or ""), f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks]
+    lines = [line for line in doubts if line]
+    if report.is_same and not lines:
+        kept = "messages, definitions, attachments, metadata records and notes"
+        lines.append(f"is not damaged: the new bag holds the same {kept}")
+    lines += [f"{reason}: {pluralize(lost, 'message')} lost" for reason, lost in report.refused.items()]
+    lines += [f"not kept: {lost} of this: {reason}" for reason, lost in report.dropped.items()]
     if report.unpacked:
-        log(f"{pluralize(report.unpacked, 'message')} packed by the recorder, and unpacked in the new bag")
+        lines.append(f"{pluralize(report.unpacked, 'message')} packed by the recorder, and unpacked in the new bag")
     if report.defined:
-        log(f"without a definition, now with ours: {', '.join(sorted(set(report.defined)))}")
+        lines.append(f"without a definition, now with ours: {', '.join(sorted(set(report.defined)))}")
     if report.rewritten:
         topics = ", ".join(one_line(topic) for topic in sorted(set(report.rewritten)))
-        log(f"quality of service written by name, as Jazzy reads it: {topics}")
-    places = bag.damage.regions if bag.damage is not None else ()
-    for place in places[:MAX_PLACES]:
-        log(f"  {place}{_times(place.first, place.last, bag.start)}")
-    for line in _others(len(places)):
-        log(line)
-    log(f"{report.messages} messages in {options.output}")
+        lines.append(f"quality of service written by name, as Jazzy reads it: {topics}")
+    lines += _shown([f"{place}{_times(place.first, place.last, bag.start)}" for place in places])
+    for line in (*lines, f"{report.messages} messages in {options.output}"):
+        terminal.log(line)
     return DONE
 
 
@@ -114,63 +108,54 @@ def _times(first: int | None, last: int | None, start: int) -> str:
     return f"; messages between {begin} and {end}"
 
 
+def _shown(places: list[str]) -> list[str]:
+    """Return a line for each damaged place, and how many are not shown."""
+    others = len(places) - MAX_PLACES
+    return [f"  {place}" for place in places[:MAX_PLACES]] + ([f"  and {others} other places"] if others > 0 else [])
+
+
 def _table(found: dict[str, Any]) -> Table:
     """Return a row for each topic."""
     table = Table(title=f"{found['messages']} messages in {found['duration_s']:.3f} s", box=SIMPLE_HEAD, padding=0)
     table.caption = "times in s since the first message; * is taken by our graph"
-    for name in ("topic", "messages", "Hz", "first", "last", "gap", "back"):
-        is_topic = name == "topic"
-        table.add_column(name, justify="left" if is_topic else "right", overflow="fold", no_wrap=not is_topic)
+    table.add_column("topic", overflow="fold")
+    for name in ("messages", "Hz", "first", "last", "gap", "back"):
+        table.add_column(name, justify="right", no_wrap=True)
     for topic in found["topics"]:
         times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
-        table.add_row(
-            Text(one_line(topic["topic"]) + (" *" if topic["known"] else "")),
-            str(topic["messages"]),
-            *("-" if value is None else f"{value:.2f}" for value in times),
-            str(topic["stamps_going_back"]),
-        )
+        name, messages = one_line(topic["topic"]) + (" *" if topic["known"] else ""), str(topic["messages"])
+        cells = ("-" if value is None else f"{value:.2f}" for value in times)
+        table.add_row(Text(name), messages, *cells, str(topic["stamps_going_back"]))
     return table
 
 
-def _lines(found: dict[str, Any]) -> list[str]:
+def _lines(found: dict[str, Any]) -> Iterator[str]:
     """Return in words what the table does not say."""
-    lines = []
     for topic in found["topics"]:
         types = " and ".join(kind.replace("/msg/", "/") for kind in topic["types"])
-        lines.append(f"{one_line(topic['topic'])}: {one_line(types) or 'no type'}")
+        yield f"{one_line(topic['topic'])}: {one_line(types) or 'no type'}"
     for topic in found["topics"]:
         name = one_line(topic["topic"])
         if len(topic["types"]) > 1:
-            lines.append(f"{name} has two types")
+            yield f"{name} has two types"
         elif topic["problem"]:
-            lines.append(topic["problem"])
+            yield topic["problem"]
         if topic["stamps_going_back"]:
-            lines.append(f"{name}: {topic['stamps_going_back']} stamps are before the one before them")
+            yield f"{name}: {topic['stamps_going_back']} stamps are before the one before them"
         if topic["unreadable_stamps"]:
-            lines.append(f"{name}: {topic['unreadable_stamps']} stamps cannot be read")
-    lines += ["; ".join(f"{key} {value}" for key, value in file.items()) for file in found["files"]]
-    lines += [f"{key}: {shorten(value, MAX_NOTE_CHARS, placeholder=' ...')}" for key, value in found["notes"].items()]
-    lines += found["remarks"]
-    if found["unverified"]:
-        lines.append(f"unverified: {found['unverified']}")
-    elif found["unchecked"]:
-        lines.append(found["unchecked"])
-    lines += [
-        f"{reason}: {count} {'message' if count == 1 else 'messages'} lost"
-        for reason, count in found["refused"].items()
-    ]
-    if found["damage"] is None:
-        is_sure = not (found["refused"] or found["unchecked"] or found["unverified"])
-        return [*lines, "nothing is damaged"] if is_sure else lines
-    lines.append(found["damage"]["text"])
-    places = found["damage"]["places"]
-    lines += [
-        f"  {place['file']}, bytes {place['start_byte']} to {place['end_byte']}: {place['what']}"
-        for place in places[:MAX_PLACES]
-    ]
-    return [*lines, *_others(len(places))]
-
-
-def _others(count: int) -> list[str]:
-    """Return a line on the damaged places that are not shown, if there are any."""
-    return [f"  and {count - MAX_PLACES} other places"] if count > MAX_PLACES else []
+            yield f"{name}: {topic['unreadable_stamps']} stamps cannot be read"
+    for file in found["files"]:
+        yield "; ".join(f"{key} {value}" for key, value in file.items())
+    for key, value in found["notes"].items():
+        yield f"{key}: {shorten(value, 200, placeholder=' ...')}"
+    yield from found["remarks"]
+    if found["unverified"] or found["unchecked"]:
+        yield f"unverified: {found['unverified']}" if found["unverified"] else found["unchecked"]
+    for reason, count in found["refused"].items():
+        yield f"{reason}: {pluralize(count, 'message')} lost"
+    if found["damage"] is not None:
+        yield found["damage"]["text"]
+        byte = "{file}, bytes {start_byte} to {end_byte}: {what}"
+        yield from _shown([byte.format(**place) for place in found["damage"]["places"]])
+    elif not (found["refused"] or found["unchecked"] or found["unverified"]):
+        yield "nothing is damaged"

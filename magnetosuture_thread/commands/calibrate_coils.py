@@ -12,10 +12,9 @@ from typing import Any
 from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.coils.calibration import CalibrationFit, fit_calibration, read_measurements
+from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
 from magnetosuture_thread.commands.command import DONE, Terminal, output_file, runs
 from magnetosuture_thread.commands.output import whole_file
-from magnetosuture_thread.errors import BagError
 
 MAX_BACKGROUND = 1e-3  # T; that of the earth is a twentieth of it
 
@@ -41,7 +40,18 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
     ten places or more for each coil. Some lines with a current of 0 tell the background of earth and probe
     apart, and so do both directions of current.
     """
-    found = calibrate_coils(options.measurements, options.output, options.name).to_json()
+    fit = fit_calibration(read_measurements(options.measurements))
+    x, y = fit.background
+    if math.hypot(x, y) > MAX_BACKGROUND:
+        text, expected = f"a background of {1e3 * math.hypot(x, y):.3g} mT", f"at most {1e3 * MAX_BACKGROUND:g} mT"
+        raise InvalidInputError(str(options.measurements), text, f"{expected}; are all fields in T?")
+    source = f"from {fit.readings} readings in {options.measurements.name}"
+    notes = f"{source}, residual {fit.residual:.2e} T, background {x:.2e}, {y:.2e} T"
+    date = datetime.date.today().isoformat()
+    calibration = replace(fit.calibration, name=options.name or options.output.stem, date=date, notes=notes)
+    with whole_file(options.output) as partial:
+        partial.write_text(calibration.to_yaml(), encoding="utf-8")
+    found = replace(fit, calibration=calibration).to_json()
     terminal.print(_coil_table(found))
     x, y = (1e6 * value for value in found["background"])
     line, worst = found["worst"]
@@ -53,34 +63,6 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
             terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
     terminal.log(f"calibration: {options.output}")
     return DONE
-
-
-def calibrate_coils(measurements: Path, output: Path, name: str = "") -> CalibrationFit:
-    """Fit the coils' model to measurements and write the calibration, whole or not at all.
-
-    Args:
-        measurements: a CSV file; see `read_measurements`.
-        output: the YAML file to write.
-        name: of the rig; the output's own without its ending if empty.
-
-    Raises:
-        InvalidInputError: the measurements cannot be used; the message says which and why.
-        BagError: the file cannot be written.
-    """
-    if output.exists() and output.samefile(measurements):
-        raise BagError(output, "holds the measurements; write the calibration to another file")
-    fit = fit_calibration(read_measurements(measurements))
-    x, y = fit.background
-    if math.hypot(x, y) > MAX_BACKGROUND:
-        text = f"a background of {1e3 * math.hypot(x, y):.3g} mT"
-        raise InvalidInputError(str(measurements), text, f"at most {1e3 * MAX_BACKGROUND:g} mT; are all fields in T?")
-    source = f"from {fit.readings} readings in {measurements.name}"
-    notes = f"{source}, residual {fit.residual:.2e} T, background {x:.2e}, {y:.2e} T"
-    date = datetime.date.today().isoformat()
-    calibration = replace(fit.calibration, name=name or output.stem, date=date, notes=notes)
-    with whole_file(output) as partial:
-        partial.write_text(calibration.to_yaml(), encoding="utf-8")
-    return replace(fit, calibration=calibration)
 
 
 def _coil_table(fit: dict[str, Any]) -> Table:

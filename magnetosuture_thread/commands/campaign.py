@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Collection, Sequence
-from contextlib import nullcontext
+from collections.abc import Collection
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,8 @@ import numpy as np
 from rich.table import Table
 
 from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
-from magnetosuture_thread.campaign.bag import RunBag
-from magnetosuture_thread.campaign.loop import START
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.campaign.loop import START, RunBag
 from magnetosuture_thread.campaign.run import (
     KEEP_OUT_TOLERANCE,
     MAX_REST,
@@ -51,13 +51,6 @@ from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.setups import Setup, read_procedure_setup
 from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
-FILE, PAGE = "campaign.json", "campaign.html"
-BAGS = "bags"  # folder of the bags in the output
-MAX_STRIPS = 200  # failed runs with pictures
-CLOSE_UP = 4.0  # lengths of the needle: side of a close-up
-MIN_CLOSE_UP = 8e-3  # m
-MIN_COMMAND = 1e-6  # m/s; a smaller command has no arrow
-NOT_REACHED = "not all goals reached"
 REASONS = {
     "min_needle_clearance_m": "the needle came too close to wall or shape",
     "max_thread_penetration_m": "a node of the thread was in wall or shape",
@@ -96,12 +89,34 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
     With --scheduler and --bags, DIR must be a folder that all workers have.
     A run succeeds if all goals are reached and all limits hold. All of it is simulated.
     """
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    given = {name: getattr(options, name) for name in ("setup", "camera", "bags", "workers", "scheduler")}
-    with terminal.progress("campaign") as advance:
-        result = simulate_campaign(
-            options.procedure, seeds, options.output, log=terminal.log, progress=advance, **given
-        )
+    seeds, bags = range(options.first_seed, options.first_seed + options.seeds), sorted(set(options.bags))
+    procedure = read_procedure(options.procedure)
+    if not set(bags) <= set(seeds):
+        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
+    setup = read_procedure_setup(procedure, options.setup)
+    check_run(procedure, setup, vary(setup, seeds[0]))
+    result = CampaignResult(procedure, setup, options.camera, bags={seed: f"bags/seed_{seed}" for seed in bags})
+    work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)
+    with (
+        terminal.progress("campaign") as advance,
+        whole_folder(options.output) as folder,
+        make_runner(work, options.workers, options.scheduler) as runner,
+    ):
+        tasks = [(seed, folder / result.bags[seed] if seed in bags else None) for seed in seeds]
+        found: dict[int, RunResult] = {}
+        for index, made in runner.run(tasks, terminal.log, advance):
+            seed = seeds[index]
+            if isinstance(made, WorkerDiedError):
+                result.died[seed] = str(made)
+                terminal.log(f"seed {seed}: {made}")
+                continue
+            found[seed], used_time = made
+            outcome = "success" if found[seed].success else found[seed].reason
+            speed = found[seed].simulated_s / used_time
+            terminal.log(f"seed {seed}: {outcome} ({speed:.1f} times real time)")
+        result.runs.extend(found[seed] for seed in seeds if seed in found)
+        (folder / "campaign.json").write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+        (folder / "campaign.html").write_text(write_page(result), encoding="utf-8")
     title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
     table = Table(title=f"{title} (simulated)", title_justify="left", title_style="bold")
     for name in ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
@@ -119,7 +134,7 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
             f"{figures.wrap_degrees:.0f}",
         )
     terminal.print(table)
-    terminal.print(f"report: {options.output / PAGE}", soft_wrap=True)
+    terminal.print(f"report: {options.output / 'campaign.html'}", soft_wrap=True)
     return FAILED if result.died else DONE
 
 
@@ -139,7 +154,7 @@ class CampaignResult:
     procedure: Procedure
     setup: Setup
     camera: bool
-    runs: Sequence[RunResult]
+    runs: list[RunResult] = field(default_factory=list)
     died: dict[int, str] = field(default_factory=dict)
     bags: dict[int, str] = field(default_factory=dict)
 
@@ -166,68 +181,6 @@ class CampaignResult:
         }
 
 
-def simulate_campaign(
-    name: str,
-    seeds: range,
-    output: Path,
-    *,
-    setup: str = "",
-    camera: bool = False,
-    bags: Collection[int] = (),
-    workers: int = 1,
-    scheduler: str = "",
-    log: Log = lambda text: None,
-    progress: Progress = lambda share: None,
-) -> CampaignResult:
-    """Run a procedure once for each seed, and write `campaign.json`, a report and bags into a new folder.
-
-    The files are the same for the same seeds, however many processes run them.
-
-    Args:
-        name: of the procedure, or the path of its file.
-        seeds: of the runs.
-        output: folder to make.
-        setup: name or file of the setup; empty for the procedure's own.
-        camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
-        bags: seeds whose runs are recorded as bags.
-        workers: processes.
-        scheduler: address of a Dask scheduler, whose workers make the runs in place of those; for bags they must have
-            the output's folder too.
-        log: called with a line for a person at each run's end.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        ConfigurationError: procedure or setup cannot be used, or do not fit each other, or a bag is of no run.
-        PlanningError: there is no way to a goal from where the first run begins.
-        BagError: the output exists, or cannot be written.
-    """
-    procedure = read_procedure(name)
-    if not set(bags) <= set(seeds):
-        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
-    used = read_procedure_setup(procedure, setup)
-    check_run(procedure, used, vary(used, seeds[0]))
-    found: dict[int, RunResult] = {}
-    died: dict[int, str] = {}
-    folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
-    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera)
-    with whole_folder(output) as folder, make_runner(work, workers, scheduler) as runner:
-        tasks = [(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
-        for index, made in runner.run(tasks, log, progress):
-            seed = seeds[index]
-            if isinstance(made, WorkerDiedError):
-                died[seed] = str(made)
-                log(f"seed {seed}: {made}")
-                continue
-            run, used_time = made
-            found[seed], speed = run, run.simulated_s / used_time
-            log(f"seed {seed}: {'success' if run.success else run.reason} ({speed:.1f} times real time)")
-        ordered = tuple(found[seed] for seed in seeds if seed in found)
-        result = CampaignResult(procedure, used, camera, ordered, died, folders)
-        (folder / FILE).write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
-        (folder / PAGE).write_text(write_page(result), encoding="utf-8")
-    return result
-
-
 def _run(
     procedure: Procedure,
     setup: Setup,
@@ -243,25 +196,27 @@ def _run(
         raise BagError(folder, "cannot be recorded: this worker does not have the output's folder")
     what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {seed}"
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
-    with nullcontext() if folder is None else RunBag(folder, setup, notes, START, camera=camera) as bag:
-        found = run_procedure(procedure, setup, vary(setup, seed), camera=camera, recorder=bag)
+    with ExitStack() as stack:
+        bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
+        recorder = None if bag is None else RunBag(bag, setup, START, camera=camera)
+        found = run_procedure(procedure, setup, vary(setup, seed), camera=camera, recorder=recorder)
     return found, process_time() - began
 
 
 def write_page(result: CampaignResult) -> str:
     """Return the report as a page of HTML, with pictures of failed runs."""
-    rows = [
-        {"result": run, "broken": set(run.figures.beyond_limits(result.setup.coils.keep_out))} for run in result.runs
+    keep_out = result.setup.coils.keep_out
+    rows: list[dict[str, Any]] = [
+        {"result": run, "broken": set(run.figures.beyond_limits(keep_out)), "pictures": (), "closest": None}
+        for run in result.runs
     ]
-    failed = [row for row, run in zip(rows, result.runs, strict=True) if not run.success]
-    for row in rows:
-        row |= {"pictures": (), "closest": None}
-    for row in failed[:MAX_STRIPS]:
+    failed = [row for row in rows if not row["result"].success]
+    for row in failed[:200]:  # of the others the figures are in the table
         row |= _pictures(result, row["result"], row["broken"])
     reasons: dict[str, list[int]] = {}
     for row in rows:
         run = row["result"]
-        not_reached = [NOT_REACHED] if not (run.success or run.reached) else []
+        not_reached = ["not all goals reached"] if not (run.success or run.reached) else []
         for why in (*not_reached, *(REASONS[name] for name in sorted(row["broken"]))):
             reasons.setdefault(why, []).append(run.seed)
     scene = result.setup.scene
@@ -269,7 +224,7 @@ def write_page(result: CampaignResult) -> str:
         details=result,
         runs=rows,
         failed=[row for row in failed if row["pictures"]],
-        left_out=len(failed[MAX_STRIPS:]),
+        left_out=len(failed[200:]),
         tiles=_tiles(result) if rows else [],
         reasons=sorted(reasons.items(), key=lambda each: -len(each[1])),
         shapes=[{"kind": shape.kind, "path": _outline(shape.geometry)} for shape in scene.shapes],
@@ -345,11 +300,12 @@ def _picture(instant: RunInstant, scene: Scene, speed: float, *, overview: bool 
     """
     axis, frame = instant.axis, instant.frame
     length = float(np.linalg.norm(axis[-1] - axis[0]))
-    half, centre = 0.5 * max(CLOSE_UP * length, MIN_CLOSE_UP), 0.5 * (axis[0] + axis[-1])
+    # A close-up is four needles wide, and 8 mm at least.
+    half, centre = 0.5 * max(4.0 * length, 8e-3), 0.5 * (axis[0] + axis[-1])
     if overview:
         half, centre = 1.02 * scene.dish.radius, np.zeros(2)
     command: list[float] = []
-    if math.hypot(*frame.commanded) > MIN_COMMAND:
+    if math.hypot(*frame.commanded) > 1e-6:
         command = np.round(1e3 * np.append(axis[-1], axis[-1] + length / speed * frame.commanded), 3).tolist()
     return {
         "instant": instant,

@@ -7,7 +7,7 @@ import inspect
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -70,38 +70,27 @@ def add_actions(
     return parsers
 
 
-def number_argument(low: float, high: float) -> Callable[[str], float]:
-    """Return an argument type: a number within bounds."""
-
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = float("nan")
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number from {low:g} to {high:g}")
-        return value
+def _bounded(kind: Callable[[str], Any], what: str, low: float, high: float) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
+        with suppress(ValueError):
+            if low <= (value := kind(text)) <= high:
+                return value
+        raise argparse.ArgumentTypeError(f"{text!r} is no {what} from {low:g} to {high:g}")
 
     return parse
+
+
+def number_argument(low: float, high: float) -> Callable[[str], float]:
+    """Return an argument type: a number within bounds."""
+    return _bounded(float, "number", low, high)
 
 
 def count_argument(things: str, low: int, high: int) -> Callable[[str], int]:
     """Return an argument type: a number of things within bounds."""
-
-    def parse(text: str) -> int:
-        count = whole_number(text)
-        if not low <= count <= high:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number of {things} from {low} to {high}")
-        return count
-
-    return parse
+    return _bounded(int, f"number of {things}", low, high)
 
 
-def whole_number(text: str) -> int:
-    """Return a whole number of at least 0: an argument type."""
-    if not (text.isascii() and text.isdigit()):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 0")
-    return int(text)
+whole_number = _bounded(int, "whole number", 0, 2**31 - 1)  # an argument type
 
 
 def output_file(text: str) -> Path:

@@ -14,9 +14,7 @@ from magnetosuture_thread.planning.session import compile_planning
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.thread_model.session import ThreadSession
-from magnetosuture_thread.vision.warm_up import warm_up
-
-SETUP = "petri_35mm_polyamide_post"  # has a shape, so that contact is compiled too
+from magnetosuture_thread.vision.tracker import warm_up
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +42,7 @@ def run_compile(options: argparse.Namespace, terminal: Terminal) -> int:
 
 def kernel_steps() -> dict[str, Callable[[], object]]:
     """Return what loads the compiled functions of each part, in the order in which they build on each other."""
-    setup = read_setup(SETUP)
+    setup = read_setup("petri_35mm_polyamide_post")  # has a shape, so that contact is compiled too
     return {
         "thread model": lambda: ThreadSession(setup.model, setup.scene),
         "tracker": warm_up,

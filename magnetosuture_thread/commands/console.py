@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,7 @@ from magnetosuture_thread.commands.command import (
     runs,
     whole_number,
 )
-from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, log_compiling, own_domain
+from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, Place, log_compiling, own_place
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.configuration import from_mapping, to_mapping
@@ -43,13 +43,6 @@ from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.workers import Log
 
 TOKEN = "MAGNETOSUTURE_TOKEN"
-POLL_PERIOD = 0.2  # s between two checks of the nodes
-QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
-REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
-# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
-# go before the browser and the rig, and behind the bridge.
-PREFERRED, PRIORITY = "perception", 5
-SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
 SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
 
 
@@ -110,41 +103,18 @@ def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
             source.given.check_loop()
             shown = settings(source.given.setup)
             shown = replace(shown, image_transport=source.transport) if source.transport else shown
-            place = _place(stack)
+            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
             host = ReplayHost(graph, source, place, terminal.log)
             terminal.log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
         else:
             shown = settings(read_setup(name))
-            place = _place(stack)
+            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
             graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
             host = SimulatedHost(graph, name, place, options.record, terminal.log)
             terminal.log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
         asyncio.run(_serve(graph, host, terminal.log))
     return DONE
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where nodes run.
-
-    Attributes:
-        domain: ROS domain.
-        environment: for the nodes.
-        logs: folder for what each node prints.
-    """
-
-    domain: int
-    environment: dict[str, str]
-    logs: Path
-
-    def nodes(self, processes: Sequence[str], arguments: Sequence[str]) -> NodeProcesses:
-        """Return nodes that are not started yet."""
-        return NodeProcesses(processes, arguments, self.environment, self.logs)
-
-
-def _place(stack: ExitStack) -> Place:
-    return Place(*stack.enter_context(own_domain()), Path(stack.enter_context(TemporaryDirectory())))
 
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
@@ -157,7 +127,8 @@ async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
     try:
         host.start()
-        await serve_until(ends, ConsoleServer(graph.settings, graph, host), host.watch, POLL_PERIOD, report)
+        server, period = ConsoleServer(graph.settings, graph, host), 0.2  # s between two checks of the nodes
+        await serve_until(ends, server, host.watch, period, report)
     finally:
         await host.close()
     log("ended")
@@ -178,7 +149,7 @@ class BagRecording:
     ) -> None:
         self.output = output
         self._notes = notes
-        self._inboxes = [Inbox(graph.node, topic, QUEUE_DEPTH) for topic in recorded]
+        self._inboxes = [Inbox(graph.node, topic, 1000) for topic in recorded]
         self._ending = threading.Event()
         self._writing: asyncio.Task[None] | None = None
 
@@ -226,7 +197,7 @@ class BagRecording:
             begun()
             ending = False
             while not ending:
-                ending = self._ending.wait(RECORDING_PERIOD)
+                ending = self._ending.wait(0.01)
                 for inbox in self._inboxes:
                     for data, arrived in inbox.take():
                         bag.write(inbox.topic.channel.recorded, arrived, data)
@@ -357,7 +328,8 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *SIMULATED_COILS, *FORECAST]
+        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *FORECAST]
+        arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active"]  # a person arms it
         # Here and not in another thread: the nodes end with the thread that has started them.
         self._nodes = self._place.nodes((SCENE_SERVER, RIG, *PROCESSES, PLANNER), arguments).__enter__()
         self._since = time.monotonic()
@@ -399,7 +371,9 @@ class SimulatedHost(RecordingHost):
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
             # Only now: while it compiles for the first time, others shall not wait for it.
-            self.log(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
+            # The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key:
+            # so tracker and model go before the browser and the rig, and behind the bridge.
+            self.log(f"perception: {self._nodes.prefer('perception', 5)}")
             self._block("")
             self.log(f"{self.setup.name} runs; the coils are not armed")
         elif time.monotonic() - self._since > START_TIMEOUT:
@@ -437,7 +411,7 @@ class ReplayHost(RecordingHost):
         self._ending = threading.Event()
         self._playing: asyncio.Task[None] | None = None
         self.busy = f"starting the nodes for {source.given.recording.path}"
-        graph.blocked = REPLAY_BLOCKED
+        graph.blocked = "this is a replay: nothing can be jogged or armed"
 
     def state(self) -> dict[str, Any]:
         """Return what runs and what is possible now."""

@@ -14,9 +14,8 @@ import yaml
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.observations import CHANGING
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag
+from magnetosuture_thread.commands.recorded import CHANGING, BagInput, BagSelection, open_bag
 from magnetosuture_thread.commands.replay import replay_summary, write_results
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
@@ -50,7 +49,7 @@ FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:fore
 NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
 
 
-@dataclass
+@dataclass(frozen=True)
 class OwnGraph:
     """Nodes that run in a ROS domain of their own.
 
@@ -70,9 +69,31 @@ class OwnGraph:
         self.nodes.check()
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where nodes run.
+
+    Attributes:
+        domain: ROS domain.
+        environment: for the nodes.
+        logs: folder for what each node prints.
+    """
+
+    domain: int
+    environment: dict[str, str]
+    logs: Path
+
+    def nodes(self, processes: Sequence[str], arguments: Sequence[str]) -> NodeProcesses:
+        """Return nodes that are not started yet."""
+        return NodeProcesses(processes, arguments, self.environment, self.logs)
+
+
 @contextmanager
-def own_domain() -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield a ROS domain that nobody else uses, and the environment for it, which this process has meanwhile.
+def own_place(logs: Path) -> Iterator[Place]:
+    """Yield a ROS domain that nobody else uses, with the environment for it, which this process has meanwhile.
+
+    Args:
+        logs: folder for what each node prints.
 
     Raises:
         GraphError: all domains are in use.
@@ -80,7 +101,7 @@ def own_domain() -> Iterator[tuple[int, dict[str, str]]]:
     with reserved_domain() as domain:
         environment = graph_environment(domain)
         with environment_of(environment):
-            yield domain, environment
+            yield Place(domain, environment, logs)
 
 
 @contextmanager
@@ -99,10 +120,10 @@ def own_graph(
     Raises:
         GraphError: all domains are in use.
     """
-    with own_domain() as (domain, environment):
-        log(f"starting {what} (ROS domain {domain}, this machine only)")
-        with NodeProcesses(processes, arguments, environment, logs) as nodes:
-            yield OwnGraph(domain, nodes, Interruption())
+    with own_place(logs) as place:
+        log(f"starting {what} (ROS domain {place.domain}, this machine only)")
+        with place.nodes(processes, arguments) as nodes:
+            yield OwnGraph(place.domain, nodes, Interruption())
 
 
 def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:

@@ -36,9 +36,6 @@ from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 from magnetosuture_thread.setups import Setup, read_setup
 
 SIZE = (640, 480)
-DISH_SHARE = 0.9115  # of the image's height
-CAMERA_HEIGHT = 0.3  # m above the dish, for the intrinsics in camera_info
-GROUND_TRUTH_POINTS, MEASURED_POINTS = 51, 64
 EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "not set" in ROS
 
 
@@ -144,7 +141,7 @@ def render_bag(
                 *source.messages(stamp, tail, heading, thread),
                 packed_twist(stamp, velocity),
                 packed_pose_stamped(stamp, tail, heading),
-                packed_path(stamp, _resampled(thread, GROUND_TRUTH_POINTS)),
+                packed_path(stamp, _resampled(thread, 51)),
             )
             for channel, message in zip(channels, instant, strict=True):
                 bag.write(channel.recorded, stamp, message)
@@ -183,7 +180,7 @@ class _FrameTopics:
     channels = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO)
 
     def __init__(self, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
-        view = DishView((322.0, 238.0), setup.scene.dish.diameter / (DISH_SHARE * SIZE[1]))
+        view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * SIZE[1]))
         scene = CameraScene(
             dish_diameter=setup.scene.dish.diameter,
             needle_length=setup.vision.needle_length,
@@ -197,7 +194,7 @@ class _FrameTopics:
         """Return a message for each channel."""
         camera = self._camera
         data = encode_jpeg(camera.render(tail, heading, thread), self._quality)
-        information = packed_camera_info(stamp, camera.size, camera.view, CAMERA_HEIGHT)
+        information = packed_camera_info(stamp, camera.size, camera.view, 0.3)  # m above the dish
         return packed_compressed_image(stamp, data), information
 
 
@@ -216,7 +213,7 @@ class _PoseTopics:
         angle = heading + offset[2]
         direction = np.array([np.cos(angle), np.sin(angle)])
         pose = packed_pose(stamp, tail + offset[:2], direction, np.diag(self._noise**2))
-        measured = _resampled(thread, MEASURED_POINTS)
+        measured = _resampled(thread, 64)
         measured[1:] += self._noise[:2] * self._random.standard_normal(measured[1:].shape)
         measured[0] = tail + offset[:2]  # a measured thread begins at the measured tail
         return pose, packed_path(stamp, measured)

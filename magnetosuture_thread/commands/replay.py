@@ -23,9 +23,17 @@ from magnetosuture_thread.commands.command import (
     number_argument,
     runs,
 )
-from magnetosuture_thread.commands.observations import ObservationReader, Step, measure_step, predictions, read_image
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag
+from magnetosuture_thread.commands.recorded import (
+    BagInput,
+    BagSelection,
+    ObservationReader,
+    Step,
+    measure_step,
+    open_bag,
+    predictions,
+    read_image,
+)
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
@@ -42,8 +50,7 @@ from magnetosuture_thread.messages.packing import (
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.thread_model.session import WAITING
-from magnetosuture_thread.vision.session import FrameMeasurement
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import FrameMeasurement, VisionTracker
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

@@ -23,8 +23,6 @@ from magnetosuture_thread.commands.command import (
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.scene.checks import scene_warnings
 
-PICTURES = (".png", ".svg")
-
 DESCRIPTION = """\
 Check a scene file, or draw it.
 
@@ -76,8 +74,8 @@ def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
 
 def run_draw(options: argparse.Namespace, terminal: Terminal) -> int:
     """Draw a scene file from above, with names and scale, as PNG or SVG."""
-    if options.output.suffix not in PICTURES:
-        raise ConfigurationError("--output", str(options.output), f"a file that ends in {' or '.join(PICTURES)}")
+    if options.output.suffix not in (".png", ".svg"):
+        raise ConfigurationError("--output", str(options.output), "a file that ends in .png or .svg")
 
     from magnetosuture_thread.evaluation.plots import plot_scene  # late, as it imports matplotlib
 

@@ -50,10 +50,8 @@ from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 
-ONCE = (
-    interface.SCENE.recorded,
-    interface.SCENE_MARKERS.recorded,
-)  # published while nodes start, for the bag's beginning
+# Published while nodes start, for the bag's beginning.
+ONCE = (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded)
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
@@ -61,20 +59,9 @@ OPTIONAL = (
 )
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
-SETTLING_TIME = 1.0  # s for all nodes to have found each other
-PREDICTION_TIMEOUT = 10.0  # s for the first prediction: where the needle cannot be tracked, there is none
-FINAL_TIME = 0.5  # s that go on once the path or procedure is done
 # A run along a path that never ends is ended after this many times its own duration, and so many s of simulated time.
 TIMEOUT_FACTOR, EXTRA_TIME = 3.0, 20.0
 MAX_PROCEDURE_TIME = 600.0  # s of simulated time, as in a campaign
-BOARDS_TIMEOUT = 15.0  # s for simulated boards to be ready
-
-# On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
-AUDIENCE = "audience:=2"  # bridge and recorder
-SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
-# Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
-# for 75 ms, as happens with two busy cores, would be taken for dead.
-SLOW_BOARD_TIMEOUTS = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -335,7 +322,8 @@ class _Run:
         what = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
         processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
-            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else SIMULATED_COILS
+            simulated = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
+            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else simulated
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
             with own_graph(processes, arguments, folder / "logs", what, self.log) as graph:
@@ -354,7 +342,10 @@ class _Run:
         self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
         sink.running = True
         try:
-            graph.nodes.start(self.steering.node, arguments=("-p", f"{self.steering.node}:{AUDIENCE}"))
+            # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
+            # and the bag would lack the start.
+            audience = f"{self.steering.node}:audience:=2"
+            graph.nodes.start(self.steering.node, arguments=("-p", audience))
             with graph.interruption, self.steering.client:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
@@ -374,7 +365,7 @@ class _Run:
             timed = 0.0 if self.duration is None or not stage else min(1.0, elapsed / self.duration)
             self.progress(steering.share if self.duration is None else timed)
             if steering.ended:
-                recorder.spin(FINAL_TIME / rate)
+                recorder.spin(0.5 / rate)
             if problem or steering.ended:
                 return problem
             wanted = None if self.duration is None else self.duration + (EXTRA_TIME if stage == 1 else 0.0)
@@ -409,7 +400,7 @@ class _Sink:
 
 def _arm() -> None:
     """Arm the bridge as soon as its boards are ready."""
-    deadline = time.monotonic() + BOARDS_TIMEOUT
+    deadline = time.monotonic() + 15.0
     while True:
         try:
             with CoilClient() as client:
@@ -424,8 +415,11 @@ def _wired(folder: str, coils: int) -> list[str]:
     """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
     boards = {"roboclaw_ports": ports, "roboclaw_addresses": json.dumps(board_addresses(coils // 2))}
+    # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
+    # for 75 ms, as happens with two busy cores, would be taken for dead.
+    boards |= {"roboclaw_answer_timeout": "0.2", "driver_timeout": "0.5"}
     parameters: dict[str, dict[str, object]] = {
-        "coil_bridge": {"driver": "roboclaw", "autostart": "active", **boards, **SLOW_BOARD_TIMEOUTS},
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", **boards},
         "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
     }
     given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
@@ -445,8 +439,8 @@ def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
         if time.monotonic() > deadline:
             raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
         recorder.spin(POLL_PERIOD)
-    deadline = time.monotonic() + PREDICTION_TIMEOUT
+    deadline = time.monotonic() + 10.0  # where the needle cannot be tracked, there is none
     while not recorder.taken[interface.PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
         check()
         recorder.spin(POLL_PERIOD)
-    recorder.spin(SETTLING_TIME)
+    recorder.spin(1.0)  # for all nodes to have found each other

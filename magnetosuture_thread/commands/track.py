@@ -6,7 +6,7 @@ import argparse
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from magnetosuture_thread import InvalidInputError, Scene, read_scene
+from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
@@ -30,7 +30,7 @@ from magnetosuture_thread.commands.command import (
     runs,
     write_json,
 )
-from magnetosuture_thread.commands.observations import read_image
+from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.files import read_regular
@@ -41,18 +41,11 @@ from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
-from magnetosuture_thread.vision.look import State, Track, no_pose
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
-from magnetosuture_thread.vision.warm_up import warm_up
-from magnetosuture_thread.workers import Log, Progress
+from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
+from magnetosuture_thread.workers import Log
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
-MIN_RATE, MAX_RATE = 0.1, 240.0  # frames/s, that video players show
-FRAMES_FOR_RATE = 300  # of a bag, from its beginning
-MAX_ROWS = 20  # of frames; beyond, only the summary is shown
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -91,11 +84,34 @@ def run_track(options: argparse.Namespace, terminal: Terminal) -> int:
     if options.centre is not None:
         view["dish_centre_px"] = tuple(options.centre)
     settings = replace(setup.vision, **view)
-    lens = read_lens(options.camera_info) if options.camera_info is not None else None
-    given = {"overlay": options.overlay, "remap": dict(options.remap), "lens": lens, "log": terminal.log}
-    with terminal.progress("track") as advance:
-        frames = track(options.frames, settings, setup.scene, progress=advance, **given)
-    rows = [frame.to_json() for frame in frames]
+    given = read_lens(options.camera_info) if options.camera_info is not None else None
+    source = FrameSource(options.frames, dict(options.remap), terminal.log)
+    tracker = VisionTracker(settings, setup.scene)
+    warm_up()
+    rows = []
+    # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
+    files = numbered([Path(name).stem for name in source.names], "{}_{}")
+    with (
+        terminal.progress("track") as advance,
+        nullcontext() if options.overlay is None else OverlayWriter(options.overlay, source.rate()) as writer,
+    ):
+        for index, frame in enumerate(source):
+            lens = given or frame.lens
+            tracker.set_lens(lens)
+            began = time.thread_time()
+            seen = _look(tracker, frame, source.is_sequence)
+            unverified = {"unverified": source.unverified} if source.unverified else {}
+            rows.append(_row(frame, seen, time.thread_time() - began) | unverified)
+            if writer is not None and frame.image is not None:
+                picture = frame.image
+                if lens is not None and lens.problem_with(picture.shape) is None:
+                    picture = lens.undistorted(picture)
+                drawn = draw_overlay(picture, seen, settings.needle_length, frame.name)
+                if seen.view is not None:
+                    draw_dish(drawn, seen.view.centre_px, setup.scene.dish.radius / seen.view.metres_per_pixel)
+                writer.write(f"frame_{index:06d}" if source.is_sequence else files[index], drawn)
+            advance((index + 1) / max(source.count, 1))
+    source.log_refused(terminal.log)
     terminal.print(_table(rows))
     if rows:
         counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
@@ -234,13 +250,13 @@ class FrameSource:
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
         if self._recording is None:
-            return PICTURE_RATE
-        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), FRAMES_FOR_RATE)]
+            return 30.0
+        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), 300)]
         intervals = np.diff(stamps) * 1e-9
         if not np.any(intervals > 0.0):
-            return PICTURE_RATE
-        # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
-        return min(MAX_RATE, max(MIN_RATE, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+            return 30.0
+        # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
+        return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:
@@ -250,64 +266,62 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
         names: that may come again.
         form: of a name with its number, 2 and up, for example `{}_{}`.
     """
-    given, numbers, taken = list[str](), Counter[str](), set(names)
+    taken = dict[str, None]()
     for name in names:
-        numbers[name] += 1
-        own = name
-        while numbers[name] > 1 and (own := form.format(name, numbers[name])) in taken:
-            numbers[name] += 1
-        taken.add(own)
-        given.append(own)
-    return given
+        own, number = name, 1
+        while own in taken:
+            number += 1
+            own = form.format(name, number)
+        taken[own] = None
+    return list(taken)
 
 
-@dataclass(frozen=True)
-class TrackedFrame:
-    """What one frame showed.
+def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> Track:
+    """Return what a frame shows."""
+    try:
+        if frame.image is None:
+            raise InvalidInputError("image", "a broken picture", frame.problem)
+        if in_sequence and frame.stamp is not None:
+            return tracker.track(frame.image, frame.stamp)
+        return tracker.look(frame.image)
+    except InvalidInputError as error:
+        return no_pose(State.LOST, frame.problem or str(error), None)
 
-    Attributes:
-        name: see `FrameFile`.
+
+def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
+    """Return what is written of a frame, in SI units; null for what has no value.
+
+    Args:
+        frame: that was looked at.
         track: what was seen.
         duration: processor time that looking took, on one core, decoding not included; other work on the
             machine does not show in it [s].
-        stamp: when the frame was taken [s]; None where nothing tells.
-        unverified: why a bag's frame may be wrong; empty if nothing speaks against it.
     """
-
-    name: str
-    track: Track
-    duration: float
-    stamp: float | None
-    unverified: str = ""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what is written of it, in SI units; null for what has no value."""
-        track, pose = self.track, dict[str, Any]()
-        if not track.reason:
-            thread = track.centreline
-            pose = {
-                "tail_m": _numbers(track.tail),
-                "heading_rad": finite_or_none(math.atan2(track.heading[1], track.heading[0])),
-                "tip_m": _numbers(track.tip),
-                "curvature_per_m": finite_or_none(float(track.curvature)),
-                "thread_m": thread.tolist() if np.isfinite(thread).all() else None,
-                "pieces": [_piece(piece) for piece in track.observation.pieces],
-            }
-        names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
-        length = track.needle_length
-        return {
-            "file": self.name,
-            "status": track.state.value,
-            "reason": track.reason or None,
-            "warning": track.warning or None,
-            **{name: pose.get(name) for name in names},
-            "needle_length_m": None if length is None else finite_or_none(float(length)),
-            "complete": track.observation.complete,
-            "confidence": finite_or_none(float(track.confidence)),
-            "time_s": self.duration,
-            "stamp_s": self.stamp,
-            **({"unverified": self.unverified} if self.unverified else {}),
+    pose = dict[str, Any]()
+    if not track.reason:
+        thread = track.centreline
+        pose = {
+            "tail_m": _numbers(track.tail),
+            "heading_rad": finite_or_none(math.atan2(track.heading[1], track.heading[0])),
+            "tip_m": _numbers(track.tip),
+            "curvature_per_m": finite_or_none(float(track.curvature)),
+            "thread_m": thread.tolist() if np.isfinite(thread).all() else None,
+            "pieces": [_piece(piece) for piece in track.observation.pieces],
         }
+    names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
+    length = track.needle_length
+    return {
+        "file": frame.name,
+        "status": track.state.value,
+        "reason": track.reason or None,
+        "warning": track.warning or None,
+        **{name: pose.get(name) for name in names},
+        "needle_length_m": None if length is None else finite_or_none(float(length)),
+        "complete": track.observation.complete,
+        "confidence": finite_or_none(float(track.confidence)),
+        "time_s": duration,
+        "stamp_s": frame.stamp,
+    }
 
 
 def _numbers(values: np.ndarray) -> list[float] | None:
@@ -327,78 +341,8 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
     }
 
 
-def track(
-    paths: Sequence[Path],
-    settings: VisionTrackerSettings,
-    scene: Scene,
-    *,
-    overlay: Path | None = None,
-    remap: Mapping[str, str] | None = None,
-    lens: Lens | None = None,
-    log: Callable[[str], None] = lambda text: None,
-    progress: Progress = lambda share: None,
-) -> list[TrackedFrame]:
-    """Track the needle in frames: each by itself, or over time where they are a bag's.
-
-    Args:
-        paths: picture files, one folder of pictures, or one bag.
-        settings: what to look for.
-        scene: in which.
-        overlay: folder or video to draw into.
-        remap: new name of a bag's topic by its recorded name.
-        lens: of the camera; None: a bag's own, and none of pictures.
-        log: called with a line for a person on what of a bag is damaged or not checked.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        BagError: there are no frames, or the overlay cannot be written.
-    """
-    source = FrameSource(paths, remap, log)
-    tracker = VisionTracker(settings, scene)
-    warm_up()
-    results = []
-    # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
-    files = numbered([Path(name).stem for name in source.names], "{}_{}")
-    with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
-        for index, frame in enumerate(source):
-            own = lens or frame.lens
-            tracker.set_lens(own)
-            result = replace(_look(tracker, frame, source.is_sequence), unverified=source.unverified)
-            results.append(result)
-            if writer is not None and frame.image is not None:
-                name = f"frame_{index:06d}" if source.is_sequence else files[index]
-                picture = frame.image
-                if own is not None and own.problem_with(picture.shape) is None:
-                    picture = own.undistorted(picture)
-                drawn, view = (
-                    draw_overlay(picture, result.track, settings.needle_length, result.name),
-                    result.track.view,
-                )
-                if view is not None:
-                    draw_dish(drawn, view.centre_px, scene.dish.radius / view.metres_per_pixel)
-                writer.write(name, drawn)
-            progress((index + 1) / max(source.count, 1))
-    source.log_refused(log)
-    return results
-
-
-def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> TrackedFrame:
-    """Look at one frame, and time it."""
-    began = time.thread_time()
-    try:
-        if frame.image is None:
-            raise InvalidInputError("image", "a broken picture", frame.problem)
-        if in_sequence and frame.stamp is not None:
-            seen = tracker.track(frame.image, frame.stamp)
-        else:
-            seen = tracker.look(frame.image)
-    except InvalidInputError as error:
-        seen = no_pose(State.LOST, frame.problem or str(error), None)
-    return TrackedFrame(frame.name, seen, time.thread_time() - began, frame.stamp)
-
-
 def _table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Return a row for each of the first frames, as `TrackedFrame.to_json` gives them."""
+    """Return a row for each of the first frames, as `_row` gives them."""
     table = Table(title=f"{len(rows)} frames")
     table.caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
     table.add_column("frame", overflow="fold", min_width=12)
@@ -406,7 +350,7 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     for name in ("tail", "heading", "thread", "sure", "ms"):
         table.add_column(name, justify="right", no_wrap=True)
     began = rows[0]["stamp_s"] if rows else None
-    for row in rows[:MAX_ROWS]:
+    for row in rows[:20]:
         name, status = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s", row["status"]
         cells = [""] * 4
         if row["reason"]:
@@ -420,6 +364,6 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
                 "" if row["confidence"] is None else f"{row['confidence']:.2f}",
             ]
         table.add_row(name, status, *cells, f"{row['time_s'] * 1e3:.1f}")
-    if len(rows) > MAX_ROWS:
-        table.add_row(f"and {len(rows) - MAX_ROWS} more", "", "", "", "", "", "")
+    if len(rows) > 20:
+        table.add_row(f"and {len(rows) - 20} more", "", "", "", "", "", "")
     return table

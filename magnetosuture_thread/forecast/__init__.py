@@ -5,7 +5,6 @@ from magnetosuture_thread.forecast.forecaster import (
     ForecastContact,
     ForecastMargin,
     ForecastStart,
-    NeedleDrag,
     ThreadForecaster,
     make_forecaster,
 )
@@ -15,7 +14,6 @@ __all__ = [
     "ForecastContact",
     "ForecastMargin",
     "ForecastStart",
-    "NeedleDrag",
     "ThreadForecaster",
     "make_forecaster",
 ]

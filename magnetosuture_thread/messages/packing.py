@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.forecast import Forecast
     from magnetosuture_thread.rig.rig import RigFrame
     from magnetosuture_thread.thread_model.session import PredictionResult
-    from magnetosuture_thread.vision.look import Track
+    from magnetosuture_thread.vision.tracker import Track
 
 Vector = NDArray[np.float64]
 Outputs = Iterator[tuple[Channel, bytes]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
+RecordedMessage: TypeAlias = Any  # with `topic`, `time` [ns], `data` (CDR bytes), and `decode()`, or a `BagError`
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
 
@@ -277,37 +278,14 @@ def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
     return np.array([linear.x, linear.y])
 
 
-class SerializedMessage(Protocol):
-    """A recorded message."""
-
-    @property
-    def topic(self) -> str:
-        """Its topic."""
-
-    @property
-    def time(self) -> int:
-        """When it was recorded [ns]."""
-
-    @property
-    def data(self) -> bytes:
-        """Its CDR bytes."""
-
-    def decode(self) -> Any:
-        """Return the message.
-
-        Raises:
-            BagError: it cannot be decoded.
-        """
-
-
-def stamp_of(record: SerializedMessage) -> int:
+def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)
     return record.time if stamp is None else stamp
 
 
 def read_pose(
-    record: SerializedMessage,
+    record: RecordedMessage,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
     """Return tail, heading and their standard deviations of a recorded needle pose, as `thread_model` gets them.
 
@@ -318,7 +296,7 @@ def read_pose(
     return _plane_pose(record.decode(), record.topic)
 
 
-def read_path(record: SerializedMessage) -> Points:
+def read_path(record: RecordedMessage) -> Points:
     """Return a recorded path as an array of shape (m, 2) [m].
 
     Raises:
@@ -329,7 +307,7 @@ def read_path(record: SerializedMessage) -> Points:
     return path_points(record.decode(), record.topic) if found is None else found
 
 
-def read_force(record: SerializedMessage) -> NDArray[np.float64]:
+def read_force(record: RecordedMessage) -> NDArray[np.float64]:
     """Return the force in the dish plane of a recorded wrench, shape (2,) [N].
 
     Raises:
@@ -344,7 +322,7 @@ def read_force(record: SerializedMessage) -> NDArray[np.float64]:
     return force
 
 
-def read_observation(record: SerializedMessage) -> ThreadObservation:
+def read_observation(record: RecordedMessage) -> ThreadObservation:
     """Return a recorded observation of the thread.
 
     Raises:

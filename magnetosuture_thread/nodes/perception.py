@@ -36,7 +36,7 @@ def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
         raise GraphError(f"two nodes cannot both be named {name}: rename each, as by -r vision_tracker:__node:=NAME")
     shared = (topics.NEEDLE_POSE.name, topics.THREAD_OBSERVATION.name)
     if all(tracker.resolve_topic_name(name) == model.resolve_topic_name(name) for name in shared):
-        tracker.hand_to(model)
+        tracker.follower = model.on_tracked
     else:
         model.listen()
     return tracker, model

@@ -159,7 +159,7 @@ class LiveReplay:
         self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
         # A quality of service that waits for slow readers: only the replay has time to.
-        reliable = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
+        reliable: dict[str, Any] = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
         self._inputs = {
             topic.channel.recorded: self._node.create_publisher(
                 topic.message, topic.name, QoSProfile(**reliable, durability=topic.qos.durability)

@@ -13,6 +13,7 @@ import numpy as np
 from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import (
+    Forecast,
     ForecastStart,
     InvalidInputError,
     MagnetosutureError,
@@ -20,7 +21,7 @@ from magnetosuture_thread import (
     Scene,
     ThreadForecaster,
 )
-from magnetosuture_thread.forecast import Forecast, make_forecaster
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.markers import packed_forecast_markers

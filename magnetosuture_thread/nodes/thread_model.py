@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import ThreadMaterial
@@ -27,7 +26,9 @@ from magnetosuture_thread.thread.prediction import STARTED
 from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings, parse_material
-from magnetosuture_thread.thread_observation import ThreadObservation
+
+if TYPE_CHECKING:
+    from magnetosuture_thread.vision.look import Track
 
 
 class ThreadModelNode(StandbyNode[ThreadModelSettings]):
@@ -111,10 +112,12 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         """Step the thread to a needle pose, or report why that is impossible."""
         self._step(message.header.stamp, lambda: reading.needle_pose(message))
 
-    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray) -> None:
-        """Handle a pose handed over by a tracker in the same process, as its message would be."""
+    def on_tracked(self, stamp: Time, track: Track) -> None:
+        """Handle what a tracker in the same process sees in a frame, as its messages would be."""
         if self.is_active:
-            self._step(stamp, lambda: reading.tracked_pose(stamp, tail, heading, covariance))
+            # Before the pose, so that the thread is estimated once, at the pose of its frame.
+            self._report_all(self._session.on_observation(reading.nanoseconds(stamp), track.observation))
+            self._step(stamp, lambda: reading.tracked_pose(stamp, track.tail, track.heading, track.covariance))
 
     def _subscribe(self) -> None:
         observation, measured = self.on_observation_message, self.on_measured_thread_message
@@ -160,11 +163,6 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
                 self._report_all(take(stamp, read(topic.decode(data))))
             except InvalidInputError as error:
                 self.health.refuse(error)
-
-    def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
-        """Handle an observation of the thread handed over by a tracker in the same process."""
-        if self.is_active:
-            self._report_all(self._session.on_observation(reading.nanoseconds(stamp), observation))
 
     def _report_all(self, results: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()

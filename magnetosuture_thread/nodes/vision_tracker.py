@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -17,26 +17,13 @@ from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state,
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
-from magnetosuture_thread.vision.look import State, no_pose
-from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import FrameMeasurement, State, Track, TrackerSession, no_pose, warm_up
 
 NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the dish is"
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
-
-
-class Follower(Protocol):
-    """Receiver of poses and observations of the thread in the same process."""
-
-    def on_tracked(self, stamp: Time, tail: np.ndarray, heading: np.ndarray, covariance: np.ndarray) -> None:
-        """Receive what is published as needle pose."""
-
-    def on_observation(self, stamp: Time, observation: ThreadObservation) -> None:
-        """Receive what is published as observation of the thread."""
 
 
 class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
@@ -55,7 +42,8 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
-        self._followers: list[Follower] = []
+        # In the same process: called with each frame in which the needle is tracked, once that is published.
+        self.follower: Callable[[Time, Track], None] | None = None
         topics.CAMERA_INFO.subscribe(self, self.on_camera_info)
         self.start()
 
@@ -99,10 +87,6 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             self._session.set_scene(scene)
         elif self.settings is not None:
             self._session = self._new_session(self.settings, scene)
-
-    def hand_to(self, follower: Follower) -> None:
-        """Hand every pose and observation of the thread to a follower in the same process, once it is published."""
-        self._followers.append(follower)
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Track the needle in a JPEG or PNG frame."""
@@ -164,15 +148,11 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             taken = time.perf_counter() - began
         track = seen.track
         if seen.tracked:
-            # Before the pose, so that the thread is estimated once, at the pose of its frame.
-            for follower in self._followers:
-                follower.on_observation(stamp, track.observation)
             self._publish(thread_outputs(stamp, track.observation, seen.centreline))
         if len(track.tail):  # also with a heading that is unknown, which those who need it refuse
             self._publish(pose_outputs(stamp, track.tail, track.heading, track.covariance))
-        if seen.tracked:
-            for follower in self._followers:
-                follower.on_tracked(stamp, track.tail, track.heading, track.covariance)
+        if seen.tracked and self.follower is not None:
+            self.follower(stamp, track)
         self._states.publish(packed_tracker_state(stamp, track, 0.0 if seen.problem else taken))
         self._report(seen, self._session)
 

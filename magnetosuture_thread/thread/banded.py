@@ -326,6 +326,36 @@ def search(
     return part
 
 
+@compiled_uncounted
+def solve_positive_definite(matrix: Table, x: Vector) -> bool:
+    """Solve a small dense system in place by Cholesky's factor, written over the matrix; return whether there is one.
+
+    Args:
+        matrix: symmetric, shape (n, n).
+        x: the right side, then the solution, shape (n,).
+    """
+    count = len(x)
+    for p in range(count):
+        for q in range(p + 1):
+            total = matrix[p, q]
+            for k in range(q):
+                total -= matrix[p, k] * matrix[q, k]
+            if q < p:
+                matrix[p, q] = total / matrix[q, q]
+            elif total > 0.0:
+                matrix[p, p] = math.sqrt(total)
+            else:
+                return False
+        for k in range(p):
+            x[p] -= matrix[p, k] * x[k]
+        x[p] /= matrix[p, p]
+    for p in range(count - 1, -1, -1):
+        for k in range(p + 1, count):
+            x[p] -= matrix[k, p] * x[k]
+        x[p] /= matrix[p, p]
+    return True
+
+
 @compiled
 def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: Mask, band: Table, step: Vector) -> bool:
     """Turn B^-1 F in `step` into F'^-1 F, with the factor of B in the band.
@@ -334,8 +364,11 @@ def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: M
         Whether F' is positive definite.
     """
     d, chain = len(axes), len(program.first)
-    chosen = np.flatnonzero(active[chain : len(program.lower)])
-    count = len(chosen)
+    chosen, count = np.empty(len(program.far_nodes), np.int64), 0
+    for r in range(len(chosen)):
+        if active[chain + r]:
+            chosen[count] = r
+            count += 1
     columns, matrix, pull = np.zeros((count, len(band))), np.zeros((count, count)), np.zeros(count)
     for p in range(count):
         for k in range(program.far_nodes.shape[1]):
@@ -351,24 +384,9 @@ def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: M
                 pull[p] += value * step[j]
                 for q in range(count):
                     matrix[p, q] += value * columns[q, j]
-    for p in range(count):  # Cholesky's factor, and the first substitution with it
-        for q in range(p + 1):
-            total = matrix[p, q]
-            for k in range(q):
-                total -= matrix[p, k] * matrix[q, k]
-            if q < p:
-                matrix[p, q] = total / matrix[q, q]
-            elif total > 0.0:
-                matrix[p, p] = math.sqrt(total)
-            else:
-                return False
-        for k in range(p):
-            pull[p] -= matrix[p, k] * pull[k]
-        pull[p] /= matrix[p, p]
-    for p in range(count - 1, -1, -1):
-        for k in range(p + 1, count):
-            pull[p] -= matrix[k, p] * pull[k]
-        pull[p] /= matrix[p, p]
+    if not solve_positive_definite(matrix, pull):
+        return False
+    for p in range(count):
         for j in range(len(step)):
             step[j] -= pull[p] * columns[p, j]
     return True

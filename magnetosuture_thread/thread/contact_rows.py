@@ -36,6 +36,7 @@ from magnetosuture_thread.thread.program import (
     Mask,
     RodBuffers,
     StepBuffers,
+    Vector,
 )
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
@@ -209,25 +210,23 @@ def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
 
 
 @compiled_uncounted
-def knows_friction(workspace: WorkspaceData) -> bool:
+def knows_friction(friction: Vector) -> bool:
     """Return whether any shape or the wall has friction."""
     largest = 0.0
-    for k in range(len(workspace.friction)):
-        largest = max(largest, workspace.friction[k])
+    for k in range(len(friction)):
+        largest = max(largest, friction[k])
     return largest > 0.0
 
 
 @compiled_uncounted
-def friction_rows(
-    rod: RodBuffers, row: int, count: int, workspace: WorkspaceData, interval: float
-) -> tuple[int, float]:
+def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, interval: float) -> tuple[int, float]:
     """Write the rows of friction of what shapes pushed in the last solve and is in contact with them now.
 
     Args:
         rod: its rows are written behind the contacts; these must be there already.
         row: the first row of the contacts.
         count: how many contacts there are.
-        workspace: has the coefficients of friction.
+        friction: coefficients of the wall, then of each shape.
         interval: dt [s].
 
     Returns:
@@ -256,7 +255,7 @@ def friction_rows(
                     continue
                 grip, limit, c = grips.force[kind, i, slot], 0.0, best[kind, i, slot]
                 if c >= 0:
-                    limit = workspace.friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
+                    limit = friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
                 change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
                 if limit == 0.0:
                     continue
@@ -282,7 +281,7 @@ def friction_rows(
 
 
 @compiled_uncounted
-def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, workspace: WorkspaceData) -> None:
+def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, friction: Vector) -> None:
     """Keep the normal forces of a solve, by place and shape, and what friction there was.
 
     A place that more than `GRIPS` shapes with friction push at once has friction with the first of them.
@@ -292,7 +291,7 @@ def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, wo
         grips: written.
         rows: of the program.
         row: the first row of the contacts.
-        workspace: has the coefficients of friction.
+        friction: coefficients of the wall, then of each shape.
     """
     contacts, multipliers = buffers.contacts, buffers.multipliers
     grips.force[:] = 0.0
@@ -305,7 +304,7 @@ def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, wo
             grips.force[kind, i, slot, 3] = buffers.limit[r]
             grips.force[kind, i, slot, 4] = place
             continue
-        if not (multipliers[r] > 0.0 and workspace.friction[shape + 1] > 0.0):
+        if not (multipliers[r] > 0.0 and friction[shape + 1] > 0.0):
             continue
         if slot < 0:
             slot = _slot_of(grips, kind, i, NO_SHAPE)

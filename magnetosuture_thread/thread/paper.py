@@ -40,7 +40,7 @@ from magnetosuture_thread.thread.barriers import (
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import rest_distances
-from magnetosuture_thread.thread.program import SPAN, Mask, Solver, program_of
+from magnetosuture_thread.thread.program import SPAN, Mask, Solver, first_rows
 from magnetosuture_thread.thread.step import (
     AddedRows,
     Formulation,
@@ -120,7 +120,7 @@ class PaperFormulation(Formulation):
         if self.added:
             self.added.begin(state.positions, drive.time, interval)
             added = self.added.linearised(start, moved, known, interval)
-        solution = self._solve(program_of(buffers, known, self._rows + contacts), velocities, added)
+        solution = self._solve(first_rows(buffers, known, self._rows + contacts), velocities, added)
         rows = self._rows + contacts
         buffers.multipliers[:rows], buffers.push[:] = solution.multipliers[:rows], 0.0
         np.maximum.at(buffers.push[0], buffers.contacts.node[:contacts], buffers.multipliers[self._rows : rows])

@@ -11,30 +11,23 @@ from typing import Annotated, Any
 import numpy as np
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.barrier import Barrier, check_barriers
 from magnetosuture_thread.configuration import Quantity
-from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.thread.forces import ThreadForces
-from magnetosuture_thread.thread.formulations import (
-    Formulation,
-    PaperOptions,
-    PrescribedMotion,
-    RodFormulation,
-    StepResult,
-    ThreadState,
-    WarmStart,
-    make_formulation,
-)
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene, direction_between
+from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
-from magnetosuture_thread.thread.program import SOLVED
+from magnetosuture_thread.thread.program import SOLVED, Solver
+from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import make_solver
+from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState, WarmStart
 
 DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a camera sees above it
 LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
@@ -43,6 +36,31 @@ MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
 MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
 MOTION_TIME = 4e-3  # s; shorter, what the pose's noise bends counts for more, and longer, the thread has gone on
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
+
+
+FORMULATIONS = (RodFormulation.name, PaperFormulation.name)
+
+
+def make_formulation(
+    name: str,
+    thread: Thread,
+    workspace: Workspace,
+    solver: Solver,
+    tolerance: float,
+    paper: PaperOptions | None = None,
+    barriers: Sequence[Barrier] = (),
+) -> Formulation:
+    """Return a formulation by name; the options are those of `paper`.
+
+    Raises:
+        ConfigurationError: there is no formulation of this name, or barriers cannot be told apart.
+    """
+    check_barriers(tuple(barriers))
+    if name == PaperFormulation.name:
+        return PaperFormulation(thread, workspace, solver, tolerance, paper, barriers)
+    if name != RodFormulation.name:
+        raise ConfigurationError("formulation", name, f"one of {', '.join(FORMULATIONS)}")
+    return RodFormulation(thread, workspace, solver, tolerance, barriers)
 
 
 @checked_arguments("thread predictor")

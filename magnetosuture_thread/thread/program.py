@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -233,7 +233,7 @@ class RodBuffers(NamedTuple):
             array[:] = kept
 
 
-def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
+def first_rows(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     """Return the program of the first rows."""
     return ChainProgram(
         buffers.blocks,
@@ -251,9 +251,9 @@ def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
     )
 
 
-program_of = compiled(_program_of)
-program_view = compiled_inline(_program_of)
-"""The same for kernels that do not count references to arrays."""
+program_of = compiled(first_rows)
+program_view = compiled_inline(first_rows)
+"""The same for kernels, and for those that do not count references to arrays."""
 
 
 class Residuals(NamedTuple):
@@ -345,7 +345,14 @@ def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: V
 
     Shares nothing with a solver, so P u is written out here once more.
     """
-    force, pulled = np.empty(velocities.shape), np.zeros(velocities.shape)
+    return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
+
+
+@compiled_uncounted
+def _residuals(
+    program: ChainProgram, velocities: Points, multipliers: Vector, force: Points, pulled: Points
+) -> tuple[float, float, float]:
+    """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
     largest = 1.0
     for i in range(nodes):

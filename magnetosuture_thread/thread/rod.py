@@ -69,7 +69,7 @@ from magnetosuture_thread.thread.program import (
     Solver,
     StepBuffers,
     Vector,
-    program_of,
+    first_rows,
     program_view,
 )
 from magnetosuture_thread.thread.self_contact import SelfContact
@@ -160,7 +160,7 @@ def assemble_step(
     rod, workspace, segments = model.rod, model.workspace, len(about) - 1
     mechanics.chord_lengths(about, given.heading, rod.clamped, program.chords)
     strain = segment_rows(program, about, start, known, interval)
-    rough, off = knows_friction(workspace), max(strain / STRAIN_TOLERANCE, elsewhere)
+    rough, off = knows_friction(workspace.friction), max(strain / STRAIN_TOLERANCE, elsewhere)
     cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
     if cheap and stays_clear(program, workspace, motion[LAST_ABOUT], about, known, rod.unit, rod.radius):
         return last_contacts, off, False
@@ -169,7 +169,7 @@ def assemble_step(
     )
     rubs = False
     if contacts > 0 and rough:
-        rubbing, change = friction_rows(buffers, segments, contacts, workspace, interval)
+        rubbing, change = friction_rows(buffers, segments, contacts, workspace.friction, interval)
         contacts = contacts + rubbing if rubbing >= 0 else -1
         rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
     off = max(off, depth / DEPTH_TOLERANCE)
@@ -404,20 +404,20 @@ def solve_step(
                 multipliers[:] = 0.0
                 break
             word = banded.RESTARTED
-        accept_step(buffers, workspace, rows, given.interval)
+        accept_step(buffers, workspace.friction, rows, given.interval)
         primal, dual, complementarity = max(primal, found[0]), max(dual, found[1]), max(complementarity, found[2])
         status, solves = status if status != 0 else word, solves + 1
     return StepProgress(code, contacts, solves, off, status, (primal, dual, complementarity))
 
 
 @compiled_uncounted
-def accept_step(buffers: RodBuffers, workspace: WorkspaceData, rows: int, interval: float) -> None:
+def accept_step(buffers: RodBuffers, friction: Vector, rows: int, interval: float) -> None:
     """Accept the velocities and multipliers in the buffers as the solution of the first rows: keep what follows."""
     start, velocities, about = buffers.motion[START], buffers.motion[VELOCITIES], buffers.motion[ABOUT]
     segments = len(about) - 1
     keep_pushes(buffers, rows, segments)
-    if knows_friction(workspace):
-        keep_grips(buffers.program, buffers.grips, rows, segments, workspace)
+    if knows_friction(friction):
+        keep_grips(buffers.program, buffers.grips, rows, segments, friction)
     keep_internal_forces(buffers, rows, interval)
     for i in range(len(about)):
         for a in range(about.shape[1]):
@@ -472,7 +472,7 @@ class RodFormulation(Formulation):
         self._self_contact = selves[0] if selves else None
         self.touches_itself = bool(selves)
         self._only_self_contact = len(barriers) == len(selves)
-        self._rough = knows_friction(self.workspace.data)
+        self._rough = knows_friction(self.workspace.data.friction)
 
     @property
     def nodes_in_contact(self) -> Mask:
@@ -562,11 +562,11 @@ class RodFormulation(Formulation):
                         continue
                 break
             rows = self._rows + done.contacts
-            program = program_of(self._program, buffers.known, rows)
+            program = first_rows(self._program, buffers.known, rows)
             solution = self._solve(program, buffers.motion[VELOCITIES], added)
             self._program.multipliers[:rows], pushes = np.split(solution.multipliers, [rows])
             buffers.motion[VELOCITIES] = solution.velocities
-            accept_step(buffers, self.workspace.data, rows, interval)
+            accept_step(buffers, self.workspace.data.friction, rows, interval)
             if added is not None:
                 if self._only_self_contact:
                     buffers.contact_force[:] += added.force(pushes, positions.shape)
@@ -617,7 +617,7 @@ class RodFormulation(Formulation):
         super().warm_up()
         nodes, heading = self._thread.segments + 1, np.eye(self.dimension)[0]
         still, chain = np.zeros((nodes, self.dimension)), np.outer(np.arange(nodes), heading)
-        accept_step(self._buffers, self.workspace.data, self._rows, 1.0)
+        accept_step(self._buffers, self.workspace.data.friction, self._rows, 1.0)
         tension, force = np.zeros(self._rows), np.zeros(self.dimension)
         write_forces(self.rod, chain, still, heading, still, force, 1.0, tension, force)
 

@@ -28,7 +28,7 @@ from magnetosuture_thread.thread.program import (
     StepBuffers,
     Table,
     Vector,
-    program_of,
+    first_rows,
     residuals_of,
 )
 
@@ -313,7 +313,7 @@ class Formulation(ABC):
     def warm_up(self) -> None:
         """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
         nodes = self._thread.segments + 1
-        program = program_of(self._program, np.zeros(nodes, dtype=np.bool_), self._rows)
+        program = first_rows(self._program, np.zeros(nodes, dtype=np.bool_), self._rows)
         solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
         residuals_of(program, solution.velocities, solution.multipliers)
         self.forget()

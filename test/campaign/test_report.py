@@ -58,7 +58,7 @@ def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> 
 def page_of(*runs: RunResult) -> str:
     """Return the page of a campaign of the hernia repair."""
     bags = {3: "bags/seed_3"}
-    return write_page(CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, runs, {}, bags))
+    return write_page(CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, list(runs), {}, bags))
 
 
 def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:

@@ -104,7 +104,7 @@ def test_an_unverified_bag_says_so_in_file_figures_and_text(folder: Path, tmp_pa
 def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
     output = tmp_path / "best.yaml"
     command = [sys.executable, "-m", "magnetosuture_thread.cli", "calibrate", str(folder / "one")]
-    command += ["--setup", str(folder / "lab.yaml"), "--output", str(output), "--workers", "2"]
+    command += ["--setup", str(folder / "lab.yaml"), "--output", str(output), "--workers", "1"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stderr is not None

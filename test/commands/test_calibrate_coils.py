@@ -11,8 +11,6 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.coils.calibration import read_calibration
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.commands.calibrate_coils import calibrate_coils
-from magnetosuture_thread.errors import BagError, InvalidInputError
 
 ANGLES = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)
 
@@ -69,15 +67,12 @@ def test_what_fails_leaves_the_calibration_before(tmp_path: Path, capsys: pytest
     assert sorted(path.name for path in tmp_path.iterdir()) == ["probe.csv", "rig.yaml"]
 
 
-def test_the_measurements_are_not_written_over(tmp_path: Path):
+def test_what_cannot_be_a_calibration_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = probe(tmp_path)
     before = path.read_text()
-    with pytest.raises(BagError, match="holds the measurements"):
-        calibrate_coils(path, path)
+    assert cli.main(["calibrate-coils", str(path), "--output", str(path)]) == 2
     assert path.read_text() == before
-
-
-def test_a_background_far_above_the_earths_is_taken_for_a_wrong_unit(tmp_path: Path):
-    with pytest.raises(InvalidInputError, match="are all fields in T"):
-        calibrate_coils(probe(tmp_path, background=2e-3), tmp_path / "rig.yaml")
+    path = probe(tmp_path, background=2e-3)  # far above the earth's
+    assert cli.main(["calibrate-coils", str(path), "--output", str(tmp_path / "rig.yaml")]) == 1
+    assert "are all fields in T" in capsys.readouterr().err
     assert not (tmp_path / "rig.yaml").exists()

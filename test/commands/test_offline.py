@@ -22,7 +22,7 @@ from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.observations import ObservationReader, predictions
+from magnetosuture_thread.commands.recorded import ObservationReader, predictions
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.errors import BagError

@@ -15,11 +15,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.commands.calibrate_camera import calibrate_camera
-from magnetosuture_thread.commands.track import track
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.vision.look import State
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from test.bags.bags import copy_with_notes
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
@@ -64,10 +59,11 @@ def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytes
 
 
 def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
-    video = tmp_path / "seen.mp4"
-    seen = track([short_bag], VisionTrackerSettings(), Scene(), overlay=video)
-    assert [frame.track.state for frame in seen] == [State.SEARCHING] * 2 + [State.TRACKED] * 28
-    row = seen[5].to_json()
+    video, file = tmp_path / "seen.mp4", tmp_path / "seen.json"
+    assert cli.main(["track", str(short_bag), "--overlay", str(video), "--json", str(file)]) == 0
+    rows = json.loads(file.read_text())
+    assert [row["status"] for row in rows] == ["searching"] * 2 + ["tracked"] * 28
+    row = rows[5]
     assert row["file"].startswith("/camera/image_raw/compressed ")
     assert row["stamp_s"] == pytest.approx(1.0 + 5 / 30.0, abs=1e-6)
     np.testing.assert_allclose(row["tail_m"], [0.003 + 0.003 * 5 / 30.0, 0.002], atol=8e-5)
@@ -107,14 +103,17 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
     frame, lens, output = tmp_path / "frame.png", tmp_path / "lens.yaml", tmp_path / "camera.yaml"
     cv2.imwrite(str(frame), image)
     lens.write_text(yaml.safe_dump(info))
-    straight = calibrate_camera([frame], 0.035, output, camera_info=lens).view
-    assert straight.metres_per_pixel == pytest.approx(case.view.metres_per_pixel, rel=3e-3)
-    assert calibrate_camera([frame], 0.035, output).view.metres_per_pixel != pytest.approx(
-        case.view.metres_per_pixel, rel=6e-3
-    )
+    given = ["--dish-diameter", "0.035", "--output", str(output)]
+    for options, error in ((["--camera-info", str(lens)], 3e-3), ([], 0.1)):
+        assert cli.main(["calibrate-camera", str(frame), *given, *options]) == 0
+        (section,) = (
+            found for found in yaml.safe_load(output.read_text()).values() if "metres_per_pixel" in str(found)
+        )
+        scale = section["ros__parameters"]["metres_per_pixel"]
+        assert scale == pytest.approx(case.view.metres_per_pixel, rel=error)
+    assert scale != pytest.approx(case.view.metres_per_pixel, rel=6e-3)
     lens.write_text(yaml.safe_dump(info | {"image_width": 1280}))
-    given = ["--dish-diameter", "0.035", "--output", str(output), "--camera-info", str(lens)]
-    assert cli.main(["calibrate-camera", str(frame), *given]) == 1
+    assert cli.main(["calibrate-camera", str(frame), *given, "--camera-info", str(lens)]) == 1
     assert "camera_info.width" in error_of(capsys)
 
 

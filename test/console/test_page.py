@@ -8,13 +8,11 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, ViewportSize, expect
 
-from magnetosuture_thread.geometry.needle_arc import needle_axis
 from test.console.conftest import ServedConsole
-from test.console.scene import estimated_state, forecast_state, picture, state, thread
+from test.console.scene import TAIL, estimated_state, forecast_state, picture, state
 
 pytestmark = pytest.mark.slow
 
@@ -144,13 +142,12 @@ def test_gamepad_stick_jogs_after_it_was_centred(operator: Operator):
 
 def test_dragging_from_the_needle_jogs(operator: Operator):
     operator.take_control()
-    needle = operator.served.graph.shown["needle"]
-    tip = needle_axis(thread()[0], needle["heading"], 0.007, 0.0, np.array([1.0]))[0][0]
+    tip = TAIL[0] + 0.007, TAIL[1]  # m
     box = operator.page.locator("#dish").bounding_box()
     assert box is not None
     scale = float(operator.page.get_attribute("#dish", "data-scale") or 0)
     u, v = (float(entry) for entry in (operator.page.get_attribute("#dish", "data-centre") or "").split(","))
-    x, y = box["x"] + u + scale * float(tip[0]), box["y"] + v - scale * float(tip[1])
+    x, y = box["x"] + u + scale * tip[0], box["y"] + v - scale * tip[1]
     mouse = operator.page.mouse
     mouse.move(x + 150, y + 200)
     mouse.down()
@@ -359,7 +356,7 @@ def test_a_held_key_without_motion_always_has_a_reason(operator: Operator):
 def test_estimate_disturbance_and_forecast_are_shown_while_there_are_any(operator: Operator) -> None:
     graph, page = operator.served.graph, operator.page
     dish, margins = page.locator("#dish"), page.locator("#margins")
-    graph.shown = estimated_state(found=True)
+    graph.shown = estimated_state()
     expect(dish).to_have_attribute("data-estimate", "measured")
     expect(dish).to_have_attribute("data-disturbances", "1")
     for text in ("Measured50 %", "99 % bound", "Held at 22 mm of the thread: 0.2 mN up and to the left"):

@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NoReturn
 
 from magnetosuture_thread.nodes import program
 
@@ -136,16 +137,16 @@ def serve() -> None:
         time.sleep(0.005)
 
 
-def run(given: dict[str, object]) -> None:
+def run(given: dict[str, Any]) -> NoReturn:
     """Become a program."""
     os.environ.clear()
-    os.environ.update(given["environment"])  # type: ignore[call-overload]
-    log = os.open(str(given["log"]), os.O_WRONLY | os.O_APPEND)
+    os.environ.update(given["environment"])
+    log = os.open(given["log"], os.O_WRONLY | os.O_APPEND)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(log, 1)
     os.dup2(log, 2)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    sys.argv = list(given["argv"])  # type: ignore[call-overload]
+    sys.argv = given["argv"]
     code = 1
     try:
         code = program.main()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes import diagnostics, topics
+from magnetosuture_thread.nodes import node as diagnostics
+from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health
 
 
@@ -38,6 +39,6 @@ def test_that_a_node_stands_by_is_reported_at_once_as_a_warning_whatever_else_th
     health.error("broken")
     health.stand_by("x" * 100_000)
     graph.wait(lambda: last()[1].startswith("xxx"), "the report")
-    assert len(last()[1]) <= diagnostics.MAX_TEXT_CHARS
+    assert len(last()[1]) <= diagnostics.MAX_REASON_CHARS
     health.stand_by("")
     graph.wait(lambda: last() == (DiagnosticStatus.ERROR, "broken"), "the state of meanwhile")

@@ -31,7 +31,7 @@ from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.look import State, no_pose
+from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
 from test.nodes import wire
 from test.scene.scenes import every_shape

@@ -25,7 +25,7 @@ class FollowerNode(PackageNode):
         super().__init__("follower", **options)
         self.changes: list[Scene] = []
         self.refusal: ConfigurationError | None = None
-        self.follower = SceneFollower(self, self.health, initial_scene(file), self.take)
+        self.follower = SceneFollower(self, self.take, initial_scene(file))
 
     def take(self, scene: Scene) -> None:
         """Take a scene, or refuse it."""

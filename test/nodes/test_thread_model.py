@@ -9,18 +9,14 @@ import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import SafetyMargins
-from magnetosuture_msgs.msg import Scene as SceneMessage
 from nav_msgs.msg import Path
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread import rod
 from test.examples import FOLDER
 from test.nodes import wire
-from test.thread.worlds import scene_with
 
 
 def stamp(seconds: float) -> Time:
@@ -71,47 +67,10 @@ def test_the_thread_starts_where_it_is_seen_and_follows(graph):
     ]
     assert markers[-1].markers[0].type == Marker.LINE_STRIP
     assert len(markers[-1].markers[0].points) == 26
-    assert markers[-1].markers[0].color.g == max(colour_of(markers[-1])[:3])
+    colour = markers[-1].markers[0].color
+    assert colour.g == max(colour.r, colour.g, colour.b)
     assert margins[-1].friction_state == SafetyMargins.FRICTION_FREE
     assert margins[-1].slowdown == 1.0
-
-
-def colour_of(message: MarkerArray) -> tuple[float, float, float]:
-    """Return the thread's colour."""
-    colour = message.markers[0].color
-    return colour.r, colour.g, colour.b
-
-
-def place(graph, *geometries: Disc | Polygon) -> Scene:
-    """Publish a scene with these shapes, for a node that is made next."""
-    scene = scene_with(*geometries)
-    graph.said = graph.probe.create_publisher(SceneMessage, topics.SCENE.name, topics.SCENE.qos)
-    graph.said.publish(wire.scene_message(graph.now(), scene))
-    return scene
-
-
-def test_friction_slows_the_needle_and_is_shown(graph):
-    """A gate of two discs around the thread, 6 mm behind the needle, which is drawn on and then rests."""
-    scene = place(graph, Disc((-0.006, 0.0018), 0.001), Disc((-0.006, -0.0018), 0.001))
-    node = graph.add(ThreadModelNode, initial_shape="straight", friction_threshold=1.2e-3, friction_averaging=0.0)
-    graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
-    margins, markers = graph.listen(topics.MARGINS), graph.listen(topics.THREAD_MARKERS)
-    graph.wait(lambda: node._markers.get_subscription_count() > 0, "the markers to be wanted")
-    for k, x in enumerate((0.0, 1e-4, 2e-4, 2e-4)):
-        graph.publish(topics.NEEDLE_POSE, pose(1.0 + k / 30.0, x))
-        graph.wait(lambda k=k: len(margins) == k + 1 and len(markers) == k + 1, "margins and markers")
-    pulled, resting = margins[-2:]
-    assert pulled.scene_version == resting.scene_version == scene.version
-    assert pulled.friction_state == SafetyMargins.FRICTION_SLIDING
-    assert list(pulled.friction_nodes) == list(resting.friction_nodes)
-    count = len(pulled.friction_nodes)
-    assert count >= 2
-    assert pulled.slowdown == pytest.approx(0.9**count)
-    assert (resting.friction_state, resting.slowdown) == (SafetyMargins.FRICTION_STUCK, 1.0)
-    red, green, blue = colour_of(markers[-2])
-    assert red > green > blue
-    assert colour_of(markers[-1])[2] == max(colour_of(markers[-1]))
-    assert len(markers[-2].markers[1].points) == count
 
 
 def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeypatch: pytest.MonkeyPatch):

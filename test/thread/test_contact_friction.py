@@ -10,9 +10,9 @@ import pytest
 
 from benchmarks.friction import DIAMETER, EAST, POST, RATE, SPEED, capstan, capstan_error, stiff_capstan
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
-from magnetosuture_thread.thread.formulations import make_formulation
 from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
+from magnetosuture_thread.thread.predictor import make_formulation
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
 from magnetosuture_thread.thread.rod import FRICTION_TOLERANCE, MAX_FRICTION_SOLVES
 from magnetosuture_thread.thread.solvers import BandedSolver, OsqpSolver

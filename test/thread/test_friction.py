@@ -31,11 +31,6 @@ def barriers(*discs: tuple[float, float, float], others: tuple[BarrierRows, ...]
 GATE = ((-3.5e-3, 1.9e-3, 1e-3), (-3.5e-3, -1.9e-3, 1e-3))
 
 
-def test_a_node_close_to_one_obstacle_is_free():
-    assert LAW.classify(barriers(GATE[0]), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
-    assert LAW.classify(barriers(), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
-
-
 def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
     assert LAW.classify(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
     third = (-3.5e-3, 1.85e-3, 1e-3)
@@ -57,11 +52,6 @@ def test_the_bound_counts_where_it_is_to_and_where_there_is_one():
     bounded = margins.with_bounds({"obstacle": avoided.clearance - 2e-5})
     assert by_bound.classify(bounded, np.ones(8)).nodes == (3, 4)
     assert replace(by_bound, by_bound=False).classify(bounded, np.ones(8)).nodes == ()
-
-
-def test_the_needle_itself_is_no_friction_of_the_thread():
-    at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
-    assert LAW.classify(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
 
 
 def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it():

@@ -77,25 +77,6 @@ def test_a_pose_waits_for_the_thread_of_its_frame():
     assert predicted(go(session, 1.4, 4e-4)).interval == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("offset", [[], [1e-3, 0.0]])
-@pytest.mark.parametrize(
-    "centreline",
-    [
-        np.empty((0, 2)),
-        np.zeros((1, 2)),
-        np.full((9, 2), np.nan),
-        np.full((9, 2), np.inf),
-        np.array([[0.0, 0.0], [1e300, -1e300]]),
-        np.array([[1e-3, 0.0], [1e-3, 0.0]]),
-    ],
-)
-def test_a_centreline_that_is_none_is_refused(centreline: Points, offset: list[float]):
-    session = ThreadSession(made(attachment_offset=offset), None)
-    go(session, 1.0)
-    (outcome,) = session.on_measured_thread(SECOND, centreline)
-    assert isinstance(outcome.problem, InvalidInputError)
-
-
 @pytest.mark.parametrize(
     "bad",
     [
@@ -231,44 +212,6 @@ def test_a_dish_that_gets_smaller_takes_the_thread_in(formulation: str):
     margins = outcomes[-1].margins
     assert margins is not None
     assert formulation == "paper" or margins.in_contact
-
-
-@pytest.mark.parametrize("formulation", ["rod", "paper"])
-@pytest.mark.parametrize("length", [0.019, 0.15])
-def test_no_thread_starts_outside_of_the_dish(formulation: str, length: float):
-    session = straight(scene_with(diameter=0.035), formulation=formulation, thread_length=length, segments=81)
-    for k in range(10):
-        prediction = predicted(go(session, 1.0 + k / 30.0, x=-0.012 + 1e-4 * k))
-        assert np.linalg.norm(prediction.positions, axis=1).max() < 0.0175 - 30e-6 + 1e-6
-    crooked = ThreadSession(made(formulation=formulation), scene_with(diameter=0.035))
-    go(crooked, 1.0, x=0.0174)
-    wavy = seen(0.0174) + np.array([0.0, 2e-4]) * np.sin(np.arange(60))[:, None]
-    wavy[:20, 0] += np.linspace(0.0, 2e-3, 20)  # out through the wall
-    (outcome,) = crooked.on_measured_thread(SECOND, wavy)
-    assert np.linalg.norm(predicted(outcome).positions[1:], axis=1).max() < 0.0175 - 30e-6 + 1e-9
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"segments": 60},
-        {"segments": 7},
-        {"thread_length": 0.03, "segments": 40},
-        {"thread_length": 0.01},
-        {"thread_length": 0.001, "segments": 8},
-    ],
-)
-def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
-    session = straight()
-    before = on_a_curve(session, 0, 30)[-1].positions
-    session.change(made(initial_shape="straight", **values), None)
-    after = on_a_curve(session, 30, 31)[0].positions
-    assert len(after) == session.thread.segments + 1
-    assert session.thread == session.settings.thread()
-    near = np.linalg.norm(after[:, None] - before, axis=2).min(axis=1)
-    along = session.thread.segment_length * np.arange(len(after))
-    assert near[along < 0.018].max() < 1e-3
-    assert np.linalg.norm(np.diff(after, axis=0), axis=1) == pytest.approx(session.thread.segment_length, rel=5e-3)
 
 
 def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import NeedlePose
-from magnetosuture_thread.thread.needle_motion import (
-    NeedleMotionFilter,
-)
-from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.thread_model.session import NeedleMotionFilter, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 RATE = 60.0
@@ -65,19 +62,6 @@ def test_a_needle_that_stops_is_followed_at_once():
         if k == 130:
             assert pose.motion is not None
             assert np.linalg.norm(pose.motion.velocity) < 0.2 * SPEED
-
-
-def test_poses_whose_deviation_is_not_known_are_as_they_were():
-    motion = NeedleMotionFilter()
-    for k in range(5):
-        pose = on_circle(k / RATE)
-        assert motion.update(pose) is pose
-    random = np.random.default_rng(9)
-    for k in range(5, 20):
-        motion.update(measured(on_circle(k / RATE), random))
-    assert motion.update(on_circle(20 / RATE)).motion is None  # and ends what was known
-    pose = measured(on_circle(21 / RATE), random)
-    assert motion.update(pose) is pose
 
 
 def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():
