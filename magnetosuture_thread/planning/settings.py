@@ -9,7 +9,7 @@ from magnetosuture_thread.configuration import Configuration, autostart_paramete
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.planning.executor import MAX_WAIT
 from magnetosuture_thread.planning.planner import NeedlePlanner
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
