@@ -17,8 +17,8 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "campaign/page.html",
-            "campaign/page.css",
+            "commands/campaign.html",
+            "commands/campaign.css",
             "evaluation/report/page.html",
             "evaluation/report/page.css",
             "evaluation/report/page.js",

@@ -20,12 +20,13 @@ from rich.table import Table
 
 from benchmarks.general_solvers import PEERS
 from benchmarks.track import OBSTACLES, Case, case
-from magnetosuture_thread.cli.terminal import progress
+from magnetosuture_thread.commands.command import progress
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.formulations import PrescribedMotion, RodFormulation, StepResult, ThreadState
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Solver, Vector
+from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver, OsqpSolver
+from magnetosuture_thread.thread.step import PrescribedMotion, StepResult, ThreadState
 
 REACH = 5e-3  # m; of the margins, which the step does not ask for
 ANY_RESIDUAL = 1e9  # accepted by the step: a residual is shown here, not refused

@@ -24,9 +24,6 @@ CONNECTIVITY, COMPRESSION, OBSTACLE = "connectivity", "compression", "obstacle"
 ENHANCED_CONNECTIVITY, STIFFNESS, WALL = "enhanced_connectivity", "stiffness", "wall"
 BUILT_IN = (CONNECTIVITY, COMPRESSION, OBSTACLE, ENHANCED_CONNECTIVITY, STIFFNESS, WALL)
 """Names of the barriers that the formulations bring."""
-GAIN = Quantity("", "1/s", minimum=1e-6, unlimited=True)
-SLACK_WEIGHT = Quantity("", minimum=1e-12, unlimited=True)
-GRADIENT_STEP = 1e-6  # of the nodes' extent; a difference loses as much by rounding as by the curvature
 MAX_BARRIERS = 32
 MAX_NAME_CHARS = 64
 
@@ -178,7 +175,8 @@ def check_gradient(barrier: Barrier, positions: Points, tolerance: float = 1e-4)
     positions = finite_array(
         "positions", positions, (None, 3 if positions.shape[-1:] == (3,) else 2), Quantity("", "m")
     )
-    rows, step = barrier.rows(positions), GRADIENT_STEP * float(np.ptp(positions, axis=0).max())
+    # A millionth of the extent: a difference loses as much by rounding as by the curvature.
+    rows, step = barrier.rows(positions), 1e-6 * float(np.ptp(positions, axis=0).max())
     given, found = np.zeros((2, len(rows.value), *positions.shape))
     np.add.at(given, (np.arange(len(given))[:, None], rows.nodes), rows.gradient)
     for node, axis in np.ndindex(positions.shape):
@@ -234,8 +232,8 @@ def check_barriers(barriers: tuple[Barrier, ...]) -> None:
             raise ConfigurationError(f"barriers[{index}].name", name, f"1 to {MAX_NAME_CHARS} printable characters")
         if name in taken:
             raise ConfigurationError(f"barriers[{index}].name", name, "a name that no other barrier has")
-        GAIN.checked(f"{name}.gain", barrier.gain)
-        SLACK_WEIGHT.checked(f"{name}.slack_weight", barrier.slack_weight)
+        Quantity("", "1/s", minimum=1e-6, unlimited=True).checked(f"{name}.gain", barrier.gain)
+        Quantity("", minimum=1e-12, unlimited=True).checked(f"{name}.slack_weight", barrier.slack_weight)
         taken.add(name)
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, cast, get_type_hints
 
@@ -188,23 +189,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-_FIELDS: dict[type[Configuration], tuple[ConfigurationField, ...]] = {}
-
-
+@cache  # to read type hints takes longer than to check a value
 def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
     """Return the fields of a configuration class."""
-    if cls not in _FIELDS:  # Type hints are read once: it takes longer than to check a value.
-        _FIELDS[cls] = tuple(_made_fields(cls))
-    return _FIELDS[cls]
-
-
-def _made_fields(cls: type[Configuration]) -> Iterator[ConfigurationField]:
-    hints = get_type_hints(cls)
+    hints, found = get_type_hints(cls), []
     for entry in fields(cast(Any, cls)):
         hint = hints[entry.name]
         kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
         assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"
-        yield ConfigurationField(cls.GROUP, entry.name, kind, entry.default, entry.metadata["quantity"], entries)
+        about = entry.metadata["quantity"]
+        found.append(ConfigurationField(cls.GROUP, entry.name, kind, entry.default, about, entries))
+    return tuple(found)
 
 
 def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C:

@@ -14,11 +14,11 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.parameter_files import EVERY_NODE, load_setup
 from magnetosuture_thread.planning.follower import PathFollowerSettings
 from magnetosuture_thread.planning.procedure import Procedure
-from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file
 from magnetosuture_thread.rig.settings import RigSettings
 from magnetosuture_thread.scene import Scene, read_scene
-from magnetosuture_thread.scene.editing import SceneServerSettings
+from magnetosuture_thread.scene.files import SceneServerSettings
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

@@ -207,7 +207,7 @@ MADE: dict[str, tuple[Callable[..., Any], str]] = {
     "ThreadEstimator": (made(ThreadEstimator, predictor=3), "predictor options"),
     "ThreadForecaster": (
         FORECASTER,
-        "thread scene safety law friction_averaging attachment_offset drag step margin_range "
+        "thread scene safety law friction_averaging attachment_offset step margin_range "
         "contact_tolerance residual_tolerance max_step max_substeps fixed_nodes",
     ),
     "ThreadPredictor": (

@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import make_forecaster
-from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file, share_directory
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS

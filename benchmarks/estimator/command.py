@@ -15,7 +15,7 @@ from rich.table import Table
 from benchmarks.estimator.cases import CASES
 from benchmarks.estimator.measurements import THREADS, measure_case, measure_cost
 from benchmarks.estimator.rendered import measure_rendered
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

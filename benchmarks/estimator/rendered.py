@@ -17,8 +17,8 @@ from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import ThreadObservation
-from magnetosuture_thread.vision.session import TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import TrackerSession
 
 VIEW = DishView((322.0, 238.0), 8e-5)
 AFTERWARDS = 2.0  # s; of a run after the contact

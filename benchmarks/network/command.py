@@ -22,8 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
 
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
 
 DELAY, LOSS = 0.05, 0.05  # s, and share of packets
 SETUP = "petri_35mm_polyamide"
+DOMAIN = 1  # of ROS, on hosts that have no other graph
 AT_THE_RIG = ("scene_server", "rig_simulator", "vision_tracker", "coil_bridge")
 AT_THE_DESK = ("thread_model", "path_follower", "console")
 # Not by TCP, whose packets wait for one that was lost.
@@ -55,7 +55,6 @@ PULL_DELAY = 1.0  # s that may go by before, at random
 PULLED_TIME = (0.3, 4.0)  # s for which the cable is out, at random
 STOP_EVERY = 10  # cuts of which in one the emergency stop is pressed at the rig while the cable is out
 STILL_TIME = 2.0  # s for which a stopped bridge must stay at zero after the cable is back
-TRAFFIC_TIME = 10.0  # s
 TIMEOUT = 60.0  # s for anything to happen ...
 START_TIMEOUT = 300.0  # ... but for the first start on a machine, which compiles
 
@@ -75,8 +74,6 @@ class CutReport:
         late: cuts after which the coils were driven for longer than the command's timeout, or again while it was out.
         stops: cuts in which the emergency stop was pressed.
         stops_kept: those of them that stayed at zero until a reset.
-        driven: share of time in which the coils are driven while the cable is in.
-        megabits: traffic from the rig to the desk and back, with camera frames for the operator's page [Mbit/s].
     """
 
     delay: float
@@ -86,8 +83,6 @@ class CutReport:
     late: int = 0
     stops: int = 0
     stops_kept: int = 0
-    driven: float = 0.0
-    megabits: tuple[float, float] = (0.0, 0.0)
 
     @property
     def passed(self) -> bool:
@@ -101,7 +96,7 @@ class CutReport:
             for name in ("zero", "resumed")
             for kind, of in (("median", np.median), ("maximum", np.max))
         }
-        names = ("delay", "loss", "late", "stops", "stops_kept", "driven", "megabits")
+        names = ("delay", "loss", "late", "stops", "stops_kept")
         return {"cuts": len(self.zero), **times, **{name: getattr(self, name) for name in names}}
 
 
@@ -113,39 +108,24 @@ class RigWatch:
         since: when it began to do so without a pause of `DRIVEN_TIME` [s].
         armed: whether the bridge is armed.
         reasons: why the currents are zero.
+        spin: takes what comes for a while [s].
+        close: leaves the graph.
 
     Args:
         processes: none of which may end.
     """
 
     def __init__(self, processes: Sequence[NodeProcesses]) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-
         from magnetosuture_thread.nodes import topics
-        from magnetosuture_thread.nodes.node import GuardedNode
+        from magnetosuture_thread.nodes.clients import Recorder
 
-        self._processes, self._context = processes, rclpy.Context()
-        rclpy.init(context=self._context, args=[])
-        self._node = GuardedNode("rig_watch", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        topics.RIG_CURRENTS.subscribe(self._node, self._on_currents)
-        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
+        self._processes, self._state = processes, topics.BRIDGE_STATE
+        self._currents = topics.RIG_CURRENTS
+        taken = [self._currents, self._state]
+        self._recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
+        self.close, self.spin = self._recorder.close, self._recorder.spin
         self.driven = self.since = -np.inf
         self.armed, self.reasons = False, ""
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin(self, duration: float) -> None:
-        """Take what comes for a while."""
-        end = time.monotonic() + duration
-        while (left := end - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=min(left, 0.02))
 
     def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
         """Take what comes until a condition holds.
@@ -159,22 +139,24 @@ class RigWatch:
                 each.check()
             if time.monotonic() > end:
                 raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
-            self._executor.spin_once(timeout_sec=0.02)
+            self.spin(0.02)
 
     def is_driven(self) -> bool:
         """Whether the coils are driven, and have been for a while."""
         now = time.time()
         return now - self.driven < DRIVEN_TIME <= now - self.since
 
-    def _on_currents(self, message: Any) -> None:
+    def _receive(self, topic: str, arrival: int, data: bytes) -> None:
+        if topic == self._state.channel.recorded:
+            state = self._state.decode(data)
+            self.armed, self.reasons = state.armed, "; ".join(state.reasons)
+            return
+        message = self._currents.decode(data)
         if np.any(np.abs(message.current) > 0.0):
             given = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
             if given - self.driven > DRIVEN_TIME:
                 self.since = given
             self.driven = given
-
-    def _on_state(self, message: Any) -> None:
-        self.armed, self.reasons = message.armed, "; ".join(message.reasons)
 
 
 class TwoHostBench:
@@ -193,7 +175,6 @@ class TwoHostBench:
         """Pull the cable at random moments."""
         self._hosts.impair(report.delay, report.loss)
         self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
-        report.driven, report.megabits = self._measure_traffic()
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
             progress((number + 1) / cuts)
@@ -226,17 +207,6 @@ class TwoHostBench:
         self._watch.spin(duration)
         return self._watch.driven > before
 
-    def _measure_traffic(self) -> tuple[float, tuple[float, float]]:
-        watch, began, before = self._watch, time.monotonic(), self._hosts.traffic()
-        driven = steps = 0
-        while time.monotonic() - began < TRAFFIC_TIME:
-            watch.spin(0.05)
-            driven += time.time() - watch.driven < RECENT
-            steps += 1
-        elapsed = time.monotonic() - began
-        there, back = (8e-6 * (now - then) / elapsed for now, then in zip(self._hosts.traffic(), before, strict=True))
-        return driven / steps, (there, back)
-
 
 def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, progress: Progress) -> list[CutReport]:
     """Run the graph over two hosts and pull the cable between them; return a report of each network.
@@ -255,7 +225,7 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
         # Imported here: threads that it starts have to be on the rig's host.
         from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment
 
-        environment = {**graph_environment(1), **ENVIRONMENT}
+        environment = {**graph_environment(DOMAIN), **ENVIRONMENT}
         path = ",".join(map(str, (*setup.follower.waypoints,) * ROUNDS))
         shared = ["--params-file", str(setup.path.resolve()), *_parameters(BEST_EFFORT)]
         at_the_rig = [*shared, *_parameters(BRIDGE)]
@@ -318,7 +288,7 @@ def network_table(reports: list[CutReport]) -> Table:
     """Return the figures of each network as a table."""
     table = Table(title="Two hosts, simulated rig")
     zero = f"at zero within {COMMAND_TIMEOUT:g} s"
-    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept", "driven", "Mbit/s"):
+    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept"):
         table.add_column(heading)
     for report in reports:
         found = report.to_json()
@@ -328,7 +298,5 @@ def network_table(reports: list[CutReport]) -> Table:
             f"{found['zero_median']:.3f}, {found['zero_maximum']:.3f}",
             f"{found['resumed_median']:.2f}, {found['resumed_maximum']:.2f}",
             f"{report.stops_kept} of {report.stops}",
-            f"{report.driven:.0%}",
-            f"{report.megabits[0]:.1f}, {report.megabits[1]:.1f}",
         )
     return table

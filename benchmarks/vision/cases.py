@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import ParamSpec
+from typing import Any
 
 import cv2
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.spatial import KDTree
 
 from benchmarks.vision.frames import (
     DISH_RADIUS,
@@ -29,7 +30,6 @@ from magnetosuture_thread.rig.camera import STEEL_BGR, Cover, Lighting
 
 Random = np.random.Generator
 MakeCase = Callable[[Random], Case]
-Drawn = ParamSpec("Drawn")
 
 WITHIN, THREAD_WITHIN = 0.0150, 0.0163  # m; of the dish's centre, in which a needle and a thread lie
 CURVATURES = (-190.0, 0.0, 0.0, 0.0, 110.0, 190.0)  # 1/m
@@ -44,13 +44,16 @@ COLOURS = {
 WIDTHS_PX = (0.5, 0.75, 1.0, 1.5, 2.0, 4.0, 6.0)
 COVERS = (1.5, 3.0, 6.0, 10.0)  # mm
 COVER_BGR = ((168.0, 176.0, 205.0), (60.0, 58.0, 55.0), (210.0, 205.0, 200.0))
-SKIN_BGR = (150.0, 170.0, 225.0)
+SKIN_BGR, INSTRUMENT_BGR, GLARE_BGR = (150.0, 170.0, 225.0), (120.0, 118.0, 115.0), (262.0, 262.0, 262.0)
+CLEARANCE = 1.2e-3  # m; of covers and of another thread from the needle and the thread's beginning
+TURNS = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+BESIDE = (0.6e-3, 2.0e-3)  # m; from a thread to one that comes near without a crossing
 
 
-def tried(make: Callable[Drawn, Case | None]) -> Callable[Drawn, Case]:
+def tried(make: Callable[..., Case | None]) -> Callable[..., Case]:
     """Return a function that draws a case at random, again and again until one fits into the dish."""
 
-    def draw(*given: Drawn.args, **options: Drawn.kwargs) -> Case:
+    def draw(*given: Any, **options: Any) -> Case:
         for _ in range(MAX_TRIES):
             if (case := make(*given, **options)) is not None:
                 return case
@@ -253,20 +256,34 @@ def _covered(width: float, random: Random) -> Case | None:
     middle = random.uniform(3e-3 + 0.5 * width, 22e-3 - 0.5 * width)
     index = int(np.searchsorted(lengths, middle))
     at, along = case.thread[index], case.thread[index + 1] - case.thread[index - 1]
-    colour = COVER_BGR[int(random.integers(len(COVER_BGR)))]
-    turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
-    round_one = at + 0.5 * width * np.column_stack([np.cos(turns), np.sin(turns)])
+    colour = _colour(random)
     if random.random() < 0.5:
-        outline, how = round_one, "post"
+        outline, how = _post(at, width), "post"
     else:
         across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
         across *= math.copysign(1.0, float(across @ at))  # towards the nearer wall
         outline, how = straight_strip(at - 2e-3 * across, across, 0.06, width), "instrument"
-    cover = Cover(outline, colour, 1.0)
+    return _below(replace(case, labels={"how": how}), [outline], [colour])
+
+
+def _below(
+    case: Case, outlines: list[Points], colours: Iterable[tuple[float, float, float]], blur_px: float = 1.0
+) -> Case | None:
+    """Return a case below covers; None unless they keep off the needle and the thread's beginning."""
     axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-    if depth_inside(outline, np.vstack([axis, case.thread[:20]])) < -1.2e-3:
-        return replace(case, hidden_by=(cover,), labels={"how": how})
+    keep = np.vstack([axis, case.thread[:20]])
+    if all(depth_inside(outline, keep) < -CLEARANCE for outline in outlines):
+        covers = tuple(Cover(*each, blur_px) for each in zip(outlines, colours, strict=True))
+        return replace(case, hidden_by=covers)
     return None
+
+
+def _post(at: Points, width: float) -> Points:
+    return at + 0.5 * width * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
+
+
+def _colour(random: Random) -> tuple[float, float, float]:
+    return COVER_BGR[int(random.integers(len(COVER_BGR)))]
 
 
 def straight_strip(end: Points, way: Points, length: float, width: float) -> Points:
@@ -330,24 +347,6 @@ def _cut_dish(least: float, greatest: float, random: Random) -> Case | None:
     return None
 
 
-@tried
-def _hand(random: Random) -> Case | None:
-    """Return a finger that comes in from the border and keeps off the needle."""
-    case = usual_case(random)
-    angle, width = random.uniform(-np.pi, np.pi), random.uniform(8e-3, 16e-3)
-    turns = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 20)
-    inwards = -unit_vector(angle)
-    across = np.array([-inwards[1], inwards[0]])
-    end = -random.uniform(3e-3, 14e-3) * inwards
-    cap = end + 0.5 * width * (np.cos(turns)[:, None] * inwards + np.sin(turns)[:, None] * across)
-    back = end - 0.1 * inwards
-    outline = np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across])
-    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-    if depth_inside(outline, axis) < -1.5e-3:
-        return replace(case, hidden_by=(Cover(outline, SKIN_BGR, 2.5),))
-    return None
-
-
 def _length_off(share: float, random: Random) -> Case:
     """Return the usual frame, and a length of the needle that is set wrong by a share."""
     return replace(usual_case(random), length_error=share * random.choice((-1.0, 1.0)))
@@ -377,25 +376,6 @@ def _instrument_beside(random: Random) -> Case | None:
     return None
 
 
-OFF_NEEDLE = 1.2e-3  # m; of a cover from the needle and the thread's beginning
-TURNS = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
-INSTRUMENT_BGR = (120.0, 118.0, 115.0)
-
-
-def _post(at: Points, width: float) -> Points:
-    return at + 0.5 * width * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
-
-
-def _off_needle(case: Case, *outlines: Points) -> bool:
-    axis, _ = case.needle.axis(np.linspace(0.0, 1.0, 40))
-    keep = np.vstack([axis, case.thread[:20]])
-    return all(depth_inside(outline, keep) < -OFF_NEEDLE for outline in outlines)
-
-
-def _colour(random: Random) -> tuple[float, float, float]:
-    return COVER_BGR[int(random.integers(len(COVER_BGR)))]
-
-
 @tried
 def _two_covers(random: Random) -> Case | None:
     """Return a thread below two posts."""
@@ -403,9 +383,7 @@ def _two_covers(random: Random) -> Case | None:
     widths, middles = random.uniform(2e-3, 5e-3, 2), (random.uniform(5e-3, 10e-3), random.uniform(16e-3, 22e-3))
     posts = [_post(points_at(case.thread, np.array([at]))[0], w) for at, w in zip(middles, widths, strict=True)]
     apart = np.linalg.norm(posts[0].mean(axis=0) - posts[1].mean(axis=0)) - 0.5 * widths.sum()
-    if apart > 1e-3 and _off_needle(case, *posts):
-        return replace(case, hidden_by=tuple(Cover(post, _colour(random), 1.0) for post in posts))
-    return None
+    return _below(case, posts, (_colour(random) for _ in posts)) if apart > 1e-3 else None
 
 
 @tried
@@ -414,10 +392,7 @@ def _cover_end(random: Random) -> Case | None:
     case = usual_case(random, thread=0.024)
     width = random.uniform(1.5e-3, 6e-3)
     at = case.thread[-1] + random.uniform(0.0, 0.3) * width * unit_vector(random.uniform(-np.pi, np.pi))
-    post = _post(at, width)
-    if _off_needle(case, post):
-        return replace(case, hidden_by=(Cover(post, _colour(random), 1.0),))
-    return None
+    return _below(case, [_post(at, width)], (_colour(random) for _ in range(1)))
 
 
 @tried
@@ -429,9 +404,7 @@ def _cover_crossing(random: Random) -> Case | None:
     apart[np.abs(np.subtract.outer(np.arange(len(line)), np.arange(len(line)))) < 60] = 1.0
     first, _ = np.unravel_index(int(np.argmin(apart)), apart.shape)
     post = _post(line[first], random.uniform(1.5e-3, 2.5e-3))
-    if _off_needle(case, post):
-        return replace(case, hidden_by=(Cover(post, _colour(random), 1.0),))
-    return None
+    return _below(case, [post], (_colour(random) for _ in range(1)))
 
 
 @tried
@@ -442,9 +415,7 @@ def _glare_thread(random: Random) -> Case | None:
     axes, turn = random.uniform(0.5e-3, 2e-3, 2), random.uniform(0.0, np.pi)
     spot = axes * np.column_stack([np.cos(TURNS), np.sin(TURNS)])
     spot = at + spot @ np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
-    if _off_needle(case, spot):
-        return replace(case, hidden_by=(Cover(spot, (262.0, 262.0, 262.0), 2.0),))
-    return None
+    return _below(case, [spot], [GLARE_BGR], 2.0)
 
 
 @tried
@@ -456,95 +427,90 @@ def _hand_instrument(random: Random) -> Case | None:
     way = math.cos(lean := random.uniform(-0.8, 0.8)) * outward + math.sin(lean) * np.array([-outward[1], outward[0]])
     instrument = straight_strip(at - 2e-3 * way, way, 0.06, random.uniform(1.5e-3, 3e-3))
     hand = straight_strip(at + random.uniform(6e-3, 10e-3) * way, way, 0.06, random.uniform(8e-3, 14e-3))
-    if _off_needle(case, instrument, hand):
-        return replace(case, hidden_by=(Cover(instrument, INSTRUMENT_BGR, 1.0), Cover(hand, SKIN_BGR, 2.5)))
-    return None
+    return _below(case, [instrument, hand], [INSTRUMENT_BGR, SKIN_BGR])
 
 
-STEEP, SHALLOW = (30.0, 90.0), (10.0, 30.0)  # degrees; at which the other thread crosses the needle's
-CROSSING_AT = (3e-3, 15e-3)  # m; of the thread's arc length
-LENGTHS = (12e-3, 22e-3)  # m; of the other thread
-CLEARANCE = 1.2e-3  # m; of the other thread from the needle
-BENDS = 200.0  # 1/m; of the other thread, at most
-BESIDE = (0.6e-3, 2.0e-3)  # m; from a thread to one that comes near without a crossing
+def _through(random: Random, place: Points, direction: float) -> tuple[Points, int]:
+    """Return another thread through a place in a direction, and the number of its vertex there."""
+    halves = [
+        winding_line(random, place, direction + turn, 0.5 * random.uniform(12e-3, 22e-3), 200.0)
+        for turn in (math.pi, 0)
+    ]
+    return np.vstack([halves[0][::-1], halves[1][1:]]), len(halves[0]) - 1
 
 
-def _apart(one: Points, other: Points) -> np.ndarray:
-    return np.asarray(np.linalg.norm(one[:, None] - other[None], axis=2))
+def _with(case: Case, other: Points, labels: dict[str, float]) -> Case | None:
+    """Return a case with another thread; None unless that stays in the dish and off the needle."""
+    if not is_inside(other) or case.needle.distances(other[::4]).min() < CLEARANCE:
+        return None
+    width = case.thread_px * case.view.metres_per_pixel
+    return replace(case, hidden_by=(drawn_thread(other, width, case.thread_bgr),), labels=labels)
+
+
+def _place_of_crossing(random: Random, case: Case) -> tuple[Points, float]:
+    """Return a place on a thread and its direction there [rad]."""
+    at = int(np.searchsorted(arc_lengths(case.thread), random.uniform(3e-3, 15e-3)))
+    along = case.thread[at + 1] - case.thread[at - 1]
+    return case.thread[at], math.atan2(along[1], along[0])
 
 
 @tried
 def _crossed(low: float, high: float, random: Random) -> Case | None:
     """Return the usual frame with another thread that crosses the needle's once, at an angle of some degrees."""
     case = usual_case(random)
-    at = int(np.searchsorted(arc_lengths(case.thread), random.uniform(*CROSSING_AT)))
-    along = case.thread[at + 1] - case.thread[at - 1]
+    place, direction = _place_of_crossing(random, case)
     angle = math.radians(random.uniform(low, high)) * random.choice((-1.0, 1.0))
-    way, place = math.atan2(along[1], along[0]) + angle, case.thread[at]
-    halves = [winding_line(random, place, way + turn, 0.5 * random.uniform(*LENGTHS), BENDS) for turn in (math.pi, 0)]
-    other = np.vstack([halves[0][::-1], halves[1][1:]])
-    apart = _apart(other[::4], case.thread[::4])
-    near = np.flatnonzero((apart.min(axis=1) < 0.5e-3) & (np.abs(4 * np.arange(len(other[::4])) - len(halves[0])) > 4))
+    other, middle = _through(random, place, direction + angle)
+    apart = KDTree(case.thread[::4]).query(other)[0]
+    near = np.flatnonzero((apart < 0.5e-3) & (np.abs(np.arange(len(other)) - middle) > 4))
     # Nowhere near but where it crosses: as long as two lines at that angle are.
-    reach = 0.8e-3 / math.sin(abs(angle))
-    again = np.abs(arc_lengths(other)[::4][near] - arc_lengths(halves[0])[-1]) > reach
-    if is_inside(other) and not again.any() and case.needle.distances(other[::4]).min() > CLEARANCE:
-        return _with(case, other, {"angle": math.degrees(angle)})
-    return None
+    at = arc_lengths(other)
+    again = np.abs(at[near] - at[middle]) > 0.8e-3 / math.sin(abs(angle))
+    return None if again.any() else _with(case, other, {"angle": math.degrees(angle)})
 
 
 @tried
 def _beside(random: Random) -> Case | None:
     """Return the usual frame with another thread that runs beside the needle's for a while and does not touch it."""
     case = usual_case(random)
-    at = int(np.searchsorted(arc_lengths(case.thread), random.uniform(*CROSSING_AT)))
-    along = case.thread[at + 1] - case.thread[at - 1]
-    direction = math.atan2(along[1], along[0])
+    place, direction = _place_of_crossing(random, case)
     side = random.choice((-1.0, 1.0)) * random.uniform(*BESIDE)
-    place = case.thread[at] + side * unit_vector(direction + 0.5 * math.pi)
-    halves = [
-        winding_line(random, place, direction + turn, 0.5 * random.uniform(*LENGTHS), BENDS) for turn in (math.pi, 0)
-    ]
-    other = np.vstack([halves[0][::-1], halves[1][1:]])
-    clear = _apart(other[::4], case.thread[::4]).min() > 0.9 * BESIDE[0]
-    if clear and is_inside(other) and case.needle.distances(other[::4]).min() > CLEARANCE:
-        return _with(case, other, {"distance": abs(side)})
-    return None
+    other, _ = _through(random, place + side * unit_vector(direction + 0.5 * math.pi), direction)
+    clear = KDTree(case.thread[::4]).query(other)[0].min() > 0.9 * BESIDE[0]
+    return _with(case, other, {"distance": abs(side)}) if clear else None
 
 
-def _with(case: Case, other: Points, labels: dict[str, float]) -> Case:
-    width = case.thread_px * case.view.metres_per_pixel
-    return replace(case, hidden_by=(drawn_thread(other, width, case.thread_bgr),), labels=labels)
-
-
-def _classes() -> dict[str, MakeCase]:
-    classes: dict[str, MakeCase] = {"usual": usual_case}
-    for length in (2.5, 7.0):
-        for low, high in FOLDS:
-            classes[f"fold_{low}_{high}_{length:g}mm"] = partial(_folded, low, high, 1e-3 * length)
-    classes |= {"crossing_itself": thread_with_loop, "crossing_needle": _crossing_needle}
-    classes |= {f"wall_{end}": partial(_at_wall, end) for end in ("tip", "tail", "side")}
-    classes |= {f"width_{columns}": partial(_image_width, columns) for columns in SIZES}
-    for colour in COLOURS:
-        classes |= {f"thread_{colour}_{width:g}px": partial(_thread, colour, width) for width in WIDTHS_PX}
-    classes |= {f"cover_{width:g}mm": partial(_covered, 1e-3 * width) for width in COVERS}
-    classes |= {"second_needle": _second_needle}
-    classes |= {f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)}
-    classes |= {"saturated": _saturated, "dark_field": _dark_field, "blunt_rod": _blunt_rod}
-    classes |= {
-        "distortion": partial(_distorted, True),
-        "cut_dish": partial(_cut_dish, 0.1, 0.55),
-        "hand": _hand,
-    }
-    classes |= {"cut_dish_far": partial(_cut_dish, 0.55, 0.9)}
-    classes |= {"distortion_untold": partial(_distorted, False)}
-    classes |= {f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)}
-    classes |= {"suture_needle": _suture_needle, "instrument_beside": _instrument_beside}
-    classes |= {"two_covers": _two_covers, "cover_end": _cover_end, "cover_crossing": _cover_crossing}
-    classes |= {"glare_thread": _glare_thread, "hand_instrument": _hand_instrument}
-    classes |= {"second_thread": partial(_crossed, *STEEP), "second_thread_shallow": partial(_crossed, *SHALLOW)}
-    classes |= {"second_thread_beside": _beside}
-    return classes
-
-
-CLASSES = _classes()
+CLASSES: dict[str, MakeCase] = {
+    "usual": usual_case,
+    **{
+        f"fold_{low}_{high}_{mm:g}mm": partial(_folded, low, high, 1e-3 * mm)
+        for mm in (2.5, 7.0)
+        for low, high in FOLDS
+    },
+    "crossing_itself": thread_with_loop,
+    "crossing_needle": _crossing_needle,
+    **{f"wall_{end}": partial(_at_wall, end) for end in ("tip", "tail", "side")},
+    **{f"width_{columns}": partial(_image_width, columns) for columns in SIZES},
+    **{f"thread_{colour}_{px:g}px": partial(_thread, colour, px) for colour in COLOURS for px in WIDTHS_PX},
+    **{f"cover_{mm:g}mm": partial(_covered, 1e-3 * mm) for mm in COVERS},
+    "second_needle": _second_needle,
+    **{f"tilt_{angle}deg": partial(_tilted, float(angle)) for angle in (3, 6, 10)},
+    "saturated": _saturated,
+    "dark_field": _dark_field,
+    "blunt_rod": _blunt_rod,
+    "distortion": partial(_distorted, True),
+    "distortion_untold": partial(_distorted, False),
+    "cut_dish": partial(_cut_dish, 0.1, 0.55),
+    "cut_dish_far": partial(_cut_dish, 0.55, 0.9),
+    **{f"length_off_{percent}": partial(_length_off, 0.01 * percent) for percent in (2, 5, 10)},
+    "suture_needle": _suture_needle,
+    "instrument_beside": _instrument_beside,
+    "two_covers": _two_covers,
+    "cover_end": _cover_end,
+    "cover_crossing": _cover_crossing,
+    "glare_thread": _glare_thread,
+    "hand_instrument": _hand_instrument,
+    "second_thread": partial(_crossed, 30.0, 90.0),
+    "second_thread_shallow": partial(_crossed, 10.0, 30.0),
+    "second_thread_beside": _beside,
+}

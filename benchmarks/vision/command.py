@@ -15,10 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.vision.cases import CLASSES
-from benchmarks.vision.measurements import Row, frame_of, measure_vision
+from benchmarks.vision.measurements import frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
-from magnetosuture_thread.cli.arguments import count_argument, whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
 from magnetosuture_thread.errors import ConfigurationError
 
 FAMILIES = ", ".join(dict.fromkeys(name.partition("_")[0] for name in CLASSES))
@@ -53,8 +52,9 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of names: {FAMILIES}")
     with progress(console, "vision") as advance:
         rows, figures = measure_vision(names, options.count, options.seed, advance)
-    for each in tables(rows):
-        console.print(each)
+    title = f"on rendered frames, {options.count} of each class"
+    console.print(_table(f"the needle {title}", NEEDLE, figures["rows"], POSES))
+    console.print(_table(f"the thread {title}", THREAD, figures["rows"], PIECES))
     total = {name: sum(getattr(row, name) for row in rows) for name in TOTALS}
     make_log(console)(", ".join(f"{value} {name}" for name, value in total.items()))
     return {**figures, "total": total}, total["reversed"] == 0
@@ -65,14 +65,9 @@ def _photographs(options: argparse.Namespace, console: Console) -> tuple[dict[st
     names = [name for name in PHOTOGRAPHS if name.startswith(tuple(options.classes))]
     if not names:
         raise ConfigurationError("--classes", " ".join(options.classes), f"beginnings of {', '.join(PHOTOGRAPHS)}")
-    rows, figures = measure_photographs(names, options.count, options.seed)
-    result = Table(title=f"the dish in {options.count} drawn photographs of each class", box=SIMPLE_HEAD)
-    for name in ("class", "found", "right", "ms", "max ms"):
-        result.add_column(name, justify="left" if name == "class" else "right", no_wrap=True)
-    for row in rows:
-        result.add_row(row.name, str(row.found), str(row.right), f"{row.median_ms:.1f}", f"{row.max_ms:.1f}")
-    console.print(result)
-    right, count = sum(row.right for row in rows), sum(row.count for row in rows)
+    figures = measure_photographs(names, options.count, options.seed)
+    console.print(_table(f"the dish in {options.count} drawn photographs of each class", PHOTOGRAPH, figures["rows"]))
+    right, count = sum(row["right"] for row in figures["rows"]), options.count * len(names)
     make_log(console)(f"{right} of {count} found within {RIGHT:.0%} of the radius")
     return figures, right >= 0.9 * count
 
@@ -92,39 +87,31 @@ POSES = """unkn: heading unknown by its covariance; wrong: tail off by 2 px or h
 by more than the covariance says; px, deg: RMS of the others"""
 PIECES = """line: visible thread that is followed from the tail; pcs: that is on pieces; off: share of pieces where no
 thread is; mis: pieces of a place that is wrong; all: frames said to show all of the thread; free: ends said to be its
-own; not: of these, that are not; dev: RMS of errors over their standard deviation"""
+own; dev: RMS of errors over their standard deviation"""
 
 
-def tables(rows: list[Row]) -> tuple[Table, Table]:
-    """Return the rows as a table of needles and one of threads."""
-    title = f"on rendered frames, {rows[0].frames} of each class"
-    needles = _table(f"the needle {title}", "pose unkn wrong rev >cov px deg ms", POSES)
-    threads = _table(f"the thread {title}", "line pcs off mis all not free not dev", PIECES)
-    for row in rows:
-        needles.add_row(
-            row.name,
-            *map(str, (row.found, row.unknown, row.wrong, row.reversed, row.dishonest)),
-            *(_number(value, ".2f") for value in (row.tail_px, row.angle_deg)),
-            f"{row.median_ms:.1f}",
-        )
-        threads.add_row(
-            row.name,
-            *(_number(value, ".0%") for value in (row.covered, row.pieces)),
-            _number(row.wrong_pieces, ".1%"),
-            *map(str, (row.misplaced, row.complete, row.incomplete, row.free, row.not_free)),
-            _number(row.normalised, ".1f"),
-        )
-    return needles, threads
+# Columns of the tables: what is shown, and how.
+NEEDLE = {
+    **{"pose": ("found", ""), "unkn": ("unknown", ""), "wrong": ("wrong", ""), "rev": ("reversed", "")},
+    **{">cov": ("dishonest", ""), "px": ("tail_px", ".2f"), "deg": ("angle_deg", ".2f"), "ms": ("median_ms", ".1f")},
+}
+THREAD = {
+    **{"line": ("covered", ".0%"), "pcs": ("pieces", ".0%"), "off": ("wrong_pieces", ".1%"), "mis": ("misplaced", "")},
+    **{"all": ("complete", ""), "not all": ("incomplete", ""), "free": ("free", ""), "not free": ("not_free", "")},
+    "dev": ("normalised", ".1f"),
+}
+PHOTOGRAPH = {"found": ("found", ""), "right": ("right", ""), "ms": ("median_ms", ".1f"), "max ms": ("max_ms", ".1f")}
 
 
-def _table(title: str, columns: str, caption: str) -> Table:
-    """Return a table without rows; columns are separated by spaces."""
+def _table(
+    title: str, columns: dict[str, tuple[str, str]], rows: list[dict[str, Any]], caption: str | None = None
+) -> Table:
+    """Return rows of figures as a table."""
     result = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), caption=caption, caption_justify="left")
     result.add_column("class", no_wrap=True)
-    for name in columns.split():
+    for name in columns:
         result.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        shown = [(row[field], form) for field, form in columns.values()]
+        result.add_row(row["name"], *("" if value is None else format(value, form) for value, form in shown))
     return result
-
-
-def _number(value: float | None, form: str) -> str:
-    return "" if value is None else format(value, form)

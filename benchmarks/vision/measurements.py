@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 import zlib
 from collections import Counter
@@ -19,11 +20,8 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.look import Track
-from magnetosuture_thread.vision.session import published_centreline
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
-from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.vision.tracker import Track, VisionTracker, published_centreline, warm_up
 
 WRONG_PX, WRONG_ANGLE = 2.0, math.radians(5.0)  # of the scale worked at: beyond, a pose is wrong
 REVERSED = 0.5 * math.pi
@@ -34,14 +32,25 @@ WRONG_END = 0.6e-3  # m; from the thread's end, beyond which an end claimed free
 
 
 @dataclass(frozen=True)
-class PieceErrors:
-    """How far the pieces of the thread in one frame are from the ground truth.
+class Result:
+    """What the tracker said of one frame.
 
     Attributes:
-        covered: length of the visible thread that lies on a piece [m].
-        length: of all pieces [m].
+        visible: length of the thread that can be seen [m].
+        seconds: of CPU.
+        reason: why there is no pose.
+        found: whether there is a pose.
+        unknown: whether its heading is unknown by its own covariance.
+        tail_px: how far the tail is off, at the scale worked at.
+        angle: how far the heading is off, from 0 to pi [rad].
+        honest: whether both are within the covariance; see `HONEST`.
+        covered: length of the visible thread that the published centreline follows [m].
+        line: length of that centreline [m].
         wrong: of it, where no thread is [m].
-        misplaced: number of those whose interval or direction is wrong.
+        pieces: length of the visible thread that lies on a piece [m].
+        length: of all pieces [m].
+        wrong_pieces: of it, where no thread is [m].
+        misplaced: number of pieces whose interval or direction is wrong.
         complete: whether all of the thread is claimed to be seen.
         incomplete: whether it is not, though claimed.
         free: number of ends that are claimed to be the thread's.
@@ -50,9 +59,20 @@ class PieceErrors:
         points: number of these points, which lie on the thread.
     """
 
+    visible: float
+    seconds: float
+    reason: str = ""
+    found: bool = False
+    unknown: bool = False
+    tail_px: float = 0.0
+    angle: float = 0.0
+    honest: bool = True
     covered: float = 0.0
-    length: float = 0.0
+    line: float = 0.0
     wrong: float = 0.0
+    pieces: float = 0.0
+    length: float = 0.0
+    wrong_pieces: float = 0.0
     misplaced: int = 0
     complete: bool = False
     incomplete: bool = False
@@ -60,39 +80,6 @@ class PieceErrors:
     not_free: int = 0
     normalised: float = 0.0
     points: int = 0
-
-
-@dataclass(frozen=True)
-class Result:
-    """What the tracker said of one frame.
-
-    Attributes:
-        found: whether there is a pose.
-        unknown: whether its heading is unknown by its own covariance.
-        tail_px: how far the tail is off, at the scale worked at.
-        angle: how far the heading is off, from 0 to pi [rad].
-        honest: whether both are within the covariance; see `HONEST`.
-        visible: length of the thread that can be seen [m].
-        covered: of it, followed [m].
-        line: length of the published centreline [m].
-        wrong: of it, where no thread is [m].
-        pieces: what is said of the pieces of the thread; see `PieceErrors`.
-        seconds: of CPU.
-        reason: why there is no pose.
-    """
-
-    found: bool
-    unknown: bool
-    tail_px: float
-    angle: float
-    honest: bool
-    visible: float
-    covered: float
-    line: float
-    wrong: float
-    pieces: PieceErrors
-    seconds: float
-    reason: str
 
     @property
     def is_wrong(self) -> bool:
@@ -184,43 +171,40 @@ def measure(case: Case, image: Image) -> Result:
 
 def compare(case: Case, track: Track, seconds: float) -> Result:
     """Compare what was tracked with the ground truth."""
-    seen = case.visible_thread()
-    visible = _step(seen, case) * len(seen)
+    seen, truth = case.visible_thread(), dense(case.thread)
+    visible = float(arc_lengths(case.thread)[-1]) / len(truth) * len(seen)
     if not len(track.tail):
-        return Result(False, False, 0.0, 0.0, True, visible, 0.0, 0.0, 0.0, PieceErrors(), seconds, track.reason)
+        return Result(visible, seconds, track.reason)
     off = np.append(track.tail - case.needle.tail, 0.0)
     turned = math.atan2(track.heading[1], track.heading[0]) - case.needle.heading
     off[2] = (turned + math.pi) % (2.0 * math.pi) - math.pi
-    distance = float(off @ np.linalg.solve(track.covariance, off))
     bound = max(WRONG_LINE_PX * case.working_scale, 0.5 * case.thread_px * case.view.metres_per_pixel)
     line = published_centreline(track)
     covered = wrong = length = 0.0
     if len(line) > 1:
-        own, truth = dense(line), dense(case.thread)
+        own = dense(line)
         length = float(arc_lengths(line)[-1])
-        wrong = length * float((_nearest(own, truth) > bound).mean())
-        if len(seen):
-            covered = visible * float((_nearest(seen, own) < bound).mean())
+        wrong = length * _share(own, truth, bound, beyond=True)
+        covered = visible * _share(seen, own, bound)
     return Result(
+        visible,
+        seconds,
         found=True,
         unknown=float(track.covariance[2, 2]) > UNKNOWN_ANGLE**2,
         tail_px=float(np.hypot(off[0], off[1])) / case.working_scale,
         angle=abs(float(off[2])),
-        honest=distance < HONEST,
-        visible=visible,
+        honest=float(off @ np.linalg.solve(track.covariance, off)) < HONEST,
         covered=covered,
         line=length,
         wrong=wrong,
-        pieces=compare_pieces(case, track.observation, bound, seen, visible),
-        seconds=seconds,
-        reason="",
+        **compare_pieces(case, track.observation, bound, seen, visible),
     )
 
 
 def compare_pieces(
     case: Case, observation: ThreadObservation, bound: float, seen: Points, visible: float
-) -> PieceErrors:
-    """Compare pieces of the thread with the ground truth.
+) -> dict[str, Any]:
+    """Compare pieces of the thread with the ground truth; return the part of a `Result` on them.
 
     Args:
         case: what the frame shows.
@@ -230,38 +214,32 @@ def compare_pieces(
         visible: its length [m].
     """
     if not observation.pieces:
-        return PieceErrors()
+        return {}
     truth = dense(case.thread)
-    at, total = arc_lengths(truth), float(arc_lengths(case.thread)[-1])
-    tree = KDTree(truth)
+    at, tree = arc_lengths(truth), KDTree(truth)
     lines = [dense(piece.points) for piece in observation.pieces]
-    length = wrong = normalised = 0.0
-    misplaced = free = not_free = points = 0
+    found: dict[str, Any] = {
+        "complete": observation.complete,
+        "pieces": visible * _share(seen, np.vstack(lines), bound),
+    }
+    sums: Counter[str] = Counter()
     for piece, line in zip(observation.pieces, lines, strict=True):
-        length += piece.length
-        wrong += piece.length * float((_nearest(line, truth) > bound).mean())
         off, nearest = (np.asarray(values) for values in tree.query(piece.points))
-        normalised += float((np.square(off / piece.deviation))[off < bound].sum())
-        points += int((off < bound).sum())
-        misplaced += _is_misplaced(piece, at[nearest])
-        for end, point in ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1])):
-            free += end is PieceEnd.FREE
-            not_free += end is PieceEnd.FREE and float(np.hypot(*(point - truth[-1]))) > WRONG_END
+        ends = ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1]))
+        free = [float(np.hypot(*(point - truth[-1]))) for end, point in ends if end is PieceEnd.FREE]
+        sums.update(
+            length=piece.length,
+            wrong_pieces=piece.length * _share(line, truth, bound, beyond=True),
+            normalised=float(np.square(off / piece.deviation)[off < bound].sum()),
+            points=int((off < bound).sum()),
+            misplaced=int(_is_misplaced(piece, at[nearest])),
+            free=len(free),
+            not_free=sum(apart > WRONG_END for apart in free),
+        )
     last = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
-    shown = float((_nearest(truth, lines[0]) < max(bound, WRONG_END)).mean())
-    covered = visible * float((_nearest(seen, np.vstack(lines)) < bound).mean()) if len(seen) else 0.0
-    return PieceErrors(
-        covered=covered,
-        length=length,
-        wrong=wrong,
-        misplaced=misplaced,
-        complete=observation.complete,
-        incomplete=observation.complete and (last > WRONG_END or shown * total < total - WRONG_END),
-        free=free,
-        not_free=not_free,
-        normalised=normalised,
-        points=points,
-    )
+    shown = at[-1] * _share(truth, lines[0], max(bound, WRONG_END))
+    found["incomplete"] = bool(observation.complete and (last > WRONG_END or shown < at[-1] - WRONG_END))
+    return found | sums
 
 
 def _is_misplaced(piece: ThreadPiece, truth: np.ndarray) -> bool:
@@ -279,14 +257,12 @@ def _is_misplaced(piece: ThreadPiece, truth: np.ndarray) -> bool:
     return not piece.arc_length[0] - WRONG_END <= first <= piece.arc_length[1] + WRONG_END
 
 
-def _step(seen: Points, case: Case) -> float:
-    """Return the length that each point of the visible thread stands for [m]."""
-    return float(arc_lengths(case.thread)[-1]) / len(dense(case.thread))
-
-
-def _nearest(points: Points, line: Points) -> np.ndarray:
-    """Return how far each of the points is from a line of points close together [m]."""
-    return np.asarray(KDTree(line).query(points)[0])
+def _share(points: Points, line: Points, bound: float, *, beyond: bool = False) -> float:
+    """Return which share of points lies within a bound of a line of points close together, or beyond it."""
+    if not len(points):
+        return 0.0
+    near = np.asarray(KDTree(line).query(points)[0]) < bound
+    return float(np.mean(~near if beyond else near))
 
 
 def row_of(name: str, results: Iterable[Result]) -> Row:
@@ -294,10 +270,9 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
     every = list(results)
     found = [each for each in every if each.found]
     right = [each for each in found if not each.is_wrong and not each.unknown]
-    visible, line = sum(each.visible for each in every), sum(each.line for each in every)
-    pieces = [each.pieces for each in every]
-    length, points = sum(each.length for each in pieces), sum(each.points for each in pieces)
-    times = [1e3 * each.seconds for each in every]
+    total: Counter[str] = Counter()
+    for each in every:
+        total.update({name: value for name, value in vars(each).items() if name != "reason"})
     return Row(
         name=name,
         frames=len(every),
@@ -308,25 +283,16 @@ def row_of(name: str, results: Iterable[Result]) -> Row:
         dishonest=sum(not each.honest for each in found),
         tail_px=_root_mean_square([each.tail_px for each in right]),
         angle_deg=_root_mean_square([math.degrees(each.angle) for each in right]),
-        covered=sum(each.covered for each in every) / visible if visible else 0.0,
+        covered=total["covered"] / total["visible"] if total["visible"] else 0.0,
         covered_90=float(np.mean([each.covered >= 0.9 * each.visible for each in every])),
-        wrong_line=sum(each.wrong for each in every) / line if line else None,
-        pieces=sum(each.covered for each in pieces) / visible if visible else 0.0,
-        wrong_pieces=sum(each.wrong for each in pieces) / length if length else None,
-        misplaced=sum(each.misplaced for each in pieces),
-        complete=sum(each.complete for each in pieces),
-        incomplete=sum(each.incomplete for each in pieces),
-        free=sum(each.free for each in pieces),
-        not_free=sum(each.not_free for each in pieces),
-        normalised=math.sqrt(sum(each.normalised for each in pieces) / points) if points else None,
-        median_ms=float(np.median(times)),
-        reasons=dict(Counter(_short(each.reason) for each in every if not each.found).most_common()),
+        wrong_line=total["wrong"] / total["line"] if total["line"] else None,
+        pieces=total["pieces"] / total["visible"] if total["visible"] else 0.0,
+        wrong_pieces=total["wrong_pieces"] / total["length"] if total["length"] else None,
+        **{name: total[name] for name in ("misplaced", "complete", "incomplete", "free", "not_free")},
+        normalised=math.sqrt(total["normalised"] / total["points"]) if total["points"] else None,
+        median_ms=1e3 * float(np.median([each.seconds for each in every])),
+        reasons=dict(Counter(re.sub(r"\d", "#", each.reason) for each in every if not each.found).most_common()),
     )
-
-
-def _short(reason: str) -> str:
-    """Return a reason without its numbers, so that it can be counted."""
-    return "".join("#" if character.isdigit() else character for character in reason)
 
 
 def _root_mean_square(values: list[float]) -> float | None:

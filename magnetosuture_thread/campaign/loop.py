@@ -12,18 +12,34 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread import interface
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.messages.packing import (
+    Outputs,
+    camera_outputs,
+    estimate_outputs,
+    ground_truth_outputs,
+    packed_currents,
+    packed_filter_state,
+    packed_twist,
+    pose_outputs,
+    prediction_outputs,
+    thread_outputs,
+)
+from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.planning.executor import ThreadCondition
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.session import TrackerSession
+from magnetosuture_thread.vision.tracker import TrackerSession
 
 Vector = NDArray[np.float64]
 
@@ -31,8 +47,13 @@ START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
 LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
 TAIL_DEVIATION, HEADING_DEVIATION = 1e-5, 5e-3  # m and rad; of a tracked needle, see docs/results.md
 THREAD_DEVIATION, THREAD_CORRELATION = 1e-5, 5e-4  # m; of a tracked centreline, and along it
-THREAD_POINTS = 64
-UNMEASURED = 1.0  # s; without a measurement of the thread an estimate is unsure
+
+RECORDED = (  # what the bag of a run holds, besides frames
+    *(interface.SCENE, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL),
+    *(interface.NEEDLE_POSE, interface.THREAD_OBSERVATION, interface.MEASURED_THREAD),
+    *(interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS),
+    *(interface.NEEDLE_COMMAND, interface.CURRENTS, interface.FILTER_STATE),
+)
 
 Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
 """From stamp [s], tail [m], heading and the thread's condition to the velocity commanded of the tip [m/s]."""
@@ -205,7 +226,7 @@ class ClosedLoop:
     def _observe(self, thread: Points) -> ThreadObservation:
         """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
         length = float(arc_lengths(thread)[-1])
-        at = np.linspace(0.0, length, THREAD_POINTS)
+        at = np.linspace(0.0, length, 64)
         points = points_at(thread, at)
         knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
         noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
@@ -253,7 +274,7 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
     if margins is None:
         problem = result.reason
     estimate = result.estimate
-    if estimate is not None and estimate.unmeasured_for > UNMEASURED:
+    if estimate is not None and estimate.unmeasured_for > 1.0:  # s, after which it is unsure
         problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
     forces = result.prediction.forces if result.prediction is not None else None
     return ThreadCondition(
@@ -263,3 +284,58 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
         margins.friction.slowdown if margins is not None else 1.0,
         problem,
     )
+
+
+class RunBag:
+    """Records a run, as a `LoopRecorder`. Every message is logged at the simulated time at which a node would get it.
+
+    Args:
+        bag: to write to.
+        setup: what the nodes believe.
+        start: time of its begin [s].
+        camera: whether frames are rendered.
+    """
+
+    def __init__(self, bag: BagWriter, setup: Setup, start: float, *, camera: bool) -> None:
+        self._bag, self._rig, self._material = bag, setup.rig, setup.model.material
+        for channel in (*RECORDED, *((interface.COMPRESSED_IMAGE, interface.CAMERA_INFO) if camera else ())):
+            bag.add_topic(channel.recorded, channel.type_name)
+        begin = _nanoseconds(start)
+        bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
+        self._view = setup.rig.view(setup.scene)
+        self._command = 0  # stamp of the last [ns]
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Write a frame, if it was rendered, and the ground truth."""
+        stamp, rig = _nanoseconds(now), self._rig
+        if frame.image is not None:
+            jpeg, size = encode_jpeg(frame.image, rig.jpeg_quality), (rig.camera_width, rig.camera_height)
+            self._write(stamp, camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
+        self._write(stamp, ground_truth_outputs(stamp, frame))
+
+    def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
+        """Write what was measured, predicted and estimated in a frame, and the command that came of it."""
+        time, stamp, observation = _nanoseconds(now), result.stamp, measured.observation
+        self._write(time, pose_outputs(stamp, measured.tail, measured.heading, measured.covariance))
+        if observation is not None:
+            self._write(time, thread_outputs(stamp, observation, observation.from_tail))
+        self._write(time, prediction_outputs(result, self._material))
+        self._write(time, estimate_outputs(result))
+        self._bag.write(interface.NEEDLE_COMMAND.recorded, time, packed_twist(time, commanded))
+        self._command = time
+
+    def on_bridge(self, now: float, output: BridgeOutput) -> None:
+        """Write currents and what became of the command, from the first command on."""
+        time = _nanoseconds(now)
+        if not (output.publish and self._command):
+            return
+        self._bag.write(interface.CURRENTS.recorded, time, packed_currents(time, self._command, output))
+        self._bag.write(interface.FILTER_STATE.recorded, time, packed_filter_state(self._command, output))
+
+    def _write(self, time: int, outputs: Outputs) -> None:
+        for channel, data in outputs:
+            self._bag.write(channel.recorded, time, data)
+
+
+def _nanoseconds(time: float) -> int:
+    return round(1e9 * time)

@@ -38,13 +38,6 @@ KEEP_OUT_TOLERANCE = 5e-6  # m
 PENETRATION_TOLERANCE = 1e-6  # m
 MAX_REST = 3.0  # s
 MAX_TIME_RATIO = 1.5
-REST_WAY = 5e-5  # m; of the tip, that a needle covers if it does not rest
-LAST_TIME, LAST_INSTANTS = 4.0, 6  # s that the last instants of a failed run cover, and how many they are
-# What a seed varies: shares, or m and rad.
-START_OFFSET, START_TURN = 1e-3, 0.15
-CURVATURE, VISCOSITY, STIFFNESS, COILS, LOST_FRAMES = 0.3, 0.3, 0.5, 0.05, 0.05
-MAX_FRICTION = 0.3
-MAX_DRAWS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +54,7 @@ class Variation:
     seed: int
     setup: Setup
     coil_gains: NDArray[np.float64]
-    losses: float = LOST_FRAMES
+    losses: float = 0.05
 
 
 def vary(setup: Setup, seed: int) -> Variation:
@@ -80,26 +73,26 @@ def vary(setup: Setup, seed: int) -> Variation:
     def factor(share: float) -> float:
         return float(1.0 + share * random.uniform(-1.0, 1.0))
 
-    liquid = factor(VISCOSITY)
+    liquid = factor(0.3)
     changed = replace(
         rig,
         seed=seed,
         viscosity=rig.viscosity * liquid,
         thread_drag_across=rig.thread_drag_across * liquid,
         thread_drag_along=rig.thread_drag_along * liquid,
-        thread_bending_stiffness=rig.thread_bending_stiffness * factor(STIFFNESS),
-        thread_friction=float(random.uniform(0.0, MAX_FRICTION)),
+        thread_bending_stiffness=rig.thread_bending_stiffness * factor(0.5),
+        thread_friction=float(random.uniform(0.0, 0.3)),
     )
-    gains = 1.0 + COILS * random.uniform(-1.0, 1.0, len(rig.coil_angles))
+    gains = 1.0 + 0.05 * random.uniform(-1.0, 1.0, len(rig.coil_angles))
     x, y, heading = rig.needle_start
-    for _ in range(MAX_DRAWS):
-        dx, dy = START_OFFSET * random.uniform(-1.0, 1.0, 2)
+    for _ in range(100):
+        dx, dy = 1e-3 * random.uniform(-1.0, 1.0, 2)
         start = (
             x + float(dx),
             y + float(dy),
-            math.remainder(heading + START_TURN * random.uniform(-1.0, 1.0), math.tau),
+            math.remainder(heading + 0.15 * random.uniform(-1.0, 1.0), math.tau),
         )
-        curvature = rig.thread_start_curvature * factor(CURVATURE)
+        curvature = rig.thread_start_curvature * factor(0.3)
         drawn = replace(changed, needle_start=start, thread_start_curvature=curvature)
         try:
             drawn.check_scene(scene)
@@ -245,16 +238,16 @@ class RunExtremes:
         # Not wrapped at a half turn, over which noise would be a turn of the needle.
         self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
         at = (frame.time, float(middle[0]), float(middle[1]), self._planner.lever * self._angle)
-        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > REST_WAY:
+        if not running or self._anchor is None or math.dist(at[1:], self._anchor[1:]) > 5e-5:  # m: it does not rest
             self._anchor = at
         found.longest_rest_s = max(found.longest_rest_s, frame.time - self._anchor[0])
         self._last.append(instant)
-        while self._last[0].frame.time < frame.time - LAST_TIME:
+        while self._last[0].frame.time < frame.time - 4.0:
             self._last.popleft()
 
     def last_instants(self) -> tuple[RunInstant, ...]:
         """Return instants of the last seconds, evenly spaced, the last frame among them."""
-        count = min(LAST_INSTANTS, len(self._last))
+        count = min(6, len(self._last))
         return tuple(self._last[round(index)] for index in np.linspace(0, len(self._last) - 1, count))
 
     def _distance(self, points: Points) -> float:

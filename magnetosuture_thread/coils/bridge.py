@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.inputs import (
     CONSISTENT_POSES,
     TOPIC,
@@ -35,9 +35,6 @@ OPERATOR, NEEDLE = "operator", "needle"
 INPUTS = {OPERATOR: "operator/servo_cv", NEEDLE: "needle/servo_cv"}  # topics, by priority
 
 LOOKAHEAD_PERIODS = 2.0  # in which command and pose must stay valid: one to the next step, one to the boards
-MAX_STEP_PERIODS = 2.0  # over which velocity and currents may change in one step, however late it is
-RETRY_DELAY = 0.1  # s until a blocked command is tried again
-NO_CURRENT = 1e-4  # A; with less in each coil the needle is at rest, which needs a reason
 NO_SCENE, NO_POSE = "no scene", "no needle pose"
 NO_PREDICTION, CURRENT_LIMIT = "no prediction", "current"  # constraints of the bridge, besides those of the filter
 
@@ -278,7 +275,8 @@ class CoilBridge:
         self._last_step, self._was_armed = arrival, self.latch.armed
         if interval > self._hold:
             self._clear()  # the driver has gone to zero by itself
-        elapsed = min(max(interval, 0.0), MAX_STEP_PERIODS * period)
+        # However late a step is, velocity and currents change by at most that of two periods.
+        elapsed = min(max(interval, 0.0), 2.0 * period)
         # An input that becomes stale before the next step has reached the boards is stale now.
         then = (now + LOOKAHEAD_PERIODS * period, arrival + LOOKAHEAD_PERIODS * period)
         selected = self._select_input(*then)
@@ -329,7 +327,8 @@ class CoilBridge:
         drift = own_drift + measured.drift
         is_stuck = math.hypot(*expected) <= STUCK * math.hypot(*filtered.filtered)
         # A needle that is pulled is held by currents where it may not go on.
-        if (is_stuck and not compensates) or np.abs(allocation.currents).max() < NO_CURRENT:
+        # With less than 0.1 mA in each coil the needle is at rest, which needs a reason.
+        if (is_stuck and not compensates) or np.abs(allocation.currents).max() < 1e-4:
             names = [name for name in active if name in (limiting, CURRENT_LIMIT)] or list(active) or [CURRENT_LIMIT]
             self._blocked, self._blocked_reason = arrival, f"{rest_reason(names)}: no feasible currents"
             return self._zero_output(now, arrival, selected, (self._blocked_reason,), active, filtered.slowdown)
@@ -383,7 +382,8 @@ class CoilBridge:
             selected.problem,
             self.extrapolator.stale_reason(*then),
             no_prediction if self._settings.without_prediction == "stop" else "",
-            self._blocked_reason if arrival - self._blocked < RETRY_DELAY else "",
+            # A blocked command is tried again after 0.1 s.
+            self._blocked_reason if arrival - self._blocked < 0.1 else "",
         )
         return tuple(reason for reason in reasons if reason)
 

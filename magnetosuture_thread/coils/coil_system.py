@@ -17,7 +17,6 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 
-MAX_INTERVALS = 2000  # that the statistics of the loop are over
 UNCONFIGURED, FINALIZED = "unconfigured", "finalized"
 UNCLEAN_END = "the bridge ended while armed or in fault, and not in order"
 
@@ -32,7 +31,8 @@ class LoopTiming:
     def __init__(self, period: float) -> None:
         self._period = period
         self._last: float | None = None
-        self._deviations: deque[float] = deque(maxlen=MAX_INTERVALS)
+        # The statistics are over the last 2000 intervals.
+        self._deviations: deque[float] = deque(maxlen=2000)
 
     def tick(self, arrival: float) -> None:
         """Register one run of the loop at a monotonic time [s]."""

@@ -135,7 +135,9 @@ def loop_fields(along: Vector, aside: Vector, distance: Vector, radius: Vector, 
 
 
 @compiled
-def fields_per_current(x: float, y: float, axes: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def fields_per_current(
+    x: float, y: float, axes: NDArray[np.float64], numbers: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the field at a point for one ampere in each coil, shape (2, m).
 
     Args:

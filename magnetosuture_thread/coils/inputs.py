@@ -20,7 +20,6 @@ Vector = NDArray[np.float64]
 
 CLOCK_TOLERANCE = 0.05  # s; clocks of two machines may differ by this much
 SILENCE_TIMEOUT = 0.5  # s; a publisher without a message for this long is gone
-MAX_GAP = 100  # consecutive messages that may get lost
 AGE_WINDOW = 5.0  # s
 SCENE_GRACE_PERIOD = 0.5  # s for which model and bridge may be on different versions of the scene during a change
 BodyVelocity = tuple[float, float, float]
@@ -28,7 +27,6 @@ BodyVelocity = tuple[float, float, float]
 ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
-SIGMA_COUNT = 3.0
 MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
 
 
@@ -81,18 +79,13 @@ class StampAges:
         while entries and entries[-1][1] >= age:  # later and less: those before will not be the minimum again
             entries.pop()
         entries.append((arrival, age))
-        self._drop_old(entries, arrival)
 
     def minimum(self, arrival: float) -> dict[str, float]:
         """Return the minimum age of each topic with a message in the last `AGE_WINDOW` before a monotonic time [s]."""
         for entries in self._ages.values():
-            self._drop_old(entries, arrival)
+            while entries and arrival - entries[0][0] > AGE_WINDOW:
+                entries.popleft()
         return {topic: entries[0][1] for topic, entries in self._ages.items() if entries}
-
-    @staticmethod
-    def _drop_old(entries: deque[tuple[float, float]], arrival: float) -> None:
-        while entries and arrival - entries[0][0] > AGE_WINDOW:
-            entries.popleft()
 
 
 class PublisherCounter:
@@ -114,7 +107,8 @@ class PublisherCounter:
             arrival: a monotonic time [s].
         """
         self._drop_silent(arrival)
-        before = [publisher for publisher in self._publishers if 0 < number - publisher[0] <= MAX_GAP]
+        # Up to 99 messages in a row may get lost.
+        before = [publisher for publisher in self._publishers if 0 < number - publisher[0] <= 100]
         if before:
             self._publishers.remove(max(before))
         self._publishers.append((number, arrival))
@@ -497,7 +491,7 @@ class PoseExtrapolator:
         if covariance is None or not np.isfinite(covariance).all():
             return 0.0
         square = covariance[0, 0] + covariance[1, 1] + self._needle.chord**2 * covariance[2, 2]
-        return min(MAX_POSE_UNCERTAINTY, SIGMA_COUNT * math.sqrt(max(0.0, square)))
+        return min(MAX_POSE_UNCERTAINTY, 3.0 * math.sqrt(max(0.0, square)))
 
     def _check_stall(self, arrival: float) -> None:
         """Drop the pose after a stall longer than the coils certainly hold their currents."""

@@ -19,7 +19,6 @@ from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
-REACH_RATIO = 0.9  # of the reach to the coils' distance
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}
 MAX_MOBILITY_RATIO = 2.0  # of a needle to that by its model, for a motion observer that is stable with late poses
@@ -174,7 +173,8 @@ class CoilBridgeSettings(Configuration):
     @property
     def reach(self) -> float:
         """Maximum distance of the needle from the dish's centre, inside the coils [m]."""
-        return REACH_RATIO * min(coil.distance for coil in self.coils_properties())
+        # The coils begin at 0.9 of the nearest one's distance.
+        return 0.9 * min(coil.distance for coil in self.coils_properties())
 
     def needle(self) -> NeedleMechanics:
         """Return the needle's mechanics.
@@ -259,8 +259,7 @@ class CoilBridgeSettings(Configuration):
         """Reject too few coils, a coiled needle, and limits that cannot be kept."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
         if len(self.coil_angles) < 3:
-            name = f"{self.GROUP}.coil_angles"
-            raise ConfigurationError(name, list(self.coil_angles), "at least 3 coils' angles [rad]")
+            raise self.refused("coil_angles", "at least 3 coils' angles [rad]")
         if self._calibration is not None:
             count, known = len(self._calibration.coils), len(self.coil_angles)
             if count != known:

@@ -31,11 +31,11 @@ from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
-from magnetosuture_thread.thread.formulations import RodFormulation
+from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.rod_step import STRAIN_TOLERANCE, RodProperties, segment_rows
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, program_of
+from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, RodFormulation, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
-from magnetosuture_thread.thread.step_buffers import CONTACTS_PER_NODE, StepBuffers, program_of
 
 Vector = NDArray[np.float64]
 

@@ -15,11 +15,10 @@ from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceT
 from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
 from magnetosuture_thread.estimator.stiffness import LearnedState, SlowParameter
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.formulations import ThreadState
 from magnetosuture_thread.thread.margins import SOLID, Margins
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
-from magnetosuture_thread.thread.step import WarmStart
+from magnetosuture_thread.thread.step import ThreadState, WarmStart
 
 Vector = NDArray[np.float64]
 

@@ -37,10 +37,11 @@ from magnetosuture_thread.estimator.noise import (
 )
 from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.thread.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread.rod import RodFormulation
+from magnetosuture_thread.thread.step import ThreadState
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]

@@ -40,10 +40,11 @@ import numpy as np
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.estimator.correction import Corrector
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.formulations import RodFormulation, ThreadState
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread.rod import RodFormulation
+from magnetosuture_thread.thread.step import ThreadState
 
 AUTOMATIC, STIFFNESS_OVER_DRAG = "auto", "stiffness_over_drag"
 NORMAL_95 = 1.959963984540054

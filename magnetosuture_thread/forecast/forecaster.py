@@ -1,10 +1,11 @@
-"""The forecaster: rolls needle, safety filter and thread out over a horizon."""
+"""The forecaster: rolls needle, safety filter and thread out over a horizon; where it starts, and its result."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.forecast.forecast import WALL_NAME, Forecast, ForecastStart
+from magnetosuture_thread.estimator import ThreadEstimate
 from magnetosuture_thread.forecast.rollout import (
     KINDS,
-    DragData,
+    NEEDLE_MARGIN,
+    NO_CONTACT,
+    OBSTACLE_MARGIN,
     FrictionData,
     RolloutBuffers,
     RolloutModel,
@@ -28,71 +31,233 @@ from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.thread.formulations import RodFormulation
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import MAX_STEP_LENGTH, ThreadPredictor
-from magnetosuture_thread.thread.rod_step import ENDED, NO_ROOM
+from magnetosuture_thread.thread.program import ContactBuffers
+from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
-from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
+from magnetosuture_thread.thread.step import WarmStart
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
-Controller = Callable[[float, Vector, Vector], Vector]
-"""Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
-
+WALL_NAME = "wall"
 MAX_HORIZON = 60.0  # s
 MAX_STEPS = 20_000
 
 
-@checked_arguments("needle drag")
-@dataclass(frozen=True)
-class NeedleDrag:
-    """The needle's drag, by which the thread's pull moves it.
-
-    Coils allocated for a velocity v of the tip give the needle a force along its chord and a torque. With the force F
-    of the thread at its tail, the unit vector e from tail to tip, n to its left, and the chord l, the needle moves with
-
-        u = (along v . e + F . e) / (along - thread),    w = F . n / across
-        omega = (v . n) / (l / 2) - (l / 2) (F . n) / turning
-
-    where `along` has, as that of the coil bridge, the drag `thread` of a straight thread behind the needle: with that
-    thread u = v . e. Source: none; force and torque balance without inertia. Deviation: the moment of a clamped thread
-    is left out; and the pull moves the needle no faster than the filtered velocity times the share of the commanded one
-    that this is, as a needle that the barriers hold back leans on what they keep it from.
+@checked_arguments("forecast start", InvalidInputError)
+@dataclass(frozen=True, eq=False)
+class ForecastStart:
+    """Needle and thread at the start of a forecast.
 
     Attributes:
-        along: drag along the needle, that of a straight thread included [N s/m].
-        across: drag across it [N s/m].
-        turning: torque at 1 rad/s [N m s].
-        thread: part of `along` that the thread adds; None for all of its drag along itself [N s/m].
-
-    Raises:
-        ConfigurationError: a number is not positive, or the thread's part is not less than the whole.
+        pose: of the needle's tail.
+        vertices: of the thread, shape (n + 1, 2) [m].
+        velocities: of the thread's nodes over the last step, shape (n + 1, 2) [m/s]; None for a thread at rest.
+        interval: duration of that step; 0 if there was none [s].
+        tip_velocity: filtered velocity of the tip before the start, shape (2,) [m/s], from which the acceleration is
+            limited; None if it is not known, and then the first change is not limited.
+        needle_force: of the thread upon the needle, shape (2,) [N]; None if it is not known.
+        warm_start: of the formulation, which brings friction that holds already; None for none.
+        thread: with the stiffness, rest curvature and drag to forecast with; None for the forecaster's own.
     """
 
-    along: Annotated[float, bounded("N s/m", 1e-15)]
-    across: Annotated[float, bounded("N s/m", 1e-15)]
-    turning: Annotated[float, bounded("N m s", 1e-20)]
-    thread: float | None = None
+    pose: NeedlePose
+    vertices: Points
+    velocities: Points | None = None
+    interval: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0
+    tip_velocity: Vector | None = None
+    warm_start: WarmStart | None = None
+    needle_force: Vector | None = None
+    thread: Thread | None = None
 
-    def data(self, thread: Thread, learned: Thread | None = None) -> DragData:
-        """Return it for compiled code.
+    @classmethod
+    def of_estimate(
+        cls, estimate: ThreadEstimate, pose: NeedlePose, tip_velocity: Vector | None = None
+    ) -> ForecastStart:
+        """Return the start from an estimate, with what the estimator has learned of the thread.
 
         Args:
-            thread: with which `along` was measured.
-            learned: that is driven, as the estimator has learned it; None for the same.
+            estimate: of the thread.
+            pose: of the needle's tail.
+            tip_velocity: see the attributes.
+        """
+        forces = estimate.prediction.forces
+        needle_force = None if forces is None else forces.needle_force
+        positions = estimate.positions
+        return cls(pose, positions, tip_velocity=tip_velocity, needle_force=needle_force, thread=estimate.thread)
+
+    @classmethod
+    def of_predictor(
+        cls,
+        predictor: ThreadPredictor,
+        pose: NeedlePose | None = None,
+        tip_velocity: Vector | None = None,
+        needle_force: Vector | None = None,
+    ) -> ForecastStart:
+        """Return the start from where a predictor is.
+
+        Args:
+            predictor: that has started.
+            pose: of the needle's tail, where the thread is not fixed to that.
+            tip_velocity: see the attributes.
+            needle_force: see the attributes.
 
         Raises:
-            ConfigurationError: the thread's part is not less than the whole.
+            InvalidInputError: it has not started.
         """
-        part = thread.medium.drag_along * thread.length if self.thread is None else self.thread
-        if not 0.0 <= part < self.along:
-            raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
-        driven = learned or thread
-        whole = driven.medium.drag_across * driven.length
-        return DragData(self.along, self.along - part, self.across, self.turning, whole)
+        if predictor.state is None or predictor.pose is None:
+            raise InvalidInputError("predictor", "one before its start", "one that has started")
+        state = predictor.state
+        warm_start = predictor.formulation.warm_start() if state.interval > 0.0 else None
+        own = predictor.pose if pose is None else pose
+        return cls(own, state.positions, state.velocities, state.interval, tip_velocity, warm_start, needle_force)
+
+
+@dataclass(frozen=True)
+class ForecastMargin:
+    """The least margin of one kind over a forecast.
+
+    Attributes:
+        value: a distance [m], inf where nothing comes near: the clearance of the thread's surface from shapes or wall,
+            that of nodes and half segments as in `Margins`;
+            a segment's length that is left until it is taut, or until it is pressed together; the distance of the
+            needle's axis from shapes and wall, less `keep_out`.
+        time: since the start of the forecast [s].
+        node: of the thread, 0 for the needle.
+        shape: name of the shape, "wall", or empty.
+    """
+
+    value: float
+    time: float
+    node: int
+    shape: str
+
+
+@dataclass(frozen=True)
+class ForecastContact:
+    """When the thread first touches something.
+
+    Attributes:
+        time: since the start of the forecast, 0 where it touches already [s].
+        node: of the thread that touches, or the first of a segment's two.
+        shape: name of the shape, or "wall".
+    """
+
+    time: float
+    node: int
+    shape: str
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Needle and thread over a horizon of k steps, at k + 1 instants; fewer where a step has no solution.
+
+    Attributes:
+        stamp: of the needle's pose at the start [s].
+        times: since then, shape (k + 1,) [s].
+        vertices: of the thread, shape (k + 1, n + 1, 2) [m].
+        tails: of the needle, shape (k + 1, 2) [m].
+        headings: of the needle at its tail, unit vectors, shape (k + 1, 2).
+        commanded: velocity of the tip in each step, shape (k, 2) [m/s].
+        filtered: what the thread's friction and the safety filter leave of it, shape (k, 2) [m/s].
+        slowdown: by the thread's friction in each step, shape (k,).
+        margins: least margin of each kind at each instant, shape (k + 1,) [m], by "obstacle", "wall", "connectivity",
+            "compression" and "needle"; see `ForecastMargin`.
+        friction: nodes under friction at each instant, shape (k + 1, n + 1); see `FrictionLaw`.
+        tension: greatest of all segments at each instant, 0 at the first, shape (k + 1,) [N].
+        needle_force: of the thread upon the needle, 0 at the first instant, shape (k + 1, 2) [N].
+        converged: whether every step ended where the barriers themselves hold.
+        problem: why the forecast ends before its horizon; empty if it does not.
+        shapes: names of the scene's shapes, then "wall".
+        scene_version: of the scene; empty where there is none.
+        record: of compiled code, of at least as many steps.
+    """
+
+    stamp: float
+    times: NDArray[np.float64]
+    vertices: NDArray[np.float64]
+    tails: Points
+    headings: Points
+    commanded: Points
+    filtered: Points
+    slowdown: NDArray[np.float64]
+    margins: dict[str, NDArray[np.float64]]
+    friction: NDArray[np.bool_]
+    tension: NDArray[np.float64]
+    needle_force: Points
+    converged: bool
+    problem: str
+    shapes: tuple[str, ...]
+    scene_version: str
+    record: RolloutRecord = field(repr=False)
+
+    @property
+    def horizon(self) -> float:
+        """Time that is covered [s]."""
+        return float(self.times[-1])
+
+    @cached_property
+    def minima(self) -> dict[str, ForecastMargin]:
+        """The least margin of each kind over the horizon, by the kind's name."""
+        return {name: self._minimum(kind, name) for kind, name in enumerate(KINDS)}
+
+    def _minimum(self, kind: int, name: str) -> ForecastMargin:
+        at = int(self.margins[name].argmin())
+        value, shape = float(self.margins[name][at]), int(self.record.shape[at, kind])
+        named = np.isfinite(value) and (kind in (OBSTACLE_MARGIN, NEEDLE_MARGIN) or name == WALL_NAME)
+        return ForecastMargin(
+            value, float(self.times[at]), int(self.record.node[at, kind]), self.shapes[shape] if named else ""
+        )
+
+    @cached_property
+    def friction_nodes(self) -> tuple[int, ...]:
+        """Nodes that are under friction at any time, rising."""
+        return tuple(np.flatnonzero(self.friction.any(axis=0)).tolist())
+
+    @cached_property
+    def first_friction(self) -> float | None:
+        """When the first node is under friction [s]; None if none is."""
+        found = np.flatnonzero(self.friction.any(axis=1))
+        return float(self.times[found[0]]) if len(found) else None
+
+    @property
+    def peak_tension(self) -> float:
+        """The greatest tension of all segments and instants [N]."""
+        return float(self.tension.max())
+
+    @property
+    def peak_needle_force(self) -> float:
+        """The greatest pull of the thread upon the needle [N]."""
+        return float(np.hypot(self.needle_force[:, 0], self.needle_force[:, 1]).max())
+
+    @cached_property
+    def first_contact(self) -> ForecastContact | None:
+        """When the thread first touches a shape or the wall, and which; None if it does not."""
+        contact = self.record.contact[: len(self.times)]
+        found = np.flatnonzero(contact[:, 0] != NO_CONTACT)
+        if not len(found):
+            return None
+        at = int(found[0])
+        return ForecastContact(float(self.times[at]), int(contact[at, 1]), self.shapes[int(contact[at, 0])])
+
+    @cached_property
+    def rest_time(self) -> float | None:
+        """When the needle comes to rest, to stay so until the end although it is commanded to move [s]; else None."""
+        rests = (self.filtered == 0.0).all(axis=1) & (self.commanded != 0.0).any(axis=1)
+        moves = np.flatnonzero(~rests)
+        first = int(moves[-1]) + 1 if len(moves) else 0
+        return float(self.times[first]) if first < len(rests) else None
+
+    @property
+    def stopped_by(self) -> tuple[str, ...]:
+        """Names of the shapes, and "wall", at which it comes to rest; empty if it does not."""
+        if self.rest_time is None:
+            return ()
+        touched = self.record.touched[len(self.filtered) - 1]
+        return tuple(name for name, active in zip(self.shapes, touched.tolist(), strict=True) if active)
 
 
 class ThreadForecaster:
@@ -103,11 +268,12 @@ class ThreadForecaster:
         forecast.first_contact, forecast.minima["obstacle"].value, forecast.rest_time
 
     A step is what the loop does in one of its periods: the commanded velocity is slowed by the thread's friction and
-    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity, exactly unless its
-    drag is given, and the thread follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor`
-    divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand,
-    but for rounding; it is compiled from end to end. Where the structured solver does not get on with a step, the
-    forecast ends there and says so, as no general solver is tried. Several threads may forecast at once.
+    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity exactly, as a bridge
+    with `motion_compensation` moves it, and the thread follows the needle by one step of the formulation `rod`, divided
+    as `ThreadPredictor` divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and
+    `ThreadPredictor` by hand, but for rounding; it is compiled from end to end. Where the structured solver does not
+    get on with a step, the forecast ends there and says so, as no general solver is tried. Several threads may forecast
+    at once.
 
     Args:
         thread: the thread.
@@ -116,8 +282,6 @@ class ThreadForecaster:
         law: the friction law that slows the needle; None for none.
         friction_averaging: time over which the nodes' speeds are averaged for it [s].
         attachment_offset: where the thread is fixed, along the heading and to its left of the needle's tail [m].
-        drag: of the needle, by which the thread's pull moves it; None for one that follows the filtered velocity
-            exactly.
         step: duration of a step [s].
         fixed_nodes: nodes that stay where they are.
         options: by name, see `PredictorOptions`; `margin_range` is 2 mm by default.
@@ -141,7 +305,6 @@ class ThreadForecaster:
         law: FrictionLaw | None = None,
         friction_averaging: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0,
         attachment_offset: Annotated[Sequence[float], bounded("m", -0.1, 0.1, multiple=2)] = (),
-        drag: NeedleDrag | None = None,
         step: Annotated[float, bounded("s", 1e-4, 1.0)] = 1.0 / 66.0,
         fixed_nodes: Sequence[int] = (),
         **options: object,
@@ -160,7 +323,7 @@ class ThreadForecaster:
                 raise ConfigurationError("margin_range", chosen.margin_range, expected)
             friction = FrictionData(law.threshold, law.beta, law.stuck_speed, float(friction_averaging))
         self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
-        self._formulation, self._drag = formulation, drag
+        self._formulation = formulation
         reach = chosen.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
         self._model = RolloutModel(
             step=formulation.step_model(),
@@ -173,20 +336,14 @@ class ThreadForecaster:
             max_substeps=int(chosen.max_substeps),
             contact_tolerance=float(chosen.contact_tolerance),
             friction=friction,
-            drag=DragData() if drag is None else drag.data(thread),
         )
         self._names = (*scene.names, WALL_NAME)
 
     def warm_up(self) -> None:
-        """Load the compiled code by a forecast of one step, wherever in the dish the needle has room."""
-        east, chord = np.array([1.0, 0.0]), self.safety.kinematics.chord
-        for radius in np.linspace(0.0, 0.9, 10) * self.scene.dish.radius:
-            for angle in np.linspace(0.0, 2.0 * math.pi, 12, endpoint=False):
-                tail = radius * np.array([math.cos(angle), math.sin(angle)]) - [0.5 * chord, 0.0]
-                if self.safety.clearance(tail, east) <= 0.0:
-                    continue
-                self.forecast(self.straight(NeedlePose(0.0, tail, east)), np.zeros(2), self.step)
-                return
+        """Load the compiled code, by a forecast of one step in the bare dish."""
+        bare = ThreadForecaster(self.thread, Scene(self.scene.dish), step=self.step)
+        middle = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
+        bare.forecast(bare.straight(middle), np.zeros(2), self.step)
 
     def straight(self, pose: NeedlePose) -> ForecastStart:
         """Return the start of a thread at rest, straight behind the needle, and along the wall where that is near."""
@@ -196,14 +353,13 @@ class ThreadForecaster:
         return ForecastStart(pose, chain_inside(path, self.thread.segments, self.thread.segment_length, radius))
 
     def forecast(
-        self, start: ForecastStart, commands: Vector | Controller, horizon: float = 3.0, *, slowed: bool = True
+        self, start: ForecastStart, commands: Vector, horizon: float = 3.0, *, slowed: bool = True
     ) -> Forecast:
         """Return what happens from a start under a command.
 
         Args:
             start: of needle and thread.
-            commands: velocity of the tip [m/s]: one that is held, shape (2,), one for each step, shape (k, 2), or a
-                function of time, tail and heading that is asked before every step, as a path follower.
+            commands: velocity of the tip [m/s]: one that is held, shape (2,), or one for each step, shape (k, 2).
             horizon: a whole number of steps to the nearest [s].
             slowed: whether the friction law slows the commands; see `friction_feedback` of the coil bridge.
 
@@ -213,18 +369,13 @@ class ThreadForecaster:
         """
         steps = self._steps(horizon)
         self._check_start(start)
-        sequence = np.zeros((steps, 2)) if callable(commands) else self._sequence(commands, steps)
+        sequence = self._sequence(commands, steps)
         nodes, state = self.thread.segments + 1, self._begin(start)
         model, buffers = self._model_of(start, slowed), self._buffers(start)
         record = RolloutRecord.of(steps, nodes, len(self.scene.shapes))
         if start.needle_force is not None:
             record.pull[0] = start.needle_force
-        code, done, asked = ENDED, 0, 1 if callable(commands) else steps
-        while code == ENDED and done < steps:
-            if callable(commands):
-                velocity = commands(done * self.step, state.pose[:2].copy(), state.pose[2:].copy())
-                sequence[done] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
-            code, done = roll_out(model, buffers, state, sequence, self.step, done, done + asked, record)
+        code, done = roll_out(model, buffers, state, sequence, self.step, record)
         problem, instants = "", done + 1
         if code == NO_ROOM:
             problem = f"more than {len(buffers.contacts.node)} contacts at once at {done * self.step:.3f} s"
@@ -257,15 +408,13 @@ class ThreadForecaster:
             model = model._replace(friction=model.friction._replace(beta=1.0))
         if thread is None or thread is self.thread:
             return model
-        model = model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
-        return model if self._drag is None else model._replace(drag=self._drag.data(self.thread, thread))
+        return model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
 
     def _begin(self, start: ForecastStart) -> RolloutState:
         """Return the state at the start."""
         vertices = np.array(start.vertices, np.float64, order="C")
         velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
         heading = np.asarray(start.pose.heading, np.float64)
-        pulled = self._drag is not None and start.needle_force is not None
         x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
         return RolloutState(
             vertices,
@@ -273,18 +422,17 @@ class ThreadForecaster:
             np.zeros_like(vertices),
             np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)]),
             np.array([x, y, start.interval]),
-            np.full(3, math.nan if pulled else 0.0),  # what is no number is worked out from the force
         )
 
     def _buffers(self, start: ForecastStart) -> RolloutBuffers:
         """Return buffers as the step before the start left them."""
         segments, prescribed = self.thread.segments, len(self._model.prescribed)
-        step = StepBuffers.of(segments + 1, 2, segments)
+        step = self._formulation.new_buffers()
         if start.warm_start is not None and start.interval > 0.0:
             step.restore(start.warm_start)
         return RolloutBuffers(
             step=step,
-            solver=BandedSolver().buffers(segments + 1, 2, len(step.first)),
+            solver=BandedSolver().buffers(segments + 1, 2, len(step.program.first)),
             contacts=ContactBuffers.of(segments + 1, 2, len(self.scene.shapes)),
             ends=np.zeros((3, prescribed, 2)),
             pose=np.zeros(6),

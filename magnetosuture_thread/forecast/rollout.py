@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted_without_gil
+from magnetosuture_thread.compiled import compiled, compiled_uncounted, compiled_uncounted_without_gil
 from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
@@ -22,8 +22,17 @@ from magnetosuture_thread.safety.motion import (
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.banded import SolverBuffers
 from magnetosuture_thread.thread.forces import write_forces
-from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
-from magnetosuture_thread.thread.rod_step import (
+from magnetosuture_thread.thread.program import (
+    ABOUT,
+    BEFORE,
+    ContactBuffers,
+    Indices,
+    Mask,
+    RodBuffers,
+    Table,
+    Vector,
+)
+from magnetosuture_thread.thread.rod import (
     ENDED,
     NO_ROOM,
     StepInput,
@@ -31,7 +40,6 @@ from magnetosuture_thread.thread.rod_step import (
     copy_points,
     solve_step,
 )
-from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins that are recorded."""
@@ -51,24 +59,6 @@ class FrictionData(NamedTuple):
     averaging: float = 0.0
 
 
-class DragData(NamedTuple):
-    """The drag of the needle, see `NeedleDrag`; zeros where it follows the filtered velocity exactly.
-
-    Attributes:
-        along: with the thread's [N s/m].
-        bare: without it [N s/m].
-        across: [N s/m].
-        turning: [N m s].
-        whole: of the whole thread broadside [N s/m].
-    """
-
-    along: float = 0.0
-    bare: float = 0.0
-    across: float = 0.0
-    turning: float = 0.0
-    whole: float = 0.0
-
-
 class RolloutModel(NamedTuple):
     """What stays the same from step to step.
 
@@ -83,7 +73,6 @@ class RolloutModel(NamedTuple):
         max_substeps: into which an interval is divided at the most.
         contact_tolerance: the thread touches a shape or the wall to which it is this close [m].
         friction: the law that slows the needle.
-        drag: of the needle.
     """
 
     step: StepModel
@@ -96,7 +85,6 @@ class RolloutModel(NamedTuple):
     max_substeps: int
     contact_tolerance: float
     friction: FrictionData
-    drag: DragData
 
 
 class RolloutState(NamedTuple):
@@ -109,7 +97,6 @@ class RolloutState(NamedTuple):
         pose: the needle's tail [m] and heading, shape (4,).
         last: velocity of the tip over the last step [m/s], and duration of the thread's last step, 0 for none [s],
             shape (3,).
-        added: motion that the thread's pull adds to the needle's; see `moved_needle`, shape (3,).
     """
 
     positions: Points
@@ -117,7 +104,6 @@ class RolloutState(NamedTuple):
     averaged: Points
     pose: Vector
     last: Vector
-    added: Vector
 
 
 class RolloutBuffers(NamedTuple):
@@ -133,7 +119,7 @@ class RolloutBuffers(NamedTuple):
         close: number of shapes that each node is close to, shape (n + 1,).
     """
 
-    step: StepBuffers
+    step: RodBuffers
     solver: SolverBuffers
     contacts: ContactBuffers
     ends: Table
@@ -196,7 +182,7 @@ class RolloutRecord(NamedTuple):
         )
 
 
-@compiled_inner
+@compiled_uncounted
 def follow_needle(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float
 ) -> tuple[int, bool]:
@@ -232,14 +218,15 @@ def follow_needle(
             return done.code, False
         for i in range(len(state.positions)):
             for a in range(2):
-                state.positions[i, a] = step.about[i, a] * rod.unit
-                state.velocities[i, a] = (step.about[i, a] - step.before[i, a]) * (rod.unit / duration)
+                moved = step.motion[ABOUT, i, a] - step.motion[BEFORE, i, a]
+                state.positions[i, a] = step.motion[ABOUT, i, a] * rod.unit
+                state.velocities[i, a] = moved * (rod.unit / duration)
         state.last[2] = duration
         converged = converged and done.off <= 1.0
     return ENDED, converged
 
 
-@compiled_inner
+@compiled_uncounted
 def record_margins(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -278,9 +265,10 @@ def record_margins(
         record.contact[k, 0], record.contact[k, 1] = shape[nearest], node[nearest]
     for i in range(nodes):
         record.rubbed[k, i] = close[i] >= 2
-    chords = buffers.step.chords  # of where the thread is: of the last linearisation, that showed that it is there
+    # Chords of where the thread is: of the last linearisation, that showed that it is there.
+    chords = buffers.step.program.chords
     if k == 0:
-        mechanics.chord_lengths(buffers.step.about, state.pose[2:], rod.clamped, chords)
+        mechanics.chord_lengths(buffers.step.motion[ABOUT], state.pose[2:], rod.clamped, chords)
     for i in range(nodes - 1):
         length = math.hypot(positions[i + 1, 0] - positions[i, 0], positions[i + 1, 1] - positions[i, 1])
         for kind in (CONNECTIVITY_MARGIN, COMPRESSION_MARGIN):
@@ -290,7 +278,7 @@ def record_margins(
     return True
 
 
-@compiled_inner
+@compiled_uncounted
 def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) -> float:
     """Return the factor on the needle's speed of the friction law at an instant."""
     count, fastest = 0, 0.0
@@ -301,37 +289,7 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
     return float(model.friction.beta**count) if count > 0 and fastest > model.friction.stuck_speed else 1.0
 
 
-@compiled_inner
-def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded: float, pull: Vector) -> None:
-    """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
-
-        c <- c + (c*(F) - c) / (1 + r)
-
-    with the ratio r of the drag that the whole thread would have broadside to the needle's: so the pull of the last
-    step, which falls with the needle's velocity, does not make the two swing. The result is bounded by the share of the
-    commanded speed [m/s] that the velocity is.
-    """
-    drag, added, body, pose = model.drag, state.added, model.needle.body, state.pose
-    lever = 0.5 * body.chord
-    ex, ey = body.chord_x * pose[2] - body.chord_y * pose[3], body.chord_x * pose[3] + body.chord_y * pose[2]
-    speed = math.hypot(velocity[0], velocity[1])
-    speed *= min(1.0, speed / commanded) if commanded > 0.0 else 0.0
-    along, across = pull[0] * ex + pull[1] * ey, pull[1] * ex - pull[0] * ey
-    forwards = velocity[0] * ex + velocity[1] * ey
-    full = (
-        (drag.along * forwards + along) / drag.bare - forwards,
-        across / drag.across,
-        -lever * across / drag.turning,
-    )
-    ratio = (drag.whole / drag.bare, drag.whole / drag.across, lever * lever * drag.whole / drag.turning)
-    begins = np.isnan(added[0])
-    for k in range(3):
-        added[k] = full[k] if begins else added[k] + (full[k] - added[k]) / (1.0 + ratio[k])
-        limit = speed if k < 2 else (speed / lever if lever > 0.0 else 0.0)
-        added[k] = max(-limit, min(limit, added[k]))
-
-
-@compiled_inner
+@compiled_uncounted
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -343,12 +301,12 @@ def record_thread(
     if k == 0:
         for i in range(len(state.positions)):
             for a in range(2):
-                step.about[i, a] = state.positions[i, a] / rod.unit
+                step.motion[ABOUT, i, a] = state.positions[i, a] / rod.unit
     if k > 0 and interval > 0.0:
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
         heading, tension = state.pose[2:], buffers.tension
         internal, load, velocities = step.internal, step.tail_load, state.velocities
-        write_forces(rod, step.about, velocities, heading, internal, load, scale, tension, record.pull[k])
+        write_forces(rod, step.motion[ABOUT], velocities, heading, internal, load, scale, tension, record.pull[k])
         record.tension[k] = tension[0]
         for i in range(len(tension)):
             record.tension[k] = max(record.tension[k], tension[i])
@@ -373,11 +331,9 @@ def roll_out(
     state: RolloutState,
     commands: Points,
     interval: float,
-    first: int,
-    last_step: int,
     record: RolloutRecord,
 ) -> tuple[int, int]:
-    """Integrate needle, filter and thread over the steps `first` to `last_step`, the latter not included.
+    """Integrate needle, filter and thread over the steps of the commands.
 
     Args:
         model: what stays the same.
@@ -385,8 +341,6 @@ def roll_out(
         state: at the begin of the first step; written.
         commands: velocity of the tip in each step, shape (k, 2) [m/s].
         interval: duration of a step [s].
-        first: step; before step 0 the instant of the start is recorded.
-        last_step: step.
         record: written.
 
     Returns:
@@ -396,11 +350,12 @@ def roll_out(
     pose, last, averaging = state.pose, state.last, model.friction.averaging
     limited = last[0] == last[0]  # not a number: the velocity before is not known
     share = 1.0 - math.exp(-interval / averaging) if averaging > 0.0 else 1.0
-    for k in range(first, last_step + 1):
-        if (k > first or k == 0) and not record_thread(model, buffers, state, k, record):
+    steps = len(commands)
+    for k in range(steps + 1):
+        if not record_thread(model, buffers, state, k, record):
             return NO_ROOM, max(k - 1, 0)
         command, slowdown = (0.0, 0.0), 1.0
-        if k < last_step:
+        if k < steps:
             command = (commands[k, 0], commands[k, 1])
             slowdown = record.slowdown[k] = friction_slowdown(model, state, record.rubbed[k])
         elapsed = interval if limited else np.inf
@@ -408,15 +363,12 @@ def roll_out(
             model.needle, pose, command, slowdown, (last[0], last[1]), elapsed, record.touched[k]
         )
         record.margin[k, NEEDLE_MARGIN], record.shape[k, NEEDLE_MARGIN] = margin, shape
-        if k == last_step:
+        if k == steps:
             break
         record.filtered[k, 0], record.filtered[k, 1] = x, y
         for a in range(4):
             buffers.pose[a] = pose[a]
-        if model.drag.along > 0.0 and (k > 0 or np.isnan(state.added[0])):  # at the start where the pull is known
-            commanded = min(math.hypot(command[0], command[1]), model.needle.max_speed)
-            add_pull(model, state, (x, y), commanded, record.pull[k])
-        moved_needle(model.needle, pose, (x, y), state.added, interval)
+        moved_needle(model.needle, pose, (x, y), interval)
         last[0], last[1], limited = x, y, True
         code, record.converged[k + 1] = follow_needle(model, buffers, state, interval)
         if code != ENDED:
@@ -425,4 +377,4 @@ def roll_out(
             for a in range(2):
                 moved = (state.positions[i, a] - record.vertices[k, i, a]) / interval
                 state.averaged[i, a] += share * (moved - state.averaged[i, a])
-    return ENDED, last_step
+    return ENDED, steps

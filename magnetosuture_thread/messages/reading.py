@@ -1,14 +1,11 @@
-"""Reads messages of any library, and the headers, poses and paths among CDR bytes, many times faster than decoded.
-
-Of bytes, what is not laid out as these readers expect is left to whoever decodes all messages.
-"""
+"""Reads messages of any library, and paths among CDR bytes, many times faster than decoded."""
 
 from __future__ import annotations
 
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,18 +22,14 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     THREAD_OBSERVATION,
 )
-from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
+from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, header_stamp, is_in_dish_frame
 from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
-_COVARIANT_POSE = struct.Struct("<43d")  # position, quaternion and covariance
-_VARIANCES = [7 * k for k in IN_PLANE]  # among its 36 numbers
-_COUNT = struct.Struct("<I")
-_POSE_AT = aligned(DISH_END, 8)
 MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
-MAX_HEADING_DEVIATION = 1.0  # rad; beyond, it is unknown which end of the needle is the tail
+RecordedMessage: TypeAlias = Any  # with `topic`, `time` [ns], `data` (CDR bytes), and `decode()`, or a `BagError`
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
 
@@ -77,17 +70,24 @@ def needle_pose(message: Any) -> NeedlePose:
     Raises:
         InvalidInputError: wrong frame, no stamp, no unit quaternion, or a heading that is unknown by its covariance.
     """
-    require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
+    tail, heading, deviation = _plane_pose(message, NEEDLE_POSE.name)
     stamp = message.header.stamp
     checked_nanoseconds(stamp, _STAMP)  # the prediction could not be stamped by another
+    variance = float(message.pose.covariance[-1])
+    if variance > 1.0:  # rad^2; beyond, it is unknown which end of the needle is the tail
+        expected = "a standard deviation of at most 1 rad: the heading is unknown"
+        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
+    return NeedlePose(seconds(stamp), tail, heading, deviation)
+
+
+def _plane_pose(message: Any, field: str) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    """Return tail, heading and their standard deviations of a PoseWithCovarianceStamped."""
+    require_dish_frame(message.header.frame_id, field)
     position, q = message.pose.pose.position, message.pose.pose.orientation
     heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
-    variance = float(message.pose.covariance[-1])
-    if variance > MAX_HEADING_DEVIATION**2:
-        expected = f"a standard deviation of at most {MAX_HEADING_DEVIATION:g} rad: the heading is unknown"
-        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
-    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
-    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading, deviation)
+    # x, y and the turn about z among the 36 numbers of the covariance.
+    deviation = pose_deviation([message.pose.covariance[7 * k] for k in IN_PLANE])
+    return np.array([position.x, position.y]), heading, deviation
 
 
 def check_pose_age(stamp: float, now: float, max_age: float) -> None:
@@ -278,37 +278,14 @@ def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
     return np.array([linear.x, linear.y])
 
 
-class SerializedMessage(Protocol):
-    """A recorded message."""
-
-    @property
-    def topic(self) -> str:
-        """Its topic."""
-
-    @property
-    def time(self) -> int:
-        """When it was recorded [ns]."""
-
-    @property
-    def data(self) -> bytes:
-        """Its CDR bytes."""
-
-    def decode(self) -> Any:
-        """Return the message.
-
-        Raises:
-            BagError: it cannot be decoded.
-        """
-
-
-def stamp_of(record: SerializedMessage) -> int:
+def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)
     return record.time if stamp is None else stamp
 
 
 def read_pose(
-    record: SerializedMessage,
+    record: RecordedMessage,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
     """Return tail, heading and their standard deviations of a recorded needle pose, as `thread_model` gets them.
 
@@ -316,20 +293,10 @@ def read_pose(
         BagError: it cannot be decoded.
         InvalidInputError: it is of another frame, or its orientation is none.
     """
-    data = record.data
-    if _is_plain(data) and len(data) >= _POSE_AT + _COVARIANT_POSE.size:
-        x, y, _, qx, qy, qz, qw, *covariance = _COVARIANT_POSE.unpack_from(data, _POSE_AT)
-        heading = heading_from_quaternion(qx, qy, qz, qw, _ORIENTATION)
-        return np.array([x, y]), heading, pose_deviation([covariance[k] for k in _VARIANCES])
-    message = record.decode()
-    require_dish_frame(message.header.frame_id, record.topic)
-    position, q = message.pose.pose.position, message.pose.pose.orientation
-    heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
-    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
-    return np.array([position.x, position.y]), heading, deviation
+    return _plane_pose(record.decode(), record.topic)
 
 
-def read_path(record: SerializedMessage) -> Points:
+def read_path(record: RecordedMessage) -> Points:
     """Return a recorded path as an array of shape (m, 2) [m].
 
     Raises:
@@ -340,7 +307,7 @@ def read_path(record: SerializedMessage) -> Points:
     return path_points(record.decode(), record.topic) if found is None else found
 
 
-def read_force(record: SerializedMessage) -> NDArray[np.float64]:
+def read_force(record: RecordedMessage) -> NDArray[np.float64]:
     """Return the force in the dish plane of a recorded wrench, shape (2,) [N].
 
     Raises:
@@ -355,7 +322,7 @@ def read_force(record: SerializedMessage) -> NDArray[np.float64]:
     return force
 
 
-def read_observation(record: SerializedMessage) -> ThreadObservation:
+def read_observation(record: RecordedMessage) -> ThreadObservation:
     """Return a recorded observation of the thread.
 
     Raises:
@@ -367,17 +334,12 @@ def read_observation(record: SerializedMessage) -> ThreadObservation:
 
 def _plain_path(data: bytes) -> Points | None:
     """Return a path whose poses all are in the dish frame, as ours are, so that they lie at equal distances."""
-    if not _is_plain(data) or len(data) < PATH_AT:
+    if not is_in_dish_frame(data) or len(data) < PATH_AT:
         return None
-    (count,) = _COUNT.unpack_from(data, PATH_AT - _COUNT.size)
+    (count,) = struct.unpack_from("<I", data, PATH_AT - 4)
     if len(data) < PATH_AT + count * PATH_POSES.itemsize:
         return None
     poses = np.frombuffer(data, PATH_POSES, count, PATH_AT)
     if poses["frame"].tobytes() != data[len(BEGIN) + 8 : DISH_END] * count:
         return None
     return np.column_stack([poses["x"], poses["y"]])
-
-
-def _is_plain(data: bytes) -> bool:
-    """Return whether a message is in the dish frame, and written as our machines write it."""
-    return data[:2] == LITTLE_ENDIAN and is_in_dish_frame(data)

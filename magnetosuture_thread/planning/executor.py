@@ -27,7 +27,6 @@ BACK_OFF_TIME = 0.8  # s; for which it then drives away from what stops it
 MAX_REPLANS, MAX_DETOURS, MAX_MISSES = 6, 20, 6  # of a goal: without progress, without less to go, off its place
 OFF_PATH, MAX_OFF_PATH = 8e-4, 3e-3  # m; an error beyond which a new path is planned: more where there is room
 PROGRESS = 2e-3  # m; on a new path, or less to go than ever before, after which plans before count no more
-WRAPPED = 0.02  # rad; of a wrap may be left
 MAX_WAIT = 30.0  # s; for a thread that is not known, after which a procedure is given up
 TENSION_SHARE = 0.9  # of the limit, which the speed is regulated to
 UNLIMITED = 10_000  # nodes under friction: a limit that is none
@@ -279,7 +278,8 @@ class ProcedureExecutor:
         goal = self.procedure.goals[self.goal]
         is_met = isinstance(goal, Tighten) and self._is_tight(goal, thread)
         if isinstance(goal, Wrap):
-            is_met = abs(goal.swept) - self.pursuit.swept * math.copysign(1.0, goal.swept) < WRAPPED
+            # The last 0.02 rad of a wrap may be left.
+            is_met = abs(goal.swept) - self.pursuit.swept * math.copysign(1.0, goal.swept) < 0.02
         if is_met:
             self._next_goal()
             return None

@@ -18,10 +18,6 @@ from magnetosuture_thread.shared_parameters import shared_parameter
 
 Vector = NDArray[np.float64]
 
-MAX_INTERVAL = 0.1  # s; after a longer gap between poses the setpoint has waited and does not run ahead
-MAX_PROGRESS_UNFINISHED = 0.999  # the path is done when the tip has arrived, not the setpoint ahead of it
-SAMPLES_PER_SPAN = 200  # between two waypoints, to measure the arc length
-
 
 @dataclass(frozen=True)
 class PathFollowerSettings(Configuration):
@@ -115,7 +111,8 @@ class SmoothPath:
 
         free: tuple[Literal[1, 2], NDArray[np.float64]] = (2, np.zeros(2))
         curve = CubicSpline(knots, waypoints, bc_type=(free if direction is None else (1, direction), free))
-        at = np.unique(np.concatenate([np.linspace(a, b, SAMPLES_PER_SPAN) for a, b in pairwise(knots)]))
+        # 200 points between two waypoints measure the arc length.
+        at = np.unique(np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(knots)]))
         self._points = np.asarray(curve(at))
         self._tangents = np.asarray(curve(at, 1))
         self._tangents /= np.linalg.norm(self._tangents, axis=1)[:, None]
@@ -194,7 +191,8 @@ class PathFollower:
             self._path = SmoothPath(waypoints, self._to_tip @ heading / np.linalg.norm(tip - tail))
             self._stamp = stamp
         path = self._path
-        interval = min(max(stamp - self._stamp, 0.0), MAX_INTERVAL)
+        # After a gap of more than 0.1 s between poses the setpoint has waited and does not run ahead.
+        interval = min(max(stamp - self._stamp, 0.0), 0.1)
         self._stamp = stamp
         remaining = path.length - self._length
         # Trapezoidal profile: the setpoint starts from rest and can still stop at the end.
@@ -215,7 +213,10 @@ class PathFollower:
         self._correction *= min(1.0, 0.5 * settings.speed / size) if size > 0.0 else 1.0
         velocity = speed * path.tangent(self._length) + settings.gain * error + self._correction
         return FollowerCommand(
-            path.point(self._length), velocity, min(MAX_PROGRESS_UNFINISHED, self._length / path.length)
+            # The path is done when the tip has arrived, not the setpoint ahead of it.
+            path.point(self._length),
+            velocity,
+            min(0.999, self._length / path.length),
         )
 
 

@@ -14,18 +14,20 @@ from scipy import ndimage
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.lattice import (
+from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
+    PREFERRED,
     STRIDE,
+    BodyPath,
     LatticeGoal,
     body_clearance,
     clearance_at,
     map_clearance,
     search_lattice,
+    smooth_path,
     turn_of,
 )
-from magnetosuture_thread.planning.path import PREFERRED, BodyPath, smooth_path
 from magnetosuture_thread.planning.procedure import (
     HEADING_TOLERANCE,
     Goal,
@@ -43,11 +45,7 @@ from magnetosuture_thread.scene import Scene, SceneShape
 Vector = NDArray[np.float64]
 
 MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
-VIEW_SAMPLES = 24
-MAX_WAYS = 32  # that are kept
 PLACE_SHARE, PLACE_STEPS = 0.7, 0.75  # of a goal's tolerance, and of the lattice: how far from its place a way may end
-GAP_HEADING = 0.8  # rad; by which the needle may be off the direction of a gap while it passes
-GAP_WIDTH_RATIO = 1.03  # of a gap's narrowest place, up to which it is one gap
 
 
 class PlanningError(MagnetosutureError):
@@ -221,7 +219,8 @@ class NeedlePlanner:
         midway = (np.abs(first - second) <= 1.5 * step) & (self.near.distance >= 0.45 * width)
         if not midway.any():
             return []
-        narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * GAP_WIDTH_RATIO)
+        # Up to 1.03 of its least width it is one gap.
+        narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * 1.03)
         labels, count = ndimage.label(narrow, np.ones((3, 3)))
         slope = np.asarray(np.gradient(first - second))
         found = []
@@ -262,7 +261,8 @@ class NeedlePlanner:
         # A procedure is planned as a whole, and then goal by goal from the same points of the lattice.
         key = (start.tobytes(), kept, *(np.asarray(part).tobytes() for part in goal))
         if (found := self._ways.get(key)) is None:
-            if len(self._ways) >= MAX_WAYS:
+            # 32 ways are kept.
+            if len(self._ways) >= 32:
                 self._ways.clear()
             found = self._ways[key] = search_lattice(
                 start, self.body, self.lever, kept, kept + PREFERRED, goal, self.near
@@ -305,7 +305,8 @@ class NeedlePlanner:
                 ahead, aside = dx * gap.along[0] + dy * gap.along[1], dy * gap.along[0] - dx * gap.along[1]
                 places |= (ahead >= 0.0) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * gap.width)
                 off = np.abs(turn_of(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
-                headings |= off <= GAP_HEADING
+                # The needle may be 0.8 rad off the direction of a gap while it passes.
+                headings |= off <= 0.8
             return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), nowhere)
         place, tolerance = start, self._step
         headed: tuple[float, ...] = ()
@@ -340,7 +341,7 @@ class NeedlePlanner:
         slope = np.array(np.gradient(from_shape))  # per step, rows first
         rows, columns = np.indices(from_shape.shape)
         free = blocking > 0.0
-        for share in np.linspace(0.1, 1.0, VIEW_SAMPLES):
+        for share in np.linspace(0.1, 1.0, 24):
             way = share * from_shape / self._step
             at = [
                 np.clip(np.rint(index - way * part), 0, self._size - 1).astype(int)

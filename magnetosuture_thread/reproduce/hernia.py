@@ -25,12 +25,12 @@ from rich.table import Table
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import BagError, InvalidInputError, SolverError
 from magnetosuture_thread.evaluation.plots import FAINT, INK, shape_patch, tidy
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import OPERATOR_COMMAND
-from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup

@@ -26,20 +26,14 @@ Box = tuple[slice, slice]
 ToCanvas = Callable[[Points], NDArray[np.int32]]
 
 OVERSAMPLING = 4
-TILE_PX = 60.0  # a long line is drawn in pieces of this length: a large, nearly empty canvas would be slow
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
-LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
-SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 NOISE_FIELDS = 12
-NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
 REACH_PX = 24.0  # of shadows and blur around what moves
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
-DROP_SHADOW_PX = np.array([3.0, 4.0])
-LAMP_PX = (-0.5, -0.86)  # direction towards the lamp, in the image
 GLARE_ARCS = ((0.78, 102.0, 156.0, 9.0), (0.81, -40.0, -17.0, 7.0))  # share of the radius; angles [deg]; width [px]
 
 
@@ -220,7 +214,9 @@ class DishCamera:
             needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
             inside = _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
-        lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
+        # Shifted to the right and down by 2.5 and 3.5 px, from the middle of the kernel's 26 values.
+        cast = cv2.sepFilter2D(shade, cv2.CV_32F, SHADOW, SHADOW, anchor=(15, 16), borderType=cv2.BORDER_CONSTANT)
+        lay(region, cast, 0.16, (0.0, 0.0, 0.0))
         lay(region, strand, 1.0, scene.thread_bgr)
         if near is not None and needle is not None:
             lay(region[inside], needle, 1.0, STEEL_BGR)
@@ -246,7 +242,8 @@ class DishCamera:
         at = np.linspace(0.07, 0.77, 15)
         points, along = needle_axis(tail, heading, scene.needle_length, scene.needle_curvature, at)
         aside = np.column_stack([-along[:, 1], along[:, 0]])
-        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ LAMP)[:, None] * aside)
+        # Direction towards the lamp, in the dish frame.
+        return np.asarray(points + 0.22 * scene.needle_width * np.tanh(2.0 * aside @ (-0.5, 0.86))[:, None] * aside)
 
     def _through_lens(self, light: Light) -> Light:
         return np.asarray(cv2.GaussianBlur(light, (0, 0), self._lighting.blur_px), dtype=np.float32)
@@ -255,7 +252,8 @@ class DishCamera:
         """Return noise for white light of level 1; the sensor's colour interpolation spreads it a little."""
         width, height = self.size
         noise = self._random.standard_normal((height, width, 3), dtype=np.float32)
-        level = np.float32(self._lighting.noise * NOISE_LEVEL / np.sqrt(90.0))
+        # 1.6 at a light of level 90, before the sensor's interpolation spreads it.
+        level = np.float32(self._lighting.noise * 1.6 / np.sqrt(90.0))
         return np.asarray(cv2.GaussianBlur(noise, (0, 0), 0.55) * level, dtype=np.float32)
 
     def _noise_in(self, box: Box, chosen: int) -> Light:
@@ -345,7 +343,7 @@ class _StillLife:
         def solid(of: Sequence[Points]) -> Light:
             return covered(box, lambda canvas, to: cv2.fillPoly(canvas, [to(r) for r in of], 255, cv2.LINE_8, 4))
 
-        shade = cv2.GaussianBlur(solid([ring + DROP_SHADOW_PX for ring in rings]), (0, 0), 4.0)
+        shade = cv2.GaussianBlur(solid([ring + np.array([3.0, 4.0]) for ring in rings]), (0, 0), 4.0)
         region *= 1.0 - 0.2 * shade[:, :, None]
         top = solid(rings)
         colour = self._surface(top, look) + (self._smear(look.mottle, 9.0)[box][:, :, None] if look.mottle else 0.0)
@@ -369,7 +367,8 @@ class _StillLife:
         slope = np.stack(
             [cv2.Sobel(height, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(height, cv2.CV_32F, 0, 1, scale=0.125)]
         )
-        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray(LAMP_PX, np.float32), slope, axes=1)
+        # Direction towards the lamp, in the image.
+        lit = -np.float32(look.relief) * reach * np.tensordot(np.asarray((-0.5, -0.86), np.float32), slope, axes=1)
         edge = np.asarray(look.edge_bgr, dtype=np.float32)
         return np.asarray(edge + height[:, :, None] * (colour - edge) + lit[:, :, None], dtype=np.float32)
 
@@ -463,7 +462,11 @@ def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
     rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
     canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
 
-    draw(canvas, lambda pixels: _on_canvas(pixels - (box[1].start, box[0].start)))
+    def on_canvas(pixels: Points) -> NDArray[np.int32]:
+        at = (pixels - (box[1].start, box[0].start) + 0.5) * OVERSAMPLING - 0.5
+        return np.asarray(np.round(16.0 * at), dtype=np.int32)
+
+    draw(canvas, on_canvas)
     small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
 
@@ -471,37 +474,28 @@ def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
 def line_covered(box: Box, line: Points, width_px: float) -> Light:
     """Return the share of each pixel in a box that a line of a given width covers, shape (rows, columns).
 
+    A long line is drawn in pieces of about 60 px: a large, nearly empty canvas would be slow.
+
     Args:
-        box: rows and columns.
+        box: rows and columns, in which the line is with all its pieces' margins; see `box_around`.
         line: vertices, shape (m, 2) [px].
         width_px: of the line; less than a quarter of a pixel is drawn as that and fainter.
     """
-    rows, columns = box
-    result = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+    result = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.float32)
     wide = max(1, round(width_px * OVERSAMPLING))
-    fainter = min(1.0, width_px * OVERSAMPLING / wide)
-    line = line - (columns.start, rows.start)
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    starts = np.searchsorted(length, np.arange(0.0, length[-1], TILE_PX), side="right") - 1
-    ends = np.append(starts[1:], len(line) - 1)
-    low = np.minimum(np.minimum.reduceat(line, starts), line[ends]) - (2.0 + width_px)
-    high = np.maximum(np.maximum.reduceat(line, starts), line[ends]) + (3.0 + width_px)
-    parts = np.clip(np.column_stack([low, high]), 0.0, [*result.shape[::-1]] * 2).astype(int).tolist()
-    at = _on_canvas(line)
-    for first, last, (left, top, right, bottom) in zip(starts, ends, parts, strict=True):
-        if left < right and top < bottom:
-            canvas = np.zeros(((bottom - top) * OVERSAMPLING, (right - left) * OVERSAMPLING), np.uint8)
-            piece = at[first : last + 1] - (left * OVERSAMPLING * 16, top * OVERSAMPLING * 16)
-            cv2.polylines(canvas, [piece], False, 255, wide, cv2.LINE_8, 4)
-            part = result[top:bottom, left:right]
-            small = cv2.resize(canvas, part.shape[::-1], interpolation=cv2.INTER_AREA)
-            np.maximum(part, small, out=part)
-    return np.asarray(result * np.float32(fainter / 255.0), dtype=np.float32)
+    length = float(np.hypot(*np.diff(line, axis=0).T).sum())
+    count = max(1, round(60.0 * (len(line) - 1) / max(length, 60.0)))
+    for first in range(0, len(line) - 1, count):
+        piece = line[first : first + count + 1]
+        part = box_around(piece, (box[1].stop, box[0].stop), 3.0 + width_px)
+        if part is not None:
+            inside, drawn = _within(part, box), _line_drawn(part, piece, wide)
+            np.maximum(result[inside], drawn, out=result[inside])
+    return result * np.float32(min(1.0, width_px * OVERSAMPLING / wide))
 
 
-def _on_canvas(pixels: Points) -> NDArray[np.int32]:
-    """Return pixels (u, v) in the coordinates of a canvas that begins with (0, 0), in sixteenths."""
-    return np.asarray(np.round(((pixels + 0.5) * OVERSAMPLING - 0.5) * 16.0), dtype=np.int32)
+def _line_drawn(box: Box, line: Points, wide: int) -> Light:
+    return covered(box, lambda canvas, at: cv2.polylines(canvas, [at(line)], False, 255, wide, cv2.LINE_8, 4))
 
 
 @compiled
@@ -516,35 +510,3 @@ def lay(region: Light, share: Light, strength: float, bgr: tuple[float, float, f
                 region[i, j, 0] += part * (b - region[i, j, 0])
                 region[i, j, 1] += part * (g - region[i, j, 1])
                 region[i, j, 2] += part * (r - region[i, j, 2])
-
-
-@compiled
-def blurred(sparse: Light, kernel: Light, right: int, down: int) -> Light:
-    """Return the convolution of a mostly empty image with a kernel along rows and columns, zeros around it.
-
-    Args:
-        sparse: shape (rows, columns).
-        kernel: shape (k,); its first value is for the pixel `right` and `down` of one that is not zero.
-        right: see there.
-        down: the same.
-    """
-    rows, columns = sparse.shape
-    size = kernel.shape[0]
-    result = np.zeros_like(sparse)
-    line = np.zeros(columns, np.float32)
-    for i in range(rows):
-        low, high = columns, 0
-        for j in range(columns):
-            if sparse[i, j] != 0.0:
-                begin, end = max(j + right, 0), min(j + right + size, columns)
-                low, high = min(low, begin), max(high, end)
-                for n in range(begin, end):
-                    line[n] += sparse[i, j] * kernel[n - j - right]
-        if low < high:
-            spread = line[low:high]
-            for n in range(max(i + down, 0), min(i + down + size, rows)):
-                target, weight = result[n, low:high], kernel[n - i - down]
-                for j in range(spread.shape[0]):
-                    target[j] += weight * spread[j]
-            spread[:] = 0.0
-    return result

@@ -19,15 +19,9 @@ NEEDLE_OUT, COIL_STUCK = "needle_out", "coil_stuck"
 KINDS = (GLARE, HAND, TOOL, DIM, OVEREXPOSED, DROPPED, LATE, CAMERA_STOPPED, NEEDLE_OUT, COIL_STUCK)
 
 DIM_GAIN, BRIGHT_GAIN = 0.3, 1.9
-DROPPED_SHARE = 0.5  # of the frames
-LATENESS = 0.12  # s; of a late frame
 LIFT_TIME = 0.6  # s in which the needle is carried over the rim
-SKIN_BGR = (120.0, 145.0, 195.0)
 STEEL_BGR = (115.0, 112.0, 108.0)
-GLARE_BGR = (265.0, 265.0, 265.0)
-MAX_FAULTS = 100
 HAND_WIDTH, TOOL_WIDTH = 0.28, 0.07  # of the dish's diameter
-GLARE_SIZE = (0.3, 0.55)  # least and greatest radius, of the needle's length
 
 
 @dataclass(frozen=True)
@@ -108,7 +102,7 @@ class FaultSchedule:
 
     def add(self, fault: Fault) -> None:
         """Take one more fault, and forget those that are over."""
-        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-MAX_FAULTS:]
+        self.faults = (*(f for f in self.faults if f.start + f.duration > fault.start), fault)[-100:]
 
     def kinds(self, time: float) -> frozenset[str]:
         """Return the kinds in force at a time [s]."""
@@ -122,11 +116,13 @@ class FaultSchedule:
     def drops(self, time: float, chance: float) -> bool:
         """Return whether a frame gets lost; `chance` is drawn from 0 to 1."""
         kinds = self.kinds(time)
-        return CAMERA_STOPPED in kinds or (DROPPED in kinds and chance < DROPPED_SHARE)
+        # Half of the frames get lost.
+        return CAMERA_STOPPED in kinds or (DROPPED in kinds and chance < 0.5)
 
     def lateness(self, time: float) -> float:
         """Return how long a frame is held back [s]."""
-        return LATENESS if LATE in self.kinds(time) else 0.0
+        # A late frame comes 0.12 s later.
+        return 0.12 if LATE in self.kinds(time) else 0.0
 
     def lifted(self, time: float) -> NDArray[np.float64]:
         """Return by how much the needle has been carried out of the dish, shape (2,) [m]."""
@@ -157,12 +153,13 @@ class FaultSchedule:
             angle = random.uniform(0.0, 2.0 * np.pi)
             sway = 0.03 * self._dish * np.sin(5.0 * (time - fault.start) + angle)
             if fault.kind == GLARE:
-                radius = self._needle * random.uniform(*GLARE_SIZE)
+                # The radius is 0.3 to 0.55 of the needle's length.
+                radius = self._needle * random.uniform(0.3, 0.55)
                 outline = _ellipse(place, radius, random.uniform(0.5, 1.0) * radius, angle)
-                result.append(Cover(outline, GLARE_BGR, blur_px=4.0))
+                result.append(Cover(outline, (265.0, 265.0, 265.0), blur_px=4.0))
             else:
                 width = (HAND_WIDTH if fault.kind == HAND else TOOL_WIDTH) * self._dish
-                bgr = SKIN_BGR if fault.kind == HAND else STEEL_BGR
+                bgr = (120.0, 145.0, 195.0) if fault.kind == HAND else STEEL_BGR
                 outline = _finger(place, angle, width, sway, 3.0 * self._dish)
                 result.append(Cover(outline, bgr, blur_px=3.0 if fault.kind == HAND else 1.5))
         return tuple(result)

@@ -17,7 +17,6 @@ from magnetosuture_thread.scene import Scene, find_collision
 
 Vector = NDArray[np.float64]
 
-MIN_SPAN = 1e-9  # s, the resolution of ROS times; what is nearer to the rig's own time waits for the next call
 RELEASE_TIME = 1.0  # s without currents asked for, after which a rig with a problem tries again
 
 
@@ -204,7 +203,8 @@ class Rig:
     def _move(self, time: float) -> bool:
         """Move up to a time [s]; return whether it was reached within the iterations."""
         span = time - self.time
-        if span < MIN_SPAN:
+        # ROS times resolve 1 ns; what is nearer to the rig's own time waits for the next call.
+        if span < 1e-9:
             return True
         moved = self._dynamics.step(self.currents, span, self._max_iterations)
         self.time = time if moved >= span else self.time + moved

@@ -2,9 +2,8 @@
 
 from magnetosuture_thread.scene.checks import WALL_NAME, find_collision
 from magnetosuture_thread.scene.files import read_scene, write_scene
-from magnetosuture_thread.scene.mapping import scene_from_mapping, scene_to_mapping, shape_from_mapping
 from magnetosuture_thread.scene.scene import KINDS, Dish, Scene, SceneShape
-from magnetosuture_thread.scene.shapes import SHAPES
+from magnetosuture_thread.scene.shapes import SHAPES, scene_from_mapping, scene_to_mapping, shape_from_mapping
 
 __all__ = [
     "KINDS",

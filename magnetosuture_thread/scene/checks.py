@@ -14,7 +14,6 @@ from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene.scene import Scene, SceneShape
 
-MIN_OVERLAP_AREA = 1e-12  # m^2; shapes that share a boundary do not overlap
 WALL_NAME = "wall"
 
 
@@ -109,7 +108,8 @@ def _pair_warnings(
 ) -> Iterator[SceneWarning]:
     names = (first.name, second.name)
     common = one.intersection(other)
-    if common.area > MIN_OVERLAP_AREA:
+    # Shapes that share a boundary do not overlap.
+    if common.area > 1e-12:
         inside = common.representative_point()
         place = float(inside.x), float(inside.y)
         text = f"{first.name} and {second.name} overlap by {1e6 * common.area:.3g} mm^2 at {_at(place)}"

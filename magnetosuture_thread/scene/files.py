@@ -1,4 +1,4 @@
-"""Scene files: a dish and named shapes in YAML, or GeoJSON, parsed with limits on size and depth.
+"""Scene files: a dish and named shapes in YAML, or GeoJSON, parsed with limits on size and depth; and their editing.
 
 dish: {diameter: 0.05, depth: 0.004}     # [m]
 shapes:
@@ -10,19 +10,21 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
-from magnetosuture_thread.configuration import use_ros_numbers
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, use_ros_numbers
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.resources import find_scene_file
 from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
-from magnetosuture_thread.scene.mapping import scene_from_mapping, scene_to_mapping
-from magnetosuture_thread.scene.scene import Scene, scene_error
+from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, Scene, SceneShape, scene_error
+from magnetosuture_thread.scene.shapes import scene_from_mapping, scene_to_mapping, shape_from_mapping
+from magnetosuture_thread.shared_parameters import shared_parameter
 from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
 
 GEOJSON_ENDINGS = (".json", ".geojson")
@@ -171,3 +173,67 @@ def write_scene(scene: Scene, path: Path) -> None:
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise scene_error("scene file", error.strerror or str(error), "a file that can be written", str(path)) from None
+
+
+@dataclass(frozen=True)
+class SceneServerSettings(Configuration):
+    """The scene that is published first."""
+
+    GROUP: ClassVar[str] = "scene_server"
+
+    autostart: str = autostart_parameter()
+    scene: str = shared_parameter("scene")
+
+
+MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
+
+
+class SceneEditor:
+    """Holds the active scene and edits it; an invalid edit leaves it unchanged.
+
+    Args:
+        scene: the initial scene; None until one is loaded.
+
+    Attributes:
+        scene: the active scene.
+
+    Each edit raises `ConfigurationError` where it is invalid, whatever the text.
+    """
+
+    def __init__(self, scene: Scene | None = None) -> None:
+        self.scene = scene
+
+    def load(self, file: str) -> None:
+        """Load the scene of a file, given as a path or as the name of one that ships with the package."""
+        _require_length("file", file, 4096)
+        self.scene = read_scene(file)
+
+    def add(self, name: str, shape: str) -> None:
+        """Append a shape; the text is its description as in a scene file."""
+        self.scene = self._require_scene().add(_parse_shape(name, shape))
+
+    def replace(self, name: str, shape: str) -> None:
+        """Replace the shape of the same name."""
+        self.scene = self._require_scene().replace(_parse_shape(name, shape))
+
+    def remove(self, name: str) -> None:
+        """Remove a shape."""
+        self.scene = self._require_scene().remove(name)
+
+    def _require_scene(self) -> Scene:
+        if self.scene is None:
+            expectation = "a scene that is loaded first, of which the dish is known"
+            raise scene_error("scene", "a change of a shape", expectation)
+        return self.scene
+
+
+def _parse_shape(name: str, text: str) -> SceneShape:
+    _require_length("name", name, MAX_NAME_CHARS)
+    _require_length("shape", text, MAX_SHAPE_CHARS)
+    description: Any = parse_yaml(text, what="shape")
+    return shape_from_mapping(name, description)
+
+
+def _require_length(field: str, text: str, max_chars: int) -> None:
+    if len(text) > max_chars:
+        raise scene_error(field, f"{len(text)} characters", f"at most {max_chars}")

@@ -15,15 +15,15 @@ from typing import Any
 import shapely
 import shapely.geometry
 
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene.mapping import (
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
+from magnetosuture_thread.scene.shapes import (
     DISH_FIELDS,
     dish_from_mapping,
     dish_to_mapping,
     make_scene,
     shape_from_mapping,
 )
-from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, scene_error
 
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
@@ -146,7 +146,10 @@ def _defined(shape: SceneShape, properties: Mapping[str, Any], source: str) -> S
     if not isinstance(definition, Mapping):
         raise scene_error(f"{shape.name}.properties.definition", definition, "a shape as in a scene file", source)
     defined = shape_from_mapping(shape.name, {**definition, "kind": shape.kind, "friction": shape.friction}, source)
-    return defined if _same(defined.geometry, shape.geometry) else shape
+    # Equal to the rounding of drawing programs.
+    apart = defined.solid.symmetric_difference(shape.solid).area
+    same = type(defined.geometry) is type(shape.geometry) and apart <= GEOMETRY_TOLERANCE * shape.solid.length
+    return defined if same else shape
 
 
 def _is_list(value: Any) -> bool:
@@ -156,14 +159,3 @@ def _is_list(value: Any) -> bool:
 def _planar(position: Any) -> Any:
     """Return a position without its height; anything else unchanged, to be refused."""
     return list(position[:2]) if _is_list(position) and len(position) in (2, 3) else position
-
-
-def _same(one: Disc | Polygon, other: Disc | Polygon) -> bool:
-    """Return whether two shapes are equal to the rounding of drawing programs."""
-    if isinstance(one, Disc) or isinstance(other, Disc):
-        if not (isinstance(one, Disc) and isinstance(other, Disc)):
-            return False
-        pairs = zip((*one.centre, one.radius), (*other.centre, other.radius), strict=True)
-        return all(abs(a - b) <= GEOMETRY_TOLERANCE for a, b in pairs)
-    first, second = (shapely.Polygon(shape.outline, shape.holes) for shape in (one, other))
-    return bool(first.symmetric_difference(second).area <= GEOMETRY_TOLERANCE * first.length)

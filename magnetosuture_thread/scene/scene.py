@@ -67,7 +67,6 @@ MIN_EDGE = 2e-6  # m; a 30th of the thinnest thread, and what arcs and contacts 
 MAX_NAME_CHARS = 64
 MAX_COORDINATE = 1.0  # m; anything larger is in another unit
 MIN_RADIUS = 1e-6  # m
-CROSSING_DEPTH = 2.0  # diameters of a thread, in a liquid of which it can pass over itself
 VERSION_CHARS = 16
 
 
@@ -117,7 +116,8 @@ class Dish:
         """
         if self.self_contact is not None:
             return self.self_contact
-        return self.depth < CROSSING_DEPTH * thread_diameter
+        # In a liquid two diameters deep the thread can pass over itself.
+        return self.depth < 2.0 * thread_diameter
 
     @property
     def radius(self) -> float:

@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     SPAN,
@@ -206,7 +206,7 @@ def is_active(limit: float, multiplier: float) -> bool:
     return multiplier != 0.0 and abs(multiplier) < limit
 
 
-@compiled_inner
+@compiled_uncounted
 def evaluate(axes: Axes, program: ChainProgram, u: Points, smooth: Vector, image: Vector) -> float:
     """Write P u + q and a_r' u of every row; return the largest term of the first."""
     d, width, nodes, chain, largest = len(axes), SPAN * len(axes), len(u), len(program.first), 1.0
@@ -236,7 +236,7 @@ def evaluate(axes: Axes, program: ChainProgram, u: Points, smooth: Vector, image
     return largest
 
 
-@compiled_inner
+@compiled_uncounted
 def forces(
     axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
 ) -> tuple[float, float]:
@@ -266,7 +266,7 @@ def forces(
     return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
 
 
-@compiled_inner
+@compiled_uncounted
 def update(
     program: ChainProgram, image: Vector, centre: Vector, weights: Vector, multipliers: Vector, active: Mask
 ) -> tuple[int, float]:
@@ -290,7 +290,7 @@ def update(
     return changes, gap
 
 
-@compiled_inner
+@compiled_uncounted
 def search(
     program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
 ) -> float:
@@ -326,6 +326,36 @@ def search(
     return part
 
 
+@compiled_uncounted
+def solve_positive_definite(matrix: Table, x: Vector) -> bool:
+    """Solve a small dense system in place by Cholesky's factor, written over the matrix; return whether there is one.
+
+    Args:
+        matrix: symmetric, shape (n, n).
+        x: the right side, then the solution, shape (n,).
+    """
+    count = len(x)
+    for p in range(count):
+        for q in range(p + 1):
+            total = matrix[p, q]
+            for k in range(q):
+                total -= matrix[p, k] * matrix[q, k]
+            if q < p:
+                matrix[p, q] = total / matrix[q, q]
+            elif total > 0.0:
+                matrix[p, p] = math.sqrt(total)
+            else:
+                return False
+        for k in range(p):
+            x[p] -= matrix[p, k] * x[k]
+        x[p] /= matrix[p, p]
+    for p in range(count - 1, -1, -1):
+        for k in range(p + 1, count):
+            x[p] -= matrix[k, p] * x[k]
+        x[p] /= matrix[p, p]
+    return True
+
+
 @compiled
 def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: Mask, band: Table, step: Vector) -> bool:
     """Turn B^-1 F in `step` into F'^-1 F, with the factor of B in the band.
@@ -334,8 +364,11 @@ def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: M
         Whether F' is positive definite.
     """
     d, chain = len(axes), len(program.first)
-    chosen = np.flatnonzero(active[chain : len(program.lower)])
-    count = len(chosen)
+    chosen, count = np.empty(len(program.far_nodes), np.int64), 0
+    for r in range(len(chosen)):
+        if active[chain + r]:
+            chosen[count] = r
+            count += 1
     columns, matrix, pull = np.zeros((count, len(band))), np.zeros((count, count)), np.zeros(count)
     for p in range(count):
         for k in range(program.far_nodes.shape[1]):
@@ -351,24 +384,9 @@ def solve_far_rows(axes: Axes, program: ChainProgram, weights: Vector, active: M
                 pull[p] += value * step[j]
                 for q in range(count):
                     matrix[p, q] += value * columns[q, j]
-    for p in range(count):  # Cholesky's factor, and the first substitution with it
-        for q in range(p + 1):
-            total = matrix[p, q]
-            for k in range(q):
-                total -= matrix[p, k] * matrix[q, k]
-            if q < p:
-                matrix[p, q] = total / matrix[q, q]
-            elif total > 0.0:
-                matrix[p, p] = math.sqrt(total)
-            else:
-                return False
-        for k in range(p):
-            pull[p] -= matrix[p, k] * pull[k]
-        pull[p] /= matrix[p, p]
-    for p in range(count - 1, -1, -1):
-        for k in range(p + 1, count):
-            pull[p] -= matrix[k, p] * pull[k]
-        pull[p] /= matrix[p, p]
+    if not solve_positive_definite(matrix, pull):
+        return False
+    for p in range(count):
         for j in range(len(step)):
             step[j] -= pull[p] * columns[p, j]
     return True
@@ -381,7 +399,7 @@ def _copy(given: Vector, factor: float, count: int, written: Vector) -> None:
         written[k] = factor * given[k]
 
 
-@compiled_inner
+@compiled_uncounted
 def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> None:
     """Write weights, proximal centres and the rows that are active at the guess."""
     vectors, active, unknowns = buffers.vectors, buffers.active, program.linear.size
@@ -408,7 +426,7 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
         active[r] = is_active(limit[r], multipliers[r])
 
 
-@compiled_inner
+@compiled_uncounted
 def solve(
     axes: Axes,
     program: ChainProgram,

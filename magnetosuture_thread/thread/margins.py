@@ -44,9 +44,6 @@ class Friction:
 UNKNOWN = Friction(FrictionState.UNKNOWN, (), 1.0)
 
 Colour = tuple[float, float, float]
-_GREEN, _BLUE, _GREY = (0.12, 0.62, 0.33), (0.10, 0.42, 0.85), (0.5, 0.5, 0.5)
-_LIGHT_ORANGE, _DEEP_ORANGE = (1.0, 0.70, 0.25), (0.78, 0.23, 0.0)
-_DEEPEST = 20  # nodes under friction, from which on orange gets no deeper
 
 
 def friction_colour(friction: Friction) -> Colour:
@@ -58,10 +55,11 @@ def friction_colour(friction: Friction) -> Colour:
     (0.12, 0.62, 0.33)
     """
     if friction.state is FrictionState.SLIDING:
-        depth = min(1.0, (len(friction.nodes) - 1) / (_DEEPEST - 1))
-        red, green, blue = ((1.0 - depth) * a + depth * b for a, b in zip(_LIGHT_ORANGE, _DEEP_ORANGE, strict=True))
+        depth = min(1.0, (len(friction.nodes) - 1) / 19)  # from 20 nodes on it gets no deeper
+        red, green, blue = ((1.0 - depth) * a + depth * b for a, b in ((1.0, 0.78), (0.70, 0.23), (0.25, 0.0)))
         return red, green, blue
-    return {FrictionState.FREE: _GREEN, FrictionState.STUCK: _BLUE}.get(friction.state, _GREY)
+    others = {FrictionState.FREE: (0.12, 0.62, 0.33), FrictionState.STUCK: (0.10, 0.42, 0.85)}
+    return others.get(friction.state, (0.5, 0.5, 0.5))
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,11 +15,11 @@ from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimator
 from magnetosuture_thread.estimator.estimator import EstimatorSettings
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
-from magnetosuture_thread.thread.formulations import FORMULATIONS, PaperOptions
 from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
+from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
 from magnetosuture_thread.thread.solvers import SOLVERS
 from magnetosuture_thread.thread_observation import ThreadObservation
 

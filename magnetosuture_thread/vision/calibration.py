@@ -16,14 +16,13 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import EVERY_NODE
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.vision.dish.find import find_dish
+from magnetosuture_thread.vision.dish import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
 from magnetosuture_thread.vision.needle.arc import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
-STRAIGHT_PX = 0.3  # residual of a similarity; beyond, and beyond twice that of a homography, the camera is tilted
 MAX_TILT = math.radians(35.0)
 MAX_SCATTER_PX = 1.5  # of the dish or the markers from frame to frame
 CORNERS = ((-1, 1), (1, 1), (1, -1), (-1, -1))  # of a square, clockwise as seen from the top left
@@ -164,7 +163,8 @@ def calibrate_by_markers(
     points = np.vstack([0.5 * spacing * centre + 0.5 * side * square for centre in square])
     view, residual = _similarity(points, pixels)
     homography = None
-    tilted = _homography(points, pixels) if residual > STRAIGHT_PX else None
+    # Beyond 0.3 px, and beyond twice the residual of a homography, the camera is tilted.
+    tilted = _homography(points, pixels) if residual > 0.3 else None
     if tilted is not None and tilted[2] < 0.5 * residual:
         view, homography, residual = tilted
     if residual > MAX_RESIDUAL_PX:

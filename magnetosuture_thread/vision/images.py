@@ -1,32 +1,32 @@
-"""Images: from bytes to pixels, and what of them is measured on.
-
-Size and orientation are read from the first bytes, before anything is decoded: a megabyte may decode to gigabytes.
-"""
+"""Images: from bytes to pixels, what of them is measured on, and samples between pixels."""
 
 from __future__ import annotations
 
-import struct
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+import io
+import math
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.untrusted import MAX_PIXELS
-from magnetosuture_thread.vision.sampling import distances, sample_inside
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
-JPEG_SIZES = (*range(0xC0, 0xC4), *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0))  # segments with a size
-MAX_SEGMENTS = 10_000  # of a JPEG or PNG before its pixels
-ORIENTATION = 274  # TIFF's tag, which EXIF has too
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
 FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
-FLOOR_CELLS = 9  # side of the median window on that grid: wider than a needle, a thread, a speck
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
+NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
+
+Gray = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,11 @@ class Layer:
         pixels: shape (rows, columns), uint8.
         small: the same, shrunk by area.
         floor: how bright what is behind all slender things is, in the pixels of `small`.
-        cleared: the last needle that was taken out of it, and the pixels without it; see `without_needle`.
     """
 
     pixels: np.ndarray
     small: np.ndarray
     floor: np.ndarray
-    cleared: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
-
-    def replaced(self, pixels: np.ndarray) -> Layer:
-        """Return the layer with other pixels."""
-        return replace(self, pixels=pixels)
 
 
 @dataclass(frozen=True)
@@ -112,7 +106,7 @@ def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:
     rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
     if mask is not None:
         rough = mask.show_floor(rough)
-    floor = cv2.medianBlur(rough, FLOOR_CELLS)
+    floor = cv2.medianBlur(rough, 9)  # cells: wider than a needle, a thread, a speck
     return Layer(pixels, small, cv2.resize(floor, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
@@ -131,9 +125,8 @@ class Wall:
     def distances(self, box: tuple[slice, slice]) -> np.ndarray:
         """Return how far the pixels of some rows and columns are from the centre [px]."""
         rows, columns = box
-        result = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-        distances(rows.start, columns.start, self.centre, result)
-        return result
+        v = np.arange(rows.start, rows.stop)[:, None] - self.centre[1]
+        return np.hypot(np.arange(columns.start, columns.stop) - self.centre[0], v)
 
     def floor(self, channel: Layer, factor: int, box: tuple[slice, slice]) -> np.ndarray:
         """Return how bright the floor is in some rows and columns, `FLOOR_DEPTH_PX` inside of the wall and beyond.
@@ -141,37 +134,32 @@ class Wall:
         There the floor of a channel is mixed with the rim. What is farther out has the brightness of the place on
         the way to the centre that is so far inside.
         """
-        rows, columns = box
-        result = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        depth = self.radius - FLOOR_DEPTH_PX
-        sample_inside(channel.floor, factor, rows.start, columns.start, self.centre, depth, result)
-        return result
+        v, u = np.mgrid[box]
+        offsets = np.stack([u, v], axis=-1) - self.centre
+        share = np.minimum(1.0, max(0.0, self.radius - FLOOR_DEPTH_PX) / np.maximum(self.distances(box), 1.0))
+        at = (share[..., None] * offsets + self.centre - 0.5 * (factor - 1)) / factor
+        return np.asarray(sampled(channel.floor, at) + 0.5).astype(np.uint8)
 
 
-def without_wall(channel: Layer, factor: int, wall: Wall, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return a channel's pixels in which all beyond the wall has the floor's brightness within a box.
+def without_wall(channel: Layer, pixels: Gray, factor: int, wall: Wall, around: Points, reach: float) -> Gray:
+    """Return pixels of a channel in which all beyond the wall has the floor's brightness around a point.
 
     What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
 
     Args:
         channel: of the frame.
-        factor: how much smaller its floor is.
+        pixels: of it, without the needle.
+        factor: how much smaller the channel's floor is.
         wall: of the dish.
-        low: least u and v of the box [px].
-        high: greatest u and v [px].
-
-    Returns:
-        A copy, or the pixels themselves where nothing of the box is beyond.
+        around: the point, shape (2,) [px].
+        reach: half of the side of the square around it [px].
     """
-    rows, columns = channel.pixels.shape
-    left, top = (max(0, int(value)) for value in low)
-    right, bottom = min(columns, int(high[0]) + 1), min(rows, int(high[1]) + 1)
-    box = slice(top, bottom), slice(left, right)
-    beyond = wall.distances(box) > wall.radius
-    if not beyond.any():
-        return channel.pixels
-    result = channel.pixels.copy()
-    np.copyto(result[box], wall.floor(channel, factor, box), where=beyond)
+    rows, columns = pixels.shape
+    left, top = np.maximum(around - reach, 0.0).astype(int)
+    right, bottom = np.minimum(around + reach + 1.0, (columns, rows)).astype(int)
+    box = slice(top, max(top, bottom)), slice(left, max(left, right))
+    result = pixels.copy()
+    np.copyto(result[box], wall.floor(channel, factor, box), where=wall.distances(box) > wall.radius)
     return result
 
 
@@ -184,24 +172,34 @@ def glare_mask(picture: Picture) -> np.ndarray:
 def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     """Decode a JPEG, PNG, BMP, TIFF or WebP image to BGR, its pixels as they are stored.
 
-    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. See
-    `image_header` to know of it.
+    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. Size
+    and kind are read from the header before any pixel is decoded: a megabyte may decode to gigabytes.
 
     Raises:
         InvalidInputError: the bytes are no image that can be decoded, or of more than `MAX_PIXELS`.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
-    header = image_header(buffer.data)
-    if header is not None and header.width * header.height > MAX_PIXELS:
-        size = f"{header.width} x {header.height} pixels"
-        raise InvalidInputError("image.data", size, f"at most {MAX_PIXELS} pixels")
+    width, height = _size_of(buffer)
+    if width * height > MAX_PIXELS:
+        raise InvalidInputError("image.data", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
     try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if header else None
+        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if width else None
     except cv2.error:  # some headers promise more than can be made
         image = None
     if image is None:
         raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image, or BMP, TIFF, WebP")
     return image
+
+
+def _size_of(buffer: np.ndarray) -> tuple[int, int]:
+    """Return width and height by a picture's header, 0 and 0 where the bytes are none."""
+    try:
+        with Image.open(io.BytesIO(buffer), formats=("JPEG", "PNG", "BMP", "TIFF", "WEBP")) as picture:
+            return picture.size
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:  # far more pixels than we take
+        raise InvalidInputError("image.data", str(error), f"at most {MAX_PIXELS} pixels") from None
+    except Exception:  # a damaged picture raises whatever its reader did not expect
+        return 0, 0
 
 
 def unpack_image(
@@ -248,107 +246,128 @@ def measured_channel(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image if image.ndim == 2 else image[:, :, 1])
 
 
-class ImageHeader(NamedTuple):
-    """What a picture says of itself.
+def middle(values: np.ndarray) -> float:
+    """Return the median of values of any shape, the upper one of two; numpy's own takes ten times as long."""
+    half = values.size // 2
+    return float(np.partition(values, half, axis=None)[half])
 
-    Attributes:
-        width: columns.
-        height: rows.
-        orientation: by EXIF, 1 to 8; 1 is upright, and what a picture without any has.
+
+def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first index and the one after the last of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+
+
+def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
+    """Return an image at points of shape (..., 2), bilinear; outside, at the nearest point of its border.
+
+    Its shape is (...), for an image with colours (..., colours).
     """
-
-    width: int
-    height: int
-    orientation: int = 1
-
-
-def image_header(data: bytes | memoryview) -> ImageHeader | None:
-    """Return size and orientation of a JPEG, PNG, BMP, TIFF or WebP; None where the bytes are none of them."""
-    view = memoryview(data)
-    begin = bytes(view[:32])
-    try:
-        if begin.startswith(b"\xff\xd8"):
-            return _jpeg(view)
-        if begin.startswith(b"\x89PNG\r\n\x1a\n"):
-            width, height = struct.unpack_from(">II", view, 16)
-            return ImageHeader(width, height, _png_orientation(view))
-        if begin.startswith(b"BM"):
-            width, height = struct.unpack_from("<ii", view, 18)
-            return ImageHeader(abs(width), abs(height))
-        if begin[:4] in (b"II*\0", b"MM\0*"):
-            tags = _tags(view)
-            return ImageHeader(tags[256], tags[257], tags.get(ORIENTATION, 1))
-        if begin.startswith(b"RIFF") and begin[8:12] == b"WEBP":
-            return _webp(view, begin[12:16])
-    except (struct.error, LookupError, ValueError):
-        pass
-    return None
+    if image.ndim == 3:  # of few points
+        left, top = np.maximum(np.floor(points.reshape(-1, 2).min(axis=0)), 0.0).astype(int)
+        right, bottom = np.ceil(points.reshape(-1, 2).max(axis=0)).astype(int) + 2
+        near = cv2.split(image[top : max(top + 2, bottom), left : max(left + 2, right)])
+        return np.stack([sampled(colour, points - (left, top)) for colour in near], axis=-1)
+    values = np.empty(points.shape[:-1])
+    sample_all(np.ascontiguousarray(image), np.ascontiguousarray(points).reshape(-1, 2), values.reshape(-1))
+    return values
 
 
-def _jpeg(view: memoryview) -> ImageHeader | None:
-    at, orientation = 2, 1
-    for _ in range(MAX_SEGMENTS):
-        window = bytes(view[at : at + 4096])
-        at += window.index(b"\xff")  # as decoders do: what is between segments is skipped
-        window = window[window.index(b"\xff") :]
-        at += len(window) - len(window.lstrip(b"\xff"))
-        kind = view[at]
-        at += 1
-        if kind in (0x01, *range(0xD0, 0xD9)):  # without a length
-            continue
-        (length,) = struct.unpack_from(">H", view, at)
-        if kind in JPEG_SIZES:
-            height, width = struct.unpack_from(">HH", view, at + 3)
-            return ImageHeader(width, height, orientation)
-        if kind == 0xE1 and bytes(view[at + 2 : at + 8]) == b"Exif\0\0":
-            orientation = _exif_orientation(view[at + 8 : at + length])
-        if kind == 0xDA:
-            return None
-        at += max(length, 2)
-    return None
+def straightened(image: NDArray[Any], axis: tuple[float, float, float, float], along: Points, aside: Points) -> Points:
+    """Return an image along and aside of an arc, shape (m, n); see `straighten`."""
+    strip = np.empty((len(along), len(aside)))
+    straighten(image, axis, along, aside, strip)
+    return strip
 
 
-def _png_orientation(view: memoryview) -> int:
-    at = 8
-    for _ in range(MAX_SEGMENTS):
-        if at + 8 > len(view):
-            break
-        length, kind = struct.unpack_from(">I4s", view, at)
-        if kind == b"eXIf":
-            return _exif_orientation(view[at + 8 : at + 8 + length])
-        at += 12 + length
-    return 1
+@compiled
+def sample(image, u, v):
+    """Return an image at a point, bilinear; 0 outside."""
+    column, row = int(np.floor(u)), int(np.floor(v))
+    if column < 0 or row < 0 or column >= image.shape[1] - 1 or row >= image.shape[0] - 1:
+        return 0.0
+    x, y = u - column, v - row
+    upper = image[row, column] * (1.0 - x) + image[row, column + 1] * x
+    lower = image[row + 1, column] * (1.0 - x) + image[row + 1, column + 1] * x
+    return upper * (1.0 - y) + lower * y
 
 
-def _webp(view: memoryview, kind: bytes) -> ImageHeader | None:
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(view[at : at + 3], "little") + 1 for at in (24, 27))
-        return ImageHeader(width, height)
-    if kind == b"VP8L":
-        (bits,) = struct.unpack_from("<I", view, 21)
-        return ImageHeader((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
-    if kind == b"VP8 ":
-        width, height = struct.unpack_from("<HH", view, 26)
-        return ImageHeader(width & 0x3FFF, height & 0x3FFF)
-    return None
+@compiled
+def within(image, u, v):
+    """Return an image at a point, bilinear; outside, at the nearest point of its border."""
+    u = min(max(u, 0.0), image.shape[1] - 1.001)
+    v = min(max(v, 0.0), image.shape[0] - 1.001)
+    return sample(image, u, v)
 
 
-def _exif_orientation(exif: memoryview) -> int:
-    try:
-        return _tags(exif).get(ORIENTATION, 1)
-    except (struct.error, LookupError):
-        return 1
+@compiled
+def sample_all(image, points, values):
+    """Fill in an image at points, shape (m, 2); see `within`."""
+    for index in range(len(points)):
+        values[index] = within(image, points[index, 0], points[index, 1])
 
 
-def _tags(view: memoryview) -> dict[int, int]:
-    """Return the numbers in the first directory of a TIFF, by tag."""
-    order = {b"II": "<", b"MM": ">"}[bytes(view[:2])]
-    (start,) = struct.unpack_from(f"{order}I", view, 4)
-    (count,) = struct.unpack_from(f"{order}H", view, start)
-    tags = {}
-    for index in range(min(count, 1000)):
-        at = start + 2 + 12 * index
-        tag, kind, number = struct.unpack_from(f"{order}HHI", view, at)
-        if kind in (1, 3, 4) and number == 1:
-            (tags[tag],) = struct.unpack_from(order + " B HI"[kind], view, at + 8)
-    return tags
+@compiled
+def straighten(gray, start, along, aside, strip):
+    """Fill a strip with the image along an arc; see `Arc.at`.
+
+    Args:
+        gray: shape (rows, columns), uint8.
+        start: u, v, angle and curvature of the arc [px, px, rad, 1/px].
+        along: lengths along the arc, shape (n,) [px].
+        aside: distances aside of it, shape (m,) [px].
+        strip: filled, shape (n, m).
+    """
+    u, v, angle, curvature = start
+    for row in range(len(along)):
+        s = along[row]
+        half = 0.5 * curvature * s
+        chord = s if abs(half) < 1e-9 else s * math.sin(half) / half
+        x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
+        across, down = -math.sin(angle + 2.0 * half), math.cos(angle + 2.0 * half)
+        for column in range(len(aside)):
+            strip[row, column] = within(gray, x + aside[column] * across, y + aside[column] * down)
+
+
+@compiled
+def straighten_both(one, other, start, first, aside, strip, other_strip):
+    """Fill two strips with two images along an arc at steps of a pixel, as `straighten` does.
+
+    The arc's direction is turned on from row to row, and both images are sampled at once: half the time.
+
+    Args:
+        one: shape (rows, columns).
+        other: of the same shape.
+        start: u, v, angle and curvature of the arc [px, px, rad, 1/px].
+        first: length along the arc of the first row [px].
+        aside: distances aside of it, shape (m,) [px].
+        strip: filled, shape (n, m).
+        other_strip: filled, of the same shape.
+    """
+    u, v, angle, curvature = start
+    rows, columns = one.shape
+    last_u, last_v = columns - 1.001, rows - 1.001
+    half = 0.5 * curvature * first
+    chord = first if abs(half) < 1e-9 else first * math.sin(half) / half
+    x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
+    ahead, down = math.cos(angle + 2.0 * half), math.sin(angle + 2.0 * half)
+    half = 0.5 * curvature
+    cosine, sine = math.cos(half), math.sin(half)
+    chord = 1.0 if abs(half) < 1e-9 else sine / half
+    for index in range(len(strip)):
+        for place in range(len(aside)):
+            at_u = min(max(x - aside[place] * down, 0.0), last_u)
+            at_v = min(max(y + aside[place] * ahead, 0.0), last_v)
+            column, row = np.uint64(int(at_u)), np.uint64(int(at_v))
+            right, below = at_u - column, at_v - row
+            left, above = 1.0 - right, 1.0 - below
+            upper = left * one[row, column] + right * one[row, column + NEXT]
+            lower = left * one[row + NEXT, column] + right * one[row + NEXT, column + NEXT]
+            strip[index, place] = above * upper + below * lower
+            upper = left * other[row, column] + right * other[row, column + NEXT]
+            lower = left * other[row + NEXT, column] + right * other[row + NEXT, column + NEXT]
+            other_strip[index, place] = above * upper + below * lower
+        # A chord of an arc is turned by half of the arc's turn, what follows it by the other half.
+        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
+        x, y = x + chord * ahead, y + chord * down
+        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine

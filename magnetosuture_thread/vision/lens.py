@@ -15,9 +15,7 @@ from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.untrusted import BudgetError, check_yaml
 
 COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
-MAX_TEXT_BYTES = 1 << 16
 MAX_SIDE_PX = 65536
-MAX_SHIFT = 0.5  # of the frame's diagonal, by which a lens may move a pixel
 GRID = 33  # points along each side at which a lens is checked
 
 
@@ -75,7 +73,7 @@ class Lens:
         shift = np.hypot(u - regular[0], v - regular[1]).max()
         du, dv = np.gradient(u), np.gradient(v)
         turned = (du[1] * dv[0] - du[0] * dv[1]).min() <= 0.0 or min(du[1].min(), dv[0].min()) <= 0.0
-        if not np.isfinite(shift) or shift > MAX_SHIFT * diagonal or turned:
+        if not np.isfinite(shift) or shift > 0.5 * diagonal or turned:
             given = f"{self.model} with coefficients up to {np.abs(self.coefficients).max():g}"
             raise InvalidInputError(f"{name}.d", given, "a distortion that can be undone over the whole frame")
 
@@ -146,7 +144,7 @@ def read_lens(path: Path) -> Lens:
         InvalidInputError: it cannot be read, is no such file, or see `Lens`.
     """
     try:
-        text = read_regular(path, MAX_TEXT_BYTES).decode()
+        text = read_regular(path, 1 << 16).decode()
         check_yaml(text)
         content = yaml.load(text, yaml.CSafeLoader)
         matrix, coefficients = (content[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))

@@ -12,10 +12,8 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.outputs import output_problem
-from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
-from magnetosuture_thread.vision.look import State, Track
-from magnetosuture_thread.vision.scene_mask import mask_outlines
+from magnetosuture_thread.vision.tracker import State, Track
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}
 SHIFT = 4  # binary places of a coordinate
@@ -57,14 +55,6 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
         _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, (40, 200, 255), -1)
     _plate(drawn, track, title, unit)
     return drawn
-
-
-def draw_scene(image: np.ndarray, view: DishView, scene: Scene) -> None:
-    """Draw the dish's circle and the outlines of the shapes into a BGR image."""
-    _circle(image, np.asarray(view.centre_px), scene.dish.radius / view.metres_per_pixel, DISH, 1)
-    for geometry in scene.obstacles:
-        for ring in mask_outlines(geometry):
-            _line(image, view.to_pixels(np.vstack([ring, ring[:1]])), (190, 90, 170), 1)
 
 
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:

@@ -10,8 +10,7 @@ height, parallax, calibration):
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,44 +32,34 @@ class SceneMask:
     """Where the shapes of a scene are in a frame or in a part of it.
 
     Attributes:
-        solid: 255 where neither needle nor thread can be, `factor` times smaller than the frame, uint8.
-        inside: the same for a tolerance of 0.
         depth: distance from the outlines, positive inside of a shape, shape (rows, columns), float32 [px].
         tolerance_px: see the module [px].
         rim: points along the outlines and the index of their shape, shape (m, 3) [px].
-        factor: how much smaller `solid` and `inside` are.
         floor_cells: for each cell of the floor's grid the column and row of the nearest one that no shape covers,
             shape (rows, columns, 2), int16.
         cell: side of such a cell [px].
     """
 
-    solid: Mask
-    inside: Mask
     depth: NDArray[np.float32]
     tolerance_px: float
     rim: Points
-    factor: int
     floor_cells: NDArray[np.int16]
     cell: int
 
     def part(self, left: int, top: int, right: int, bottom: int) -> SceneMask:
-        """Return the mask of a part of the frame; left and top are multiples of `factor` and `cell` [px]."""
-        full = (slice(top, bottom), slice(left, right))
-        small = (
-            slice(top // self.factor, -(-bottom // self.factor)),
-            slice(left // self.factor, -(-right // self.factor)),
+        """Return the mask of a part of the frame; left and top are multiples of `cell` [px]."""
+        cell = self.cell
+        cells = self.floor_cells[top // cell : -(-bottom // cell), left // cell : -(-right // cell)]
+        return replace(
+            self,
+            depth=self.depth[top:bottom, left:right],
+            rim=self.rim - (left, top, 0.0),
+            floor_cells=cells - np.array([left // cell, top // cell], np.int16),
         )
-        cells = (slice(top // self.cell, -(-bottom // self.cell)), slice(left // self.cell, -(-right // self.cell)))
-        return SceneMask(
-            self.solid[small],
-            self.inside[small],
-            self.depth[full],
-            self.tolerance_px,
-            self.rim - (left, top, 0.0),
-            self.factor,
-            self.floor_cells[cells] - np.array([left // self.cell, top // self.cell], np.int16),
-            self.cell,
-        )
+
+    def solid(self, size: tuple[int, int], tolerance_px: float) -> Mask:
+        """Return where neither needle nor thread can be by a tolerance, 255 there, in a mask of a smaller size."""
+        return cv2.compare(cv2.resize(self.depth, size, interpolation=cv2.INTER_AREA), tolerance_px, cv2.CMP_GT)
 
     @property
     def band_px(self) -> float:
@@ -98,16 +87,13 @@ class SceneMask:
         return self.depth[np.clip(at[:, 1], 0, rows - 1), np.clip(at[:, 0], 0, columns - 1)]
 
 
-def scene_mask(
-    scene: Scene, view: DishView, shape: tuple[int, ...], factor: int, tolerance: float, cell: int
-) -> SceneMask | None:
+def scene_mask(scene: Scene, view: DishView, shape: tuple[int, ...], tolerance: float, cell: int) -> SceneMask | None:
     """Return the mask of a frame; None for a scene without shapes.
 
     Args:
         scene: dish and shapes.
         view: where the dish is in the frame.
         shape: rows and columns of the frame.
-        factor: how much smaller the small masks are.
         tolerance: what the scene's outline and the visible one may differ by [m].
         cell: side of a cell of the floor's grid [px].
     """
@@ -122,22 +108,9 @@ def scene_mask(
         cv2.bitwise_or(inside, own, inside)
     # Filling takes every pixel that an edge touches: half a pixel too many, as blur makes a dark shape look too.
     depth = _distance(inside) - _distance(cv2.bitwise_not(inside))
-    tolerance_px = tolerance / view.metres_per_pixel
-    solid = np.where(depth > tolerance_px, 255, 0).astype(np.uint8)
-    size = (math.ceil(columns / factor), math.ceil(rows / factor))
-    solid = cv2.compare(_shrunk(solid, factor, size), 254, cv2.CMP_GT)
-    small_inside = cv2.compare(_shrunk(inside, factor, size), 127, cv2.CMP_GT)
     cells = cv2.resize(inside, (max(2, columns // cell), max(2, rows // cell)), interpolation=cv2.INTER_AREA)
-    return SceneMask(
-        solid,
-        small_inside,
-        depth,
-        tolerance_px,
-        _rim(scene, view),
-        factor,
-        _nearest_uncovered(cells > 0.1 * 255.0),
-        cell,
-    )
+    floor_cells = _nearest_uncovered(cells > 0.1 * 255.0)
+    return SceneMask(depth, tolerance / view.metres_per_pixel, _rim(scene, view), floor_cells, cell)
 
 
 def mask_outlines(geometry: Disc | Polygon) -> list[Points]:
@@ -179,12 +152,3 @@ def _distance(inside: Mask) -> NDArray[np.float32]:
         return np.full(inside.shape, OUTSIDE_DEPTH_PX, np.float32)
     apart = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.maximum(apart - 0.5, 0.0), dtype=np.float32)
-
-
-def _shrunk(mask: Mask, factor: int, size: tuple[int, int]) -> Mask:
-    """Return a mask shrunk by area, the last pixels repeated to whole ones."""
-    if factor == 1:
-        return mask
-    down, right = size[1] * factor - mask.shape[0], size[0] * factor - mask.shape[1]
-    whole = cv2.copyMakeBorder(mask, 0, down, 0, right, cv2.BORDER_REPLICATE)
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -1,30 +1,229 @@
-"""Follows the needle over time: what fits its motion is taken, all else is refused."""
+"""A frame becomes a pose: finds needle and thread in camera frames and follows the needle over time.
+
+What fits the needle's motion is taken, all else is refused.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
+import cv2
 import numpy as np
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.vision.dish.watch import DishWatch, FoundDish
-from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, check_image, shrunk
+from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
+from magnetosuture_thread.vision.dish import DishWatch, FoundDish, Tilt
+from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, check_image, prepare, sampled, shrunk
 from magnetosuture_thread.vision.lens import Lens
-from magnetosuture_thread.vision.look import FrameReader, State, Track, look_once, mask_of, no_pose, why_none
 from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
-from magnetosuture_thread.vision.scene_mask import SceneMask
+from magnetosuture_thread.vision.needle.measure import axis_guesses, find_needles, search_factor
+from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.thread.centreline import find_centreline, without_needle
+from magnetosuture_thread.vision.thread.observe import observe
+from magnetosuture_thread.vision.thread.walk import Ridge, smoothed, walk_on, worth
 
-JUMP_BACK = 1.0  # s; time that goes back by more begins anew, as a bag that was wound back
-GATE_PX, GATE_ANGLE = 3.0, math.radians(6.0)  # off the prediction, beside what the needle's greatest speed allows
-MAX_PREDICTION = 0.2  # s; a motion is not extrapolated farther
+UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
+MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
-MARGIN_PX, BORDER_PX = 32.0, 20.0  # around needle and thread, that is looked at; from its border, where one may go on
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
-MIN_SHARE = 0.9  # of the thread before; if less is visible in the region, the whole frame is looked at
+CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
+REPEATED = "camera repeats frames"
+MAX_CYCLE = 100  # frames; after more of them a repetition is not found
+
+
+class State(Enum):
+    """What is known of the needle in a frame."""
+
+    SEARCHING = "searching"
+    TRACKED = "tracked"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class Track:
+    """What one frame shows.
+
+    Attributes:
+        state: TRACKED when there is a pose; LOST when this frame gives none; SEARCHING while the needle is
+            found anew, or seen but not yet often enough.
+        reason: why there is no pose, or why its heading is unknown; empty when tracked.
+        confidence: of the pose, 0 to 1; 0 without one.
+        tail: the needle's blunt end, shape (2,) [m]; empty without a pose.
+        tip: its point, shape (2,) [m]; empty without a pose.
+        heading: unit tangent at the tail, towards the tip, shape (2,); empty without a pose.
+        curvature: of the needle's axis, positive to the left of the heading [1/m]; 0 without a pose.
+        covariance: of (x, y, heading angle), shape (3, 3) [m, m, rad]; empty without a pose. Where nothing tells which
+            end is the tail, the state is not TRACKED, the variance of the angle is pi^2, and that along the needle its
+            length squared.
+        centreline: the thread from the tail on, shape (m, 2) [m]; fewer than 2 points if unseen.
+        view: where the dish is in the image; None when it is not found.
+        warning: what makes the measurement worse than it could be; empty if nothing does.
+        needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
+        observation: the pieces of the thread that are seen, in the dish frame.
+    """
+
+    state: State
+    reason: str
+    confidence: float
+    tail: np.ndarray
+    tip: np.ndarray
+    heading: np.ndarray
+    curvature: float
+    covariance: np.ndarray
+    centreline: np.ndarray
+    view: DishView | None
+    warning: str = ""
+    needle_length: float | None = None
+    observation: ThreadObservation = field(default_factory=ThreadObservation)
+
+
+def no_pose(state: State, reason: str, view: DishView | None) -> Track:
+    """Return what is said of a frame without a pose."""
+    nothing = np.empty(0)
+    return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Finds needle and thread in frames with one view of the dish.
+
+    Needles and lines are in the pixels of the picture that they were found in; tracks are in the dish frame.
+
+    Attributes:
+        settings: what to look for.
+        dish: where it is in the frame.
+        radius: of the dish [m].
+        mask: where the scene's shapes are in the frame; None if it has none.
+    """
+
+    settings: VisionTrackerSettings
+    dish: FoundDish
+    radius: float
+    mask: SceneMask | None
+
+    def picture(self, image: np.ndarray, box: tuple[int, int, int, int] | None = None) -> Picture:
+        """Make a part of a prepared frame ready to measure on.
+
+        Args:
+            image: the frame.
+            box: left, top, right, bottom [px]; None for all of the dish.
+        """
+        view = self.dish.view
+        if box is None:
+            reach = self.radius / view.metres_per_pixel + 32.0  # with what tells the floor's light at the wall
+            box = region(image, np.subtract(view.centre_px, reach), np.add(view.centre_px, reach))
+        left, top, right, bottom = box
+        part = self.mask.part(left, top, right, bottom) if self.mask is not None else None
+        factor = search_factor(self.settings.needle_width / view.metres_per_pixel)
+        return prepare(image[top:bottom, left:right], factor, (left, top), part)
+
+    def needles(
+        self, picture: Picture, estimator: LengthEstimator, toward: np.ndarray | None = None
+    ) -> tuple[list[MeasuredNeedle], list[str]]:
+        """Find the needles in a picture, by the length as it is set or measured; see `find_needles`."""
+        settings, scale = self.settings, self.dish.view.metres_per_pixel
+        size = estimator.size(settings.needle_length, settings.needle_width, scale)
+        return find_needles(picture, self._local(picture), self.radius, size, toward)
+
+    def centreline(self, picture: Picture, gray: np.ndarray, needle: MeasuredNeedle) -> Points:
+        """Return the thread's centreline from a needle's tail on, shape (m, 2) [px]; m = 1 if none is visible.
+
+        Args:
+            picture: the frame or a part of it.
+            gray: its darkest colour without the needle.
+            needle: in its pixels.
+        """
+        if not needle.heading_known:
+            return needle.tail_px[None]
+        scale = self.dish.view.metres_per_pixel
+        wall = Wall(self._local(picture).centre_px, self.radius / scale)
+        return find_centreline(picture, gray, needle, MAX_LENGTH_RATIO * self.settings.thread_length / scale, wall)
+
+    def with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> tuple[MeasuredNeedle | None, str]:
+        """Return the needle that a thread leaves, and why there is none if there is none.
+
+        `needles` are all that were found, at least one. A needle that is alone needs no thread.
+        """
+        if len(needles) == 1:
+            return needles[0], ""
+        least = 0.04 * self.settings.thread_length / self.dish.view.metres_per_pixel
+        lines = [
+            self.centreline(picture, without_needle(picture.darkest, picture.factor, needle), needle)
+            for needle in needles
+        ]
+        with_thread = [needle for needle, line in zip(needles, lines, strict=True) if arc_lengths(line)[-1] >= least]
+        return (with_thread[0], "") if len(with_thread) == 1 else (None, f"{len(needles)} needles in the dish")
+
+    def track(
+        self,
+        picture: Picture,
+        needle: MeasuredNeedle,
+        otherwise: State,
+        *,
+        search: bool,
+    ) -> Track:
+        """Return what a frame shows whose needle is known.
+
+        Args:
+            picture: the frame or a part of it.
+            needle: in its pixels.
+            otherwise: the state if it is unknown which end is the tail.
+            search: whether to look for pieces of the thread that the centreline does not show; see `observe`.
+        """
+        view, local = self.dish.view, self._local(picture)
+        heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_edge_px)
+        given = self.settings.metres_per_pixel > 0.0
+        length, gray = self.settings.thread_length, without_needle(picture.darkest, picture.factor, needle)
+        line = self.centreline(picture, gray, needle)
+        observation = observe(
+            picture, smoothed(gray), needle, line, local, self.radius, length, scale_known=given, search=search
+        )
+        if self.dish.tilt is not None:  # What a straight camera's view leaves unknown moves all points alike.
+            pieces = tuple(_less_sure(piece, self.dish.tilt, self.radius) for piece in observation.pieces)
+            observation = replace(observation, pieces=pieces)
+        return Track(
+            state=State.TRACKED if needle.heading_known else otherwise,
+            reason="" if needle.heading_known else UNKNOWN_HEADING,
+            confidence=needle.confidence,
+            tail=tail,
+            tip=local.to_dish(needle.tip_px),
+            heading=heading,
+            curvature=-needle.curvature_px / view.metres_per_pixel,
+            covariance=_in_dish(needle, view) + self.dish.covariance(tail, heading, self.radius),
+            centreline=local.to_dish(line),
+            view=view,
+            warning=self.dish.warning,
+            observation=observation,
+        )
+
+    def _local(self, picture: Picture) -> DishView:
+        """Return the view in the pixels of a picture."""
+        return replace(self.dish.view, centre_px=tuple(np.subtract(self.dish.view.centre_px, picture.origin).tolist()))
+
+
+def _less_sure(piece: ThreadPiece, tilt: Tilt, radius: float) -> ThreadPiece:
+    """Return a piece with what a tilt leaves unknown of where it is, as far out as it reaches."""
+    farthest = piece.points[np.argmax(np.hypot(*piece.points.T))]
+    view = tilt.covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
+    return replace(piece, deviation=np.sqrt(piece.deviation**2 + np.linalg.eigvalsh(view)[-1]))
+
+
+def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
+    """Return the covariance of tail and heading in the dish frame, shape (3, 3)."""
+    along = view.directions_to_dish(needle.direction_px)
+    aside = view.directions_to_dish(np.array([-needle.direction_px[1], needle.direction_px[0]]))
+    scale = view.metres_per_pixel
+    turn = np.zeros((3, 3))
+    turn[:2, 0], turn[:2, 1], turn[2, 2] = scale * along, scale * aside, -1.0  # the dish's y goes up
+    assert needle.covariance is not None
+    return np.asarray(turn @ needle.covariance @ turn.T)
 
 
 @dataclass(frozen=True)
@@ -40,7 +239,7 @@ class _Pose:
 
     def at(self, time: float) -> tuple[np.ndarray, float]:
         """Return tail and heading angle predicted with constant velocity."""
-        after = min(time - self.time, MAX_PREDICTION)
+        after = min(time - self.time, 0.2)  # s; a motion is not extrapolated farther
         return self.tail + after * self.velocity, self.angle + after * self.turn_rate
 
 
@@ -62,11 +261,6 @@ class VisionTracker:
         self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
         self._shape: tuple[int, ...] = ()
         self.reset()
-
-    @property
-    def dish(self) -> FoundDish | None:
-        """What was found of the dish over time, in pixels of shrunk frames; None if nothing was."""
-        return self._dish.found
 
     def set_scene(self, scene: Scene) -> None:
         """Take another scene. The needle is still tracked, unless the dish has another size."""
@@ -134,11 +328,10 @@ class VisionTracker:
         Raises:
             InvalidInputError: the image is not of this kind.
         """
-        check_image(image)
-        factor = self._given.working_factor(image.shape, self._scene.dish.diameter)
-        small, settings = self._straight(image, factor), self._given.shrunk(factor)
-        found = look_once(small, settings, self._scene, lambda view: self._mask_for(small, view))
-        return self._with_doubt(_enlarged(found, factor), image)
+        alone = VisionTracker(replace(self._given, confirm_frames=1), self._scene)
+        alone._lens, alone._masks = self._lens, self._masks
+        found = alone.track(image, 0.0)
+        return replace(found, state=State.TRACKED if found.state is State.TRACKED else State.LOST, needle_length=None)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame.
@@ -178,14 +371,14 @@ class VisionTracker:
         assert self._dish.found is not None
         mask = self._mask_for(image, view)
         reader = FrameReader(self._settings, self._dish.found, self._scene.dish.radius, mask)
-        chosen, picture, reason = self._choose(image, reader, time_s)
+        chosen, picture, whole, reason = self._choose(image, reader, time_s)
         if chosen is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        whole = picture.shape == image.shape[:2]
-        found = self._read(reader, picture, chosen, search=whole)
+        found = reader.track(picture, chosen, self._missing(), search=whole)
         if not whole and self._is_cut(found, picture):
-            chosen, picture = chosen.shifted(picture.origin), reader.picture(image)
-            found = self._read(reader, picture, chosen, search=True)
+            cut, picture = picture, reader.picture(image)
+            chosen = chosen.shifted((cut.origin[0] - picture.origin[0], cut.origin[1] - picture.origin[1]))
+            found = reader.track(picture, chosen, self._missing(), search=True)
         if not chosen.heading_known:
             return found
         if chosen.size_measured:
@@ -194,10 +387,6 @@ class VisionTracker:
         ends = np.array([found.tail, found.tip])
         self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
         return found
-
-    def _read(self, reader: FrameReader, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> Track:
-        """Return what a frame shows whose needle is known."""
-        return reader.track(picture, needle, reader.centreline(picture, needle), self._missing(), search=search)
 
     def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
         """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
@@ -211,7 +400,8 @@ class VisionTracker:
         if key not in self._masks:
             if len(self._masks) >= 8:
                 self._masks.clear()
-            self._masks[key] = mask_of(image.shape, rounded, self._settings, self._scene)
+            tolerance = self._settings.outline_tolerance
+            self._masks[key] = scene_mask(self._scene, rounded, image.shape[:2], tolerance, FLOOR_FACTOR)
         return self._masks[key]
 
     def _advance(self, time_s: float) -> None:
@@ -219,7 +409,7 @@ class VisionTracker:
         if not math.isfinite(time_s):
             raise InvalidInputError("image.stamp", time_s, "a time [s]")
         if self._time is not None and time_s <= self._time:
-            if time_s > self._time - JUMP_BACK:
+            if time_s > self._time - 1.0:  # s; as a bag that was wound back
                 raise InvalidInputError("image.stamp", f"{time_s:.6f} s", f"a time after {self._time:.6f} s")
             self.reset()
         self._time = time_s
@@ -232,54 +422,55 @@ class VisionTracker:
         if not found.observation.complete:
             return True
         line = found.view.to_pixels(found.centreline)
-        if _length(line) < MIN_SHARE * _length(self._thread[2:]):
+        if _length(line) < 0.9 * _length(self._thread[2:]):  # of the thread before
             return True
         u, v = line[-1] - picture.origin
         rows, columns = picture.shape
-        return bool(min(u, v, columns - 1 - u, rows - 1 - v) < BORDER_PX)
+        return bool(min(u, v, columns - 1 - u, rows - 1 - v) < 20.0)  # px from its border
 
     def _missing(self) -> State:
         return State.LOST if self._last is not None else State.SEARCHING
 
     def _choose(
         self, image: np.ndarray, reader: FrameReader, time: float
-    ) -> tuple[MeasuredNeedle | None, Picture | None, str]:
-        """Return the needle of this frame and the picture it is in, or why there is none."""
+    ) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
+        """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last = reader.dish.view, self._last
-        if last is not None:
-            _, angle = last.at(time)
-            toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = reader.picture(image, self._region(image, view, time))
-            needles, _ = reader.needles(picture, self._length, toward)
+        for whole in (False, True):
+            box, toward = None, None
+            if not whole:
+                if last is None:
+                    continue
+                box, (_, angle) = self._region(image, view, time), last.at(time)
+                toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
+            picture = reader.picture(image, box)
+            needles, refused = reader.needles(picture, self._length, toward)
             needles = [self._as_before(needle, picture, view, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), last)]
-            if len(within) == 1:
+            if len(within) == 1 and not (whole and not within[0].heading_known):
                 self._take(_pose(within[0], picture, view, time), last)
-                return within[0], picture, ""
-        picture = reader.picture(image)
-        needles, refused = reader.needles(picture, self._length)
-        needles = [self._as_before(needle, picture, view, time) for needle in needles]
-        within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), last)]
+                return within[0], picture, whole, ""
         if not needles:
             self._anew = []
-            return None, None, why_none(refused)
-        chosen, _, reason = (within[0], None, "") if len(within) == 1 else reader.with_thread(picture, needles)
+            others = f"; dark things: {', '.join(refused)}" if refused else ""
+            return None, None, True, f"no needle in the dish{others}"
+        chosen, reason = (within[0], "") if len(within) == 1 else reader.with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
-            return chosen, picture, reason
+            return chosen, picture, True, reason
         pose = _pose(chosen, picture, view, time)
         if self._fits(pose, last):
             self._take(pose, last)
-            return chosen, picture, ""
+            return chosen, picture, True, ""
         if self._anew and not self._fits(pose, self._anew[-1]):
             self._anew = []
         self._anew.append(pose)
         if len(self._anew) >= self._settings.confirm_frames:
             self._take(pose, self._anew[-2] if len(self._anew) > 1 else None)
-            return chosen, picture, ""
+            return chosen, picture, True, ""
         if last is not None:
-            return None, None, "a needle farther from the last one than it can move"
-        return None, None, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
+            return None, None, True, "a needle farther from the last one than it can move"
+        return None, None, True, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
 
     def _as_before(self, needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> MeasuredNeedle:
         """Return a needle the other way round if it lies where the last one was, and its shape does not rule that out.
@@ -302,9 +493,10 @@ class VisionTracker:
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
         assert self._dish.view is not None
-        reach = self._settings.max_needle_speed * after + GATE_PX * self._dish.view.metres_per_pixel
+        # 3 px and 6 degrees off the prediction, beside what the needle's greatest speed allows.
+        reach = self._settings.max_needle_speed * after + 3.0 * self._dish.view.metres_per_pixel
         turn = abs((pose.angle - angle + math.pi) % (2.0 * math.pi) - math.pi)
-        max_shift = min(self._settings.max_turn_rate * after + GATE_ANGLE, 0.5 * math.pi)
+        max_shift = min(self._settings.max_turn_rate * after + math.radians(6.0), 0.5 * math.pi)
         return math.dist(pose.tail, tail) < reach and turn < max_shift
 
     def _take(self, pose: _Pose, before: _Pose | None) -> None:
@@ -328,13 +520,20 @@ class VisionTracker:
         """Return the box in which needle and thread should be: left, top, right, bottom [px]."""
         assert self._last is not None
         moved = self._last.at(time)[0] - self._last.tail
-        reach = MARGIN_PX + self._settings.max_needle_speed * (time - self._last.time) / view.metres_per_pixel
+        reach = 32.0 + self._settings.max_needle_speed * (time - self._last.time) / view.metres_per_pixel
         corners = np.vstack([self._thread, self._thread[:2] + view.directions_to_pixels(moved / view.metres_per_pixel)])
         low, high = corners.min(axis=0) - reach, corners.max(axis=0) + reach
-        left, top = (max(0, int(value) // FLOOR_FACTOR * FLOOR_FACTOR) for value in low)
-        right = min(image.shape[1], (int(high[0]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
-        bottom = min(image.shape[0], (int(high[1]) // FLOOR_FACTOR + 1) * FLOOR_FACTOR)
-        return left, top, right, bottom
+        return region(image, low, high)
+
+
+def region(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the box of whole cells of the floor's grid around two corners: left, top, right, bottom [px]."""
+    rows, columns = image.shape[:2]
+    last = FLOOR_FACTOR * (np.array([columns, rows]) // FLOOR_FACTOR - 1)
+    left, top = np.clip(FLOOR_FACTOR * np.floor_divide(low, FLOOR_FACTOR), 0, last).astype(int).tolist()
+    ends = FLOOR_FACTOR * (np.floor_divide(high, FLOOR_FACTOR) + 1)
+    right, bottom = np.clip(ends, (left + FLOOR_FACTOR, top + FLOOR_FACTOR), (columns, rows)).astype(int).tolist()
+    return left, top, right, bottom
 
 
 def _enlarged(track: Track, factor: int) -> Track:
@@ -352,3 +551,132 @@ def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float)
 
 def _length(points: np.ndarray) -> float:
     return float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0
+
+
+class RepetitionDetector:
+    """Finds frames that came before.
+
+    No sensor gives the same noise twice: a frame that is equal, bit for bit, to an earlier one of the last `MAX_CYCLE`
+    is not of this moment. Frames are compared by the hash of a sample of their pixels.
+    """
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, int]] = deque(maxlen=MAX_CYCLE)
+
+    def is_repeated(self, time_s: float, image: np.ndarray) -> bool:
+        """Return whether a frame, taken at a time [s], was there before that time, and keep it."""
+        # About 64 rows are compared, and as dense columns: what moves in a dish covers several.
+        step = max(1, min(image.shape[:2]) // 64)
+        sample = hash(image[::step, ::step].tobytes())
+        # A bag that was wound back gives its frames again, at the same times.
+        repeated = any(sample == other and before < time_s for before, other in self._seen)
+        self._seen.append((time_s, sample))
+        return repeated
+
+
+@dataclass(frozen=True)
+class FrameMeasurement:
+    """What is told of one frame.
+
+    Attributes:
+        track: what was seen.
+        centreline: of the thread, equally spaced from the needle's tail on, shape (64, 2) [m]; shape (0, 2) where
+            there is none to tell.
+        problem: why the frame was refused, if it was.
+    """
+
+    track: Track
+    centreline: Points
+    problem: InvalidInputError | None = None
+
+    @property
+    def tracked(self) -> bool:
+        """Whether there is a pose to tell."""
+        return self.track.state is State.TRACKED
+
+
+class TrackerSession:
+    """Tracks needle and thread over one run.
+
+    The node `vision_tracker` and the replay without a graph are both a shell around this, so that the same
+    frames give the same poses to the last bit.
+
+    Args:
+        settings: what to look for.
+        scene: the dish, and the shapes in which neither needle nor thread can be.
+
+    Attributes:
+        frames: that came.
+        tracked: those with a pose.
+    """
+
+    def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
+        self._tracker = VisionTracker(settings, scene)
+        self._repetition = RepetitionDetector()
+        self.frames = self.tracked = 0
+
+    @property
+    def missing(self) -> State:
+        """What to say of a frame that shows nothing: lost, or searching if there never was a needle."""
+        return State.LOST if self.tracked else State.SEARCHING
+
+    def set_scene(self, scene: Scene) -> None:
+        """Take another scene; see `VisionTracker.set_scene`."""
+        self._tracker.set_scene(scene)
+
+    def set_lens(self, lens: Lens | None) -> None:
+        """Take the camera's lens; see `VisionTracker.set_lens`."""
+        self._tracker.set_lens(lens)
+
+    def on_image(self, time_s: float, image: np.ndarray) -> FrameMeasurement:
+        """Look at the next frame, taken at a time [s]; see `VisionTracker.track`. One that came before has no pose."""
+        try:
+            track = self._tracker.track(image, time_s)
+        except InvalidInputError as error:
+            return self.on_broken(error)
+        if self._repetition.is_repeated(time_s, image) and len(track.tail):
+            track = no_pose(self.missing, REPEATED, track.view)
+        self.frames += 1
+        self.tracked += track.state is State.TRACKED
+        return FrameMeasurement(track, published_centreline(track))
+
+    def on_broken(self, problem: InvalidInputError) -> FrameMeasurement:
+        """Count a frame that cannot be looked at, and say why."""
+        self.frames += 1
+        return FrameMeasurement(no_pose(self.missing, str(problem), None), np.empty((0, 2)), problem)
+
+
+def published_centreline(track: Track) -> Points:
+    """Return what is told of a centreline: `CENTRELINE_POINTS` vertices equally spaced, or none, shape (m, 2) [m]."""
+    if len(track.centreline) < 2:
+        return np.empty((0, 2))
+    at = np.linspace(0.0, arc_lengths(track.centreline)[-1], CENTRELINE_POINTS)
+    return points_at(track.centreline, at)
+
+
+def warm_up() -> bool:
+    """Look at a drawn dish, needle and thread, and run what only other frames need.
+
+    Where nothing is compiled yet this takes a minute, and no frame compiles anything later. From now on OpenCV stays on
+    one thread in this process: at these sizes it costs more to wake others.
+
+    Returns:
+        Whether the drawn needle was found, as it must be.
+    """
+    cv2.setNumThreads(1)
+    image = np.full((480, 640), 170, np.uint8)
+    cv2.circle(image, (320, 240), 222, 60, 5, cv2.LINE_AA)
+    cv2.circle(image, (320, 240), 218, 225, -1, cv2.LINE_AA)
+    cv2.polylines(image, [np.array([[300, 240], [200, 240], [120, 280]])], False, 140, 1, cv2.LINE_AA)
+    outline = [(300.0, 237.5), (370.0, 237.5), (387.5, 240.0), (370.0, 242.5), (300.0, 242.5)]
+    cv2.fillPoly(image, [np.round(np.array(outline) * 16).astype(np.int32)], 45, cv2.LINE_AA, 4)
+    image = cv2.GaussianBlur(image, (0, 0), 0.9)
+    # What a plain frame does not reach: a needle in one dark thing with its thread, crossings, and other pieces.
+    sampled(np.zeros((4, 4), np.float32), np.zeros((1, 2)))
+    core = np.zeros((60, 60), np.uint8)
+    core[10, 5:55] = core[10:50, 54] = core[49, 5:55] = 1  # long and winding
+    axis_guesses(cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0, 30.0, 5.0)
+    path, strong, nothing = np.zeros((8, 6)), np.zeros(8, np.bool_), np.zeros((16, 16), np.uint8)
+    walk_on(Ridge(nothing, nothing, 1.0, 1.0), (8.0, 8.0, 8.0), 4.0, path, strong, 1)
+    worth(path, strong, 1)
+    return not VisionTracker(VisionTrackerSettings(), Scene()).look(image).reason

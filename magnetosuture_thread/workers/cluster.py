@@ -15,13 +15,11 @@ import dask
 from distributed import Client, KilledWorker, as_completed, get_worker
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.workers.pool import Log, Progress, Work, WorkerDiedError
+from magnetosuture_thread.workers import Log, Progress, Work, WorkerDiedError
 
 CONNECT_TIMEOUT = 20.0  # s to reach the scheduler
-WORKERS_TIMEOUT = 60.0  # s for its first worker, which may still start
 # A result has the same bits only where these are the same. OpenCV comes by pip or as Ubuntu's package.
 SOFTWARE = ("magnetosuture_thread", "numpy", "scipy", "numba", "opencv-python-headless", "osqp")
-MAX_WORK_BYTES = "1 GB"  # of the work, sent once; Dask warns beyond 10 MB, which a few recorded runs have
 _ONE_AT_A_TIME = threading.Lock()  # in a worker of several threads: matplotlib is not made for them
 
 
@@ -53,8 +51,9 @@ class ClusterRunner:
         except (OSError, ValueError, asyncio.TimeoutError) as error:
             raise self._refused("the address of a running Dask scheduler", error) from None
         try:
-            self._client.wait_for_workers(1, timeout=WORKERS_TIMEOUT)
-            with dask.config.set({"distributed.admin.large-graph-warning-threshold": MAX_WORK_BYTES}):
+            self._client.wait_for_workers(1, timeout=60.0)  # the first may still start
+            # The work is sent once; Dask warns beyond 10 MB, which a few recorded runs have.
+            with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
                 # A task of its own and not scattered data, which would be lost with the workers that hold it.
                 self._loaded = self._client.submit(pickle.loads, self._work, pure=False)
         except TimeoutError as error:

@@ -15,7 +15,7 @@ from benchmarks.__main__ import main
 from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import Case
 from benchmarks.vision.measurements import compare, frame_of, row_of
-from magnetosuture_thread.vision.look import State, Track
+from magnetosuture_thread.vision.tracker import State, Track
 
 
 def track_of(case: Case, *, turned: float = 0.0, deviation: float = 0.01) -> Track:

@@ -82,16 +82,6 @@ def test_saturation_is_reported_with_the_velocity_really_reached():
     assert 0.0 < found.velocity[0] < 0.01
 
 
-def test_a_current_at_its_limit_is_no_saturation_while_the_velocity_is_reached():
-    """The other coils take over what one lacks, at the cost of the field along the needle."""
-    free = np.abs(allocation(limit=1000.0).allocate(0.005 * EAST, MIDDLE, EAST).currents).max()
-    for share, error, saturated in ((0.7, 0.001, False), (0.5, 0.1, True)):
-        found = allocation(limit=share * free).allocate(0.005 * EAST, MIDDLE, EAST)
-        assert np.abs(found.currents).max() == pytest.approx(share * free)
-        assert np.linalg.norm(found.velocity - 0.005 * EAST) < error * 0.005
-        assert found.saturated == saturated
-
-
 @pytest.mark.parametrize("pulled", [None, MotionDisturbance(0.0005, 0.001)])
 def test_a_gain_is_a_factor_on_the_field_of_its_coil(pulled: MotionDisturbance | None):
     gains, heading = np.array([1.1, 0.9, 0.95, 1.2]), turned(EAST, 0.4)

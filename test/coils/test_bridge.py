@@ -9,7 +9,6 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
@@ -235,15 +234,6 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
-def test_two_that_command_at_once_stop_it_until_one_is_silent():
-    plant = Plant().ready()
-    plant.run(0.5)
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        plant.command((-0.01, 0.0), number=7777)
-    plant.velocity = None
-    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/servo_cv at once",)
-
-
 @pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0)])
 @pytest.mark.parametrize(
     ("obstacles", "latency", "interval"),
@@ -458,17 +448,6 @@ def test_an_operator_takes_over_by_commanding_and_gives_back_by_silence():
     assert plant.outputs[-1][1].commanded.tolist() == [0.005, 0.0]
 
 
-def test_an_operator_may_take_over_from_two_that_dispute_the_needle():
-    plant = Plant().ready()
-    plant.run(0.2)
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        plant.command((-0.01, 0.0), number=7777)
-    plant.velocity = None
-    assert plant.run(PERIOD)[0].reasons == ("several publishers of needle/servo_cv at once",)
-    plant.command((0.0, 0.004), number=1, source="operator")
-    assert plant.run(PERIOD)[0].source == "operator"
-
-
 def test_two_operators_at_once_stop_the_needle_whoever_else_commands():
     plant = Plant().ready()
     plant.command((0.0, 0.004), number=1, source="operator")
@@ -497,22 +476,6 @@ def test_without_a_prediction_it_may_go_on_slowly():
     assert output.reasons == ()
     assert np.linalg.norm(output.filtered) == pytest.approx(0.002)
     assert output.active == ("no prediction", "speed")
-
-
-def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
-    plant = Plant(thread=False).ready()
-    plant.run(0.02)
-    plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
-    for _ in range(8):
-        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
-        assert plant.run(0.05)[-1].slowdown == 0.5
-    for _ in range(4):
-        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
-        plant.run(0.05)
-    assert plant.outputs[-1][1].reasons == ("no thread prediction for 0.5 s",)
-    for slowdown in (float("nan"), -0.1, 1.5):
-        with pytest.raises(InvalidInputError, match="slowdown"):
-            plant.bridge.on_margins(plant.time, True, slowdown, "", plant.time)
 
 
 @pytest.mark.parametrize(
@@ -606,59 +569,6 @@ def test_a_bridge_that_stood_still_until_the_boards_stopped_is_in_fault():
     plant.bridge.reset(HARDWARE)
     plant.bridge.arm(HARDWARE)
     assert not still(plant.run(0.2)[-1])
-
-
-@pytest.mark.parametrize(("driver", "seconds"), [(HARDWARE, 0.08), (READY, 1.0)])
-def test_one_that_the_coils_did_not_miss_drives_on(driver: DriverState, seconds: float):
-    """Shorter than the boards' own timeout, or with a driver that has none."""
-    plant = Plant(driver=driver).ready()
-    assert not still(frozen(plant, seconds))
-
-
-def test_a_new_scene_that_takes_long_is_no_fault():
-    plant = Plant(driver=HARDWARE).ready()
-    plant.run(0.5)
-    plant.time += 0.4
-    plant.bridge.set_scene(Scene(Dish(0.036)))
-    assert not still(plant.run(0.2)[-1])
-
-
-def test_a_needle_that_slows_down_to_another_limit_is_not_thrown_aside():
-    """While it is still faster than the limit, nothing is left for a sidestep, to neither side."""
-    tail, heading = TAIL, np.array([math.cos(0.4), math.sin(0.4)])
-    changes: dict[str, Any] = {"motion_compensation": True, "without_prediction": "slow", "max_acceleration": 0.2}
-    settings = CoilBridgeSettings(**changes, prediction_timeout=0.1, speed_without_prediction=0.001)
-    plant = Plant(settings, velocity=(0.01 * math.cos(0.4), 0.01 * math.sin(0.4))).ready()
-    plant.tail, across, needle = None, [], settings.needle().kinematics
-    for number in range(1, 120):
-        if number % 3 == 0:
-            plant.bridge.on_pose(tail, heading, plant.time, number, plant.time, plant.time)
-        plant.thread = number < 60
-        found = plant.run(PERIOD)[0].allocation
-        along, left = needle.body_velocity(heading, found.velocity)
-        tail, heading = needle.moved(tail, heading, along, left, PERIOD, found.drift)
-        across.append(abs(found.drift))
-    assert max(across) < 1e-3
-
-
-def test_after_a_stop_the_needle_starts_from_rest():
-    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
-    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
-    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
-    plant.run(1.0)
-    plant.bridge.latch.disarm()
-    plant.run(PERIOD)
-    plant.tail = None
-    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
-    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
-    assert at_rest is not None
-    assert later is not None
-    assert later.tail.tolist() == at_rest.tail.tolist()
-    plant.bridge.arm(READY)
-    plant.command((0.015, 0.0))
-    first = plant.run(PERIOD)[0]
-    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
-    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
 def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):

@@ -32,14 +32,6 @@ def test_what_is_written_is_read(tmp_path: Path):
     assert read_calibration(written(tmp_path, GIVEN.to_yaml())) == GIVEN
 
 
-def test_the_least_file_has_a_model_and_coils(tmp_path: Path):
-    read = read_calibration(written(tmp_path, f"model: loops\ncoils: {THREE}\n"))
-    assert (read.name, read.date, read.notes) == ("", "", "")
-    assert read.coils[0].resistance == 0.0
-    assert [coil.name for coil in read.coils] == ["a", "b", "c"]
-    assert read_calibration(written(tmp_path, f"coils: {THREE}\n")) == read
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -72,14 +64,6 @@ def test_a_file_that_cannot_be_used_is_refused_with_its_name_the_key_and_the_val
         read_calibration(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path: Path):
-    with pytest.raises(ConfigurationError, match="No such file"):
-        read_calibration(tmp_path / "none.yaml")
-    (tmp_path / "bytes.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigurationError, match="not text"):
-        read_calibration(tmp_path / "bytes.yaml")
 
 
 def test_the_bridge_takes_coils_model_reach_and_resistances_from_it(tmp_path: Path):

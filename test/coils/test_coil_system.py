@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.bridge import CoilBridge
@@ -17,32 +15,12 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.scene import Scene
 
 
-class TimedDriver(RecordingDriver):
-    """A driver that records when its currents were computed."""
-
-    def __init__(self, coils: int) -> None:
-        super().__init__(coils)
-        self.computed: list[float] = []
-
-    def apply(self, currents: np.ndarray, computed: float) -> None:
-        """Record."""
-        super().apply(currents, computed)
-        self.computed.append(computed)
-
-
 @pytest.fixture
 def system() -> CoilSystem:
     """An open system."""
     made, settings = CoilSystem(), CoilBridgeSettings()
-    made.open(settings, CoilBridge(settings, made.latch, Scene()), TimedDriver(4))
+    made.open(settings, CoilBridge(settings, made.latch, Scene()), RecordingDriver(4))
     return made
-
-
-def test_a_driver_gets_the_time_for_which_currents_were_computed(system):
-    system.step(500.0, 100.0)
-    assert system.driver.computed == [100.0]  # not when they came to the driver
-    system.zero()
-    assert system.driver.computed[-1] == math.inf  # zeros never grow old
 
 
 def test_its_end_is_zero_with_the_reason(system):
@@ -84,7 +62,7 @@ def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, swit
     else:
         settings = CoilBridgeSettings()
         system.close()
-        system.open(settings, CoilBridge(settings, system.latch, Scene()), TimedDriver(4))
+        system.open(settings, CoilBridge(settings, system.latch, Scene()), RecordingDriver(4))
     system.step(500.0, 100.01)
     assert not system.latch.armed
 

@@ -31,14 +31,6 @@ def test_latch_stops_until_active_and_armed():
     assert latch.stop_reason == "disarmed"
 
 
-def test_deactivation_disarms():
-    latch = armed()
-    latch.deactivate()
-    assert latch.stop_reason == "inactive"
-    latch.activate()
-    assert latch.stop_reason == "disarmed"
-
-
 @pytest.mark.parametrize("activate_first", [True, False])
 def test_emergency_stop_is_latched_until_a_reset_which_does_not_arm(activate_first: bool):
     latch = armed() if activate_first else ArmingLatch()
@@ -54,15 +46,6 @@ def test_emergency_stop_is_latched_until_a_reset_which_does_not_arm(activate_fir
     assert not latch.armed
     latch.activate()
     assert latch.stop_reason == "disarmed"
-
-
-def test_first_fault_is_latched():
-    latch = armed()
-    latch.trip("driver: silent")
-    latch.trip("something that followed")
-    assert (latch.stop_reason, latch.state, latch.armed) == ("driver: silent", ArmingState.FAULT, False)
-    with pytest.raises(InvalidInputError, match="driver: silent"):
-        latch.arm("")
 
 
 def test_neither_arming_nor_a_reset_passes_over_a_driver_that_is_not_ready():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.coils.calibration_fit import read_measurements
+from magnetosuture_thread.coils.calibration import read_measurements
 from magnetosuture_thread.errors import InvalidInputError
 
 HEADER = "coil,current,x,y,bx,by\n"
@@ -59,16 +59,3 @@ def test_what_is_no_measurement_is_refused_with_its_line(tmp_path: Path, text: s
     with pytest.raises(InvalidInputError, match=words) as caught:
         read_measurements(path)
     assert str(caught.value).startswith(str(path))
-
-
-def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path):
-    with pytest.raises(InvalidInputError, match="No such file"):
-        read_measurements(tmp_path / "none.csv")
-    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(InvalidInputError, match="not text"):
-        read_measurements(tmp_path / "picture.csv")
-
-
-def test_a_number_of_four_digits_is_the_name_of_a_coil(tmp_path: Path):
-    rows = "".join(f"{name},1,0,0,0,0\n" for name in ("4711", "1234"))
-    assert read_measurements(written(tmp_path, HEADER + rows)).names == ("4711", "1234")

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.bridge import CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.motion_observer import MotionObserver
 from magnetosuture_thread.coils.settings import MAX_MOBILITY_RATIO, CoilBridgeSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
-from magnetosuture_thread.coils.drivers.protocol import DriverState
+from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import read_setup

@@ -1,94 +1,46 @@
-"""Test doubles of graph and host: they record calls, and show a scene like a hernia's."""
+"""Test doubles of graph and host: they record calls, and show a needle with a straight thread behind it."""
 
 from __future__ import annotations
 
 import asyncio
-import functools
 import time
 from typing import Any
 
+import cv2
 import numpy as np
 
-from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.geometry.polyline import points_at
-from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
-
-VIEW = DishView((322.0, 238.0), 8e-5)
 NODES = 40
+TAIL = (0.002, 0.010)  # m; the needle points east
 REST = {"commanded": [0.0, 0.0], "filtered": [0.0, 0.0], "applied": [0.0, 0.0]}
-RING = 0.006
-# Tissue on both sides of the ring: from left, bottom to right, top [m].
-BLOCKS = {"left": (-0.0135, -0.0045, -0.0075, 0.0045), "right": (0.0075, -0.0045, 0.0135, 0.0045)}
 
 
-def thread(points: int = NODES, wander: float = 0.0) -> np.ndarray:
-    """Return a thread that lies around the ring and runs on to its free end, from the tail on [m]."""
-    angles = np.linspace(1.45, -1.0, 60)
-    wrapped = (RING + 0.00045) * np.column_stack([np.cos(angles), np.sin(angles)])
-    ahead, behind = np.array([-np.sin(1.45), np.cos(1.45)]), np.array([np.sin(-1.0), -np.cos(-1.0)])
-    out = wrapped[0] + np.linspace(0.0022, 0.0, 12)[:, None] * ahead
-    along = np.linspace(0.0, 0.008, 40)[:, None]
-    free = wrapped[-1] + along * behind + 40.0 * along**2 * np.array([-0.4, -0.6])
-    result = resampled_points(np.vstack([out[:-1], wrapped, free[1:]]), points)
-    result[:, 1] += wander * np.sin(np.linspace(0.0, 9.0, points))
-    return result
+def thread() -> np.ndarray:
+    """Return the thread, from the tail on [m]."""
+    return np.column_stack([TAIL[0] - np.linspace(0.0, 0.012, NODES), np.full(NODES, TAIL[1])])
 
 
-def resampled_points(line: np.ndarray, count: int) -> np.ndarray:
-    """Return equally spaced points of a line."""
-    return points_at(line, np.linspace(0.0, np.linalg.norm(np.diff(line, axis=0), axis=1).sum(), count))
-
-
-def heading() -> float:
-    """Return the needle's, straight on from the thread [rad]."""
-    line = thread(200)
-    return float(np.arctan2(*(line[0] - line[1])[::-1]))
-
-
-@functools.cache
 def picture() -> bytes:
-    """Return a frame of the scene as the bytes of a JPEG file."""
-    camera = DishCamera(CameraScene(obstacles=[Disc((0.0, 0.0), RING)]), VIEW, seed=5)
-    return encode_jpeg(camera.render(thread()[0], heading(), thread(200, 4e-5)), 90).tobytes()
+    """Return a camera frame as the bytes of a JPEG file."""
+    return cv2.imencode(".jpg", np.full((480, 640, 3), 200, np.uint8))[1].tobytes()
 
 
-def clearances(line: np.ndarray) -> list[float]:
-    """Return the distance of each node from the ring [m]."""
-    return (np.linalg.norm(line, axis=1) - RING).tolist()
-
-
-def block(name: str) -> dict[str, Any]:
-    """Return a block of tissue as the page gets it."""
-    left, bottom, right, top = BLOCKS[name]
-    outline = [[left, bottom], [right, bottom], [right, top], [left, top]]
-    label = [(left + right) / 2.0, (bottom + top) / 2.0]
-    return {"name": name, "kind": "tissue", "label": label, "outline": outline, "holes": []}
-
-
-def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[str, Any]:
+def state(friction: str = "free", count: int = 0) -> dict[str, Any]:
     """Return the state of a graph that is armed and tracked, as `Graph.state` has it."""
-    line = thread(nodes)
+    line = thread().tolist()
     factor = 0.9**count if friction == "sliding" else 1.0
     return {
         "time": time.monotonic(),
         "needle_length": 0.007,
         "needle_curvature": 0.0,
-        "needle": {"tail": line[0].tolist(), "heading": heading(), "age": 0.02},
+        "needle": {"tail": list(TAIL), "heading": 0.0, "age": 0.02},
         "tracker": {
             "state": "tracked",
             "reason": "",
             "confidence": 0.97,
-            "view": {"centre": list(VIEW.centre_px), "scale": VIEW.metres_per_pixel, "rotation": VIEW.rotation},
+            "view": {"centre": [322.0, 238.0], "scale": 8e-5, "rotation": 0.0},
         },
-        "measured": thread(120, 4e-5).tolist(),
-        "predicted": {
-            "vertices": line.tolist(),
-            "residual": 1e-9,
-            "step_time": 2.1e-4,
-            "status": "solved",
-            "age": 0.02,
-        },
+        "measured": line,
+        "predicted": {"vertices": line, "residual": 1e-9, "step_time": 2.1e-4, "status": "solved", "age": 0.02},
         "estimated": None,
         "forecast": None,
         "margins": {
@@ -96,8 +48,8 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "of": "prediction",
             "bound": None,
             "reason": "",
-            "clearance": clearances(line),
-            "least": {"connectivity": 4.1e-6, "compression": 1.2e-4, "obstacle": min(clearances(line))},
+            "clearance": [1e-3] * NODES,
+            "least": {"connectivity": 4.1e-6, "compression": 1.2e-4, "obstacle": 1e-3},
             "contact": [],
             "friction": {"state": friction, "nodes": list(range(13, 13 + count)), "slowdown": factor},
         },
@@ -106,8 +58,14 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
             "dish_diameter": 0.035,
             "dish_depth": 0.003,
             "shapes": [
-                {"name": "ring", "kind": "instrument", "label": [0.0, 0.0], "disc": [0.0, 0.0, RING]},
-                *map(block, BLOCKS),
+                {"name": "ring", "kind": "instrument", "label": [0.0, 0.0], "disc": [0.0, 0.0, 0.003]},
+                {
+                    "name": "left",
+                    "kind": "tissue",
+                    "label": [-0.01, -0.008],
+                    "outline": [[-0.013, -0.01], [-0.007, -0.01], [-0.007, -0.006], [-0.013, -0.006]],
+                    "holes": [],
+                },
             ],
         },
         "filter": {
@@ -137,66 +95,40 @@ def state(friction: str = "free", count: int = 0, nodes: int = NODES) -> dict[st
 
 def procedure_state(state_name: str = "idle", **values: Any) -> dict[str, Any]:
     """Return the state of a graph with a needle planner, whose procedure is in a state."""
-    shown = state()
-    shown["procedure"] = {
+    procedure = {
         "state": state_name,
         "name": "" if state_name == "idle" else "hernia",
         "goals": [] if state_name == "idle" else ["pass_through", "wrap"],
-        "goal": 0,
-        "goals_met": 0,
-        "progress": 0.0,
-        "reason": "",
-        "resumes": False,
-        "hold_to_run": False,
+        **{"goal": 0, "goals_met": 0, "progress": 0.0, "reason": "", "resumes": False, "hold_to_run": False},
         "clearance": None,
-        **values,
     }
-    return {**shown, "plan": [], "procedures": ["hernia", "slalom"]}
+    return {**state(), "procedure": {**procedure, **values}, "plan": [], "procedures": ["hernia", "slalom"]}
 
 
-def forecast_state(*events: str, **values: Any) -> dict[str, Any]:
+def forecast_state(*events: str) -> dict[str, Any]:
     """Return the state of a graph that forecasts its thread: it moves up by 1 mm in each of three seconds."""
-    shown = state(**values)
-    line = thread(len(shown["predicted"]["vertices"]))
-    ghosts = [{"time": float(k), "vertices": (line + np.array([0.0, 1e-3 * k])).tolist()} for k in (1, 2, 3)]
-    shown["forecast"] = {"horizon": 3.0, "ghosts": ghosts, "events": list(events), "problem": "", "age": 0.02}
-    return shown
+    ghosts = [{"time": float(k), "vertices": (thread() + np.array([0.0, 1e-3 * k])).tolist()} for k in (1, 2, 3)]
+    forecast = {"horizon": 3.0, "ghosts": ghosts, "events": list(events), "problem": "", "age": 0.02}
+    return {**state(), "forecast": forecast}
 
 
-def estimated_state(hidden: bool = False, found: bool = False, **values: Any) -> dict[str, Any]:
-    """Return the state of a graph that estimates its thread too, while the model alone has gone another way.
-
-    Args:
-        hidden: whether nothing was measured for 3.2 s; else half of the thread is hidden.
-        found: whether something holds the thread that the model does not know.
-        values: see `state`.
-    """
-    shown = state(**values)
-    line = thread(shown_nodes := len(shown["predicted"]["vertices"]))
-    half = np.arange(shown_nodes) > shown_nodes // 2
-    deviation = np.where(half | hidden, 3e-4 * np.linspace(0.1, 1.0, shown_nodes), 2e-5)
-    off = np.column_stack([np.zeros(shown_nodes), 1.2e-3 * np.linspace(0.0, 1.0, shown_nodes) ** 2])
-    shown["predicted"]["vertices"] = (line + off).tolist()
-    at = shown_nodes - 9
+def estimated_state() -> dict[str, Any]:
+    """Return the state of a graph that estimates its thread, half of which is hidden, and which something holds."""
+    shown = state()
+    held = {
+        "position": thread()[-9].tolist(),
+        "direction": [-0.8, 0.6],
+        "force": 2e-4,
+        "text": "held at 22 mm of the thread: 0.2 mN up and to the left",
+    }
     shown["estimated"] = {
-        "vertices": line.tolist(),
-        "deviation": deviation.tolist(),
-        "prediction_only": hidden,
-        "unmeasured_for": 3.2 if hidden else 0.0,
-        "hidden": 1.0 if hidden else 0.5,
-        "disturbances": [
-            {
-                "position": line[at].tolist(),
-                "direction": [-0.8, 0.6],
-                "force": 2e-4,
-                "text": "held at 22 mm of the thread: 0.2 mN up and to the left",
-            }
-        ]
-        if found
-        else [],
+        "vertices": thread().tolist(),
+        "deviation": np.linspace(2e-5, 3e-4, NODES).tolist(),
+        **{"prediction_only": False, "unmeasured_for": 0.0, "hidden": 0.5},
+        "disturbances": [held],
         "age": 0.02,
     }
-    shown["margins"] |= {"of": "estimate", "bound": min(clearances(line)) - 5e-5}
+    shown["margins"] |= {"of": "estimate", "bound": 9.5e-4}
     return shown
 
 

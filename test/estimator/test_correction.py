@@ -19,9 +19,9 @@ from magnetosuture_thread.estimator.correction import (
     prior_information,
     robust_weights,
 )
-from magnetosuture_thread.thread.formulations import RodFormulation
-from magnetosuture_thread.thread.osqp_solver import as_quadratic_program
-from magnetosuture_thread.thread.step_buffers import StepBuffers, program_of
+from magnetosuture_thread.thread.program import StepBuffers, program_of
+from magnetosuture_thread.thread.rod import RodFormulation
+from magnetosuture_thread.thread.solvers import as_quadratic_program
 from magnetosuture_thread.thread_observation import ThreadObservation
 from test.estimator.threads import (
     LENGTH,

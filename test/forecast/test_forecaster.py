@@ -23,7 +23,6 @@ from magnetosuture_thread import (
     ThreadForecaster,
     ThreadPredictor,
 )
-from magnetosuture_thread.forecast import NeedleDrag
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.thread.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
@@ -166,10 +165,7 @@ def test_the_thread_of_a_start_is_forecast_in_place_of_the_own(forecaster: Threa
     own = forecaster.thread
     medium = replace(own.medium, drag_across=0.7 * own.medium.drag_across)
     stiffer = replace(own, bending_stiffness=20.0 * own.bending_stiffness, medium=medium)
-    drag = NeedleDrag(0.0255, 0.033, 1.6e-7)
-    one, other = (
-        ThreadForecaster(each, forecaster.scene, forecaster.safety, law=LAW, drag=drag) for each in (own, stiffer)
-    )
+    one, other = (ThreadForecaster(each, forecaster.scene, forecaster.safety, law=LAW) for each in (own, stiffer))
     start = one.straight(START)
     learned = one.forecast(replace(start, thread=stiffer), UP, HORIZON)
     assert same(learned, other.forecast(start, UP, HORIZON))
@@ -189,22 +185,10 @@ def same(one: Forecast, other: Forecast) -> bool:
     )
 
 
-def test_sequence_and_controller_equal_held_command(forecaster: ThreadForecaster):
+def test_sequence_equals_held_command(forecaster: ThreadForecaster):
     start, steps = forecaster.straight(START), round(HORIZON / STEP)
     held = forecaster.forecast(start, UP, HORIZON)
     assert same(forecaster.forecast(start, np.tile(UP, (steps, 1)), HORIZON), held)
-    asked: list[float] = []
-
-    def controller(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        expected = np.append(held.tails[len(asked)], held.headings[len(asked)])
-        np.testing.assert_array_equal(np.append(tail, heading), expected)
-        asked.append(time)
-        return UP
-
-    assert same(forecaster.forecast(start, controller, HORIZON), held)
-    np.testing.assert_allclose(asked, held.times[:-1])
-    with pytest.raises(InvalidInputError, match="controller"):
-        forecaster.forecast(start, lambda time, tail, heading: np.full(2, np.nan), HORIZON)
 
 
 def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
@@ -220,27 +204,6 @@ def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
     assert 0.0 < forecast.minima["needle"].value < 1e-5
     assert forecaster.forecast(start, -0.002 * EAST, 1.0).rest_time is None
     assert forecaster.forecast(start, np.zeros(2), 1.0).rest_time is None, "nobody commands it to move"
-
-
-def test_needle_with_drag_moves_by_the_balance_of_command_and_pull():
-    """Behind a straight thread as commanded, and with one that lies across it more slowly: that has to be turned."""
-    where, drag = Scene.create(), NeedleDrag(along=0.0255, across=0.033, turning=1.6e-7)
-    filters = NeedleSafetyFilter(where, needle_length=0.007)
-    exact, pulled = (ThreadForecaster(thread(), where, filters, drag=each) for each in (None, drag))
-    start = exact.straight(NeedlePose(0.0, np.zeros(2), EAST))
-    ahead, steps = 0.003 * EAST, 60
-    free, drawn = (each.forecast(start, ahead, steps * STEP) for each in (exact, pulled))
-    assert drawn.tails[-1, 0] == pytest.approx(free.tails[-1, 0], rel=0.05)
-    turning = np.array([0.0, 0.003])
-    free, drawn = (each.forecast(start, turning, steps * STEP) for each in (exact, pulled))
-    turns = [math.atan2(each.headings[-1, 1], each.headings[-1, 0]) for each in (free, drawn)]
-    assert 0.1 * turns[0] < turns[1] < 0.95 * turns[0]
-    balance = drawn.needle_force[-1] @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
-    across = turning @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
-    rate = (math.atan2(*drawn.headings[-1][::-1]) - math.atan2(*drawn.headings[-2][::-1])) / STEP
-    assert rate == pytest.approx(across / 0.0035 - 0.0035 * balance / 1.6e-7, rel=0.1)
-    still = pulled.forecast(replace(start, vertices=start.vertices), np.zeros(2), 0.2)
-    np.testing.assert_array_equal(still.tails[-1], still.tails[0])  # nothing moves a needle that nobody commands
 
 
 def test_first_contact_names_shape_and_time():
@@ -290,16 +253,18 @@ def test_start_that_cannot_be_used_is_refused(forecaster: ThreadForecaster, chan
         forecaster.forecast(replace(start, **change), UP, HORIZON)
 
 
-@pytest.mark.parametrize("horizon", [0.0, -1.0, math.nan, math.inf, 1e9, 1e-4])
-def test_horizon_out_of_bounds_is_refused(forecaster: ThreadForecaster, horizon: float):
-    with pytest.raises(InvalidInputError, match="horizon"):
-        forecaster.forecast(forecaster.straight(START), UP, horizon)
-
-
-@pytest.mark.parametrize("commands", [np.zeros(3), np.zeros((5, 2)), np.array([np.nan, 0.0]), np.zeros((0, 2))])
-def test_commands_of_other_shape_or_not_finite_are_refused(forecaster: ThreadForecaster, commands: np.ndarray):
-    with pytest.raises(InvalidInputError, match="command"):
-        forecaster.forecast(forecaster.straight(START), commands, HORIZON)
+@pytest.mark.parametrize(
+    ("commands", "horizon", "match"),
+    [
+        *((UP, horizon, "horizon") for horizon in (0.0, math.nan, math.inf, 1e9, 1e-4)),
+        *((commands, HORIZON, "command") for commands in (np.zeros(3), np.zeros((5, 2)), np.array([np.nan, 0.0]))),
+    ],
+)
+def test_horizon_and_commands_that_cannot_be_used_are_refused(
+    forecaster: ThreadForecaster, commands: np.ndarray, horizon: float, match: str
+):
+    with pytest.raises(InvalidInputError, match=match):
+        forecaster.forecast(forecaster.straight(START), commands, horizon)
 
 
 def test_filter_of_another_scene_and_other_settings_are_refused():
@@ -308,9 +273,5 @@ def test_filter_of_another_scene_and_other_settings_are_refused():
         ThreadForecaster(thread(), where, NeedleSafetyFilter(Scene.create()))
     with pytest.raises(ConfigurationError, match="step"):
         ThreadForecaster(thread(), where, step=math.nan)
-    with pytest.raises(ConfigurationError, match="turning"):
-        NeedleDrag(along=0.02, across=0.03, turning=math.nan)
-    with pytest.raises(ConfigurationError, match="along"):
-        ThreadForecaster(thread(), where, drag=NeedleDrag(along=0.001, across=0.03, turning=1e-7))
     with pytest.raises(ConfigurationError, match="margin_range"):
         ThreadForecaster(thread(), where, law=LAW, margin_range=1e-4)

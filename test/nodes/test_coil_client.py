@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.cli.commands.run_graph import COIL_ACTIONS
 from magnetosuture_thread.nodes import clients as client
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 
@@ -62,15 +61,3 @@ def test_a_bridge_in_a_namespace_is_reached_by_it_alone(
     with pytest.raises(SystemExit):
         press(capsys, "stop", "--namespace", "2 labs")
     assert "is no ROS namespace" in capsys.readouterr().err
-
-
-def test_without_a_bridge_it_fails_and_says_so(
-    graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    monkeypatch.setattr(client, "TIMEOUT", 0.5)
-    for action in ("stop", "state"):
-        code, said = press(capsys, action)
-        assert code == 1
-        assert "no coil_bridge" in said
-    assert set(COIL_ACTIONS) >= {"stop", "state"}

@@ -249,18 +249,6 @@ def test_a_place_that_is_missed_however_it_is_planned_is_given_up_with_the_dista
     assert "with a tolerance of 0.05 mm" in run.reason
 
 
-def test_a_needle_that_is_thrown_back_whenever_it_gets_on_is_given_up():
-    run, needle = executor({"go_to": {"position": [0.013, 0.008]}}), Needle()
-    run.start()
-    begin = needle.tail
-    for _ in range(round(120.0 * RATE)):
-        needle.run(run, 1.0 / RATE)
-        if math.dist(needle.tail, begin) > 6e-3:  # three times what was called progress
-            needle.tail = begin
-    assert run.state is ProcedureState.FAILED
-    assert "given up" in run.reason
-
-
 @pytest.mark.parametrize("pauses", [False, True])
 def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
     run, needle = executor({"wrap": {"around": "post", "angle": 6.2, "sense": "counterclockwise"}}), Needle()

@@ -128,18 +128,6 @@ def test_wraps_that_follow_each_other_need_the_thread_of_them_all():
             planner.check(procedure(once, second))
 
 
-@pytest.mark.parametrize("heading", [[], [-1.5708], [0.26]])
-def test_a_path_ends_at_the_very_place_and_heading_where_the_lattice_is_too_coarse_for_the_tolerance(
-    heading: list[float],
-):
-    planner = NeedlePlanner(posts((0.004, 0.0, 0.002)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
-    goal = {"go_to": {"position": [0.00811, 0.00307], "heading": heading, "tolerance": 1e-4}}
-    (path,) = planner.plan_all(procedure(goal), np.array([-0.006, -0.004]), 0.3)
-    assert path.middles[-1] == pytest.approx([0.00811, 0.00307], abs=1e-9)
-    if heading:
-        assert math.remainder(path.angles[-1] - heading[0], math.tau) == pytest.approx(0.0, abs=1e-9)
-
-
 def test_a_place_behind_a_closed_wall_of_posts_cannot_be_reached():
     count = 14
     ring = [(0.006 * math.cos(a), 0.006 * math.sin(a), 0.0013) for a in np.linspace(0.0, math.tau, count, False)]

@@ -11,8 +11,7 @@ import pytest
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
-from magnetosuture_thread.planning.session import NOT_HELD, LoopState, ProcedureSession
-from magnetosuture_thread.planning.settings import NeedlePlannerSettings
+from magnetosuture_thread.planning.session import NOT_HELD, LoopState, NeedlePlannerSettings, ProcedureSession
 from magnetosuture_thread.scene import Dish, Scene
 
 SCENE = Scene(Dish(0.035))
@@ -32,11 +31,6 @@ def known(now: float = 0.0, **changes: Any) -> LoopState:
     state.on_estimate(0.0, 0.0, {}, thread)
     state.on_margins(now, "", 3, 0.7, "1")
     return state
-
-
-def test_a_bridge_that_feeds_friction_back_to_the_operator_only_slows_no_procedure():
-    condition = known(friction_feedback="operator").condition(0.1)
-    assert (condition.friction_nodes, condition.slowdown) == (3, 1.0)
 
 
 @pytest.mark.parametrize("unmeasured", [1.01, math.inf, math.nan])

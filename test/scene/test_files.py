@@ -100,13 +100,6 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: s
     assert len(str(caught.value)) < 500 + len(str(path))
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path):
-    for data, words in ((b"\xff\xfe\x00", "bytes that are no UTF-8 text"), (b"a\x00b", "expected valid YAML")):
-        (tmp_path / "a.yaml").write_bytes(data)
-        with pytest.raises(ConfigurationError, match=words):
-            read_scene(str(tmp_path / "a.yaml"))
-
-
 def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
     fifo = tmp_path / "fifo.yaml"
     os.mkfifo(fifo)
@@ -130,14 +123,6 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
     os.truncate(os.open(large, os.O_CREAT | os.O_WRONLY), 10**12)  # a terabyte with nothing in it
     with pytest.raises(ConfigurationError, match="a larger file"):
         read_scene(str(large))
-
-
-def test_a_pipe_that_takes_the_place_of_a_file_at_the_last_moment_holds_nobody_up(tmp_path: Path, monkeypatch):
-    fifo = tmp_path / "fifo.yaml"
-    os.mkfifo(fifo)
-    monkeypatch.setattr("magnetosuture_thread.scene.files.find_scene_file", lambda name: fifo)
-    with pytest.raises(ConfigurationError, match="got 'a folder, pipe or device', expected a regular file"):
-        read_scene(str(fifo))
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "a\0b", "x" * 5000, "../config/scenes/dish_35mm"])

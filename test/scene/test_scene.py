@@ -22,13 +22,6 @@ def altered(shape: SceneShape, **changes: Any) -> Scene:
     return Scene(SCENE.dish, tuple(dataclasses.replace(s, **changes) if s is shape else s for s in SCENE.shapes))
 
 
-def test_the_version_is_sixteen_digits_and_the_same_for_the_same_content():
-    again = Scene(Dish(0.035, 0.003), (dataclasses.replace(POST, definition={"disc": {}}), BLOCK))
-    assert again.version == SCENE.version
-    assert len(SCENE.version) == 16
-    assert int(SCENE.version, 16)
-
-
 def test_any_change_gives_another_version():
     less = 0.002 - 1e-15
     changed = [

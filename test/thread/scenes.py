@@ -9,16 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from magnetosuture_thread.geometry.obstacles import Obstacle, Workspace
-from magnetosuture_thread.thread.formulations import (
-    Formulation,
-    PaperOptions,
-    PrescribedMotion,
-    StepResult,
-    ThreadState,
-    make_formulation,
-)
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
+from magnetosuture_thread.thread.paper import PaperOptions
+from magnetosuture_thread.thread.predictor import make_formulation
 from magnetosuture_thread.thread.solvers import make_solver
+from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, StepResult, ThreadState
 
 DT = 1.0 / 66.0
 TOLERANCE = 1e-6

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 from scipy.special import j0
 
-from magnetosuture_thread.thread.formulations import PrescribedMotion, ThreadState
-from test.thread.scenes import east, formulated, in_air, straight, stretch
+from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
+from test.thread.scenes import east, formulated, in_air, straight
 
 G = 9.81
 
@@ -36,25 +35,6 @@ def test_a_thread_that_nothing_holds_falls_freely(dimension: int):
     fallen = np.average(state.positions, axis=0, weights=weights) - middle
     np.testing.assert_allclose(fallen, 0.5 * dt**2 * count * (count + 1) * down, atol=1e-7)
     np.testing.assert_allclose(fallen[-1], -0.5 * G * (count * dt) ** 2, rtol=5e-3)
-
-
-def test_a_rope_between_two_hands_hangs_in_a_catenary():
-    """Y = a cosh(x / a), with 2 a sinh(w / 2 a) = L for a span w and a length L."""
-    length, span, segments = 1.0, 0.7, 60
-    thread = in_air(length, segments, (0.0, -G), drag=0.05)
-    formulation = formulated(thread)
-    state = ThreadState.at_rest(straight(thread))
-    begin, end = state.positions[-1].copy(), np.array([-span, 0.0])
-    for step in range(1, 1500):
-        part = min(1.0, step / 300)
-        drive = PrescribedMotion((0, segments), np.array([[0.0, 0.0], begin + part * (end - begin)]), east())
-        state = formulation.step(state, drive, 5e-3).state
-    assert np.abs(state.velocities).max() < 1e-5
-    a = brentq(lambda a: 2.0 * a * math.sinh(0.5 * span / a) - length, 0.05, 10.0)
-    x = state.positions[:, 0] + 0.5 * span
-    expected = a * (np.cosh(x / a) - math.cosh(0.5 * span / a))
-    np.testing.assert_allclose(state.positions[:, 1], expected, atol=1e-3 * length)
-    assert abs(stretch(thread, state.positions)) < 1e-3
 
 
 @pytest.mark.parametrize(("segments", "within"), [(3, 0.03), (20, 0.005)])

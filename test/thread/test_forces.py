@@ -12,8 +12,6 @@ from scipy.optimize import brentq
 
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 RATE = 66.0
@@ -106,41 +104,3 @@ def test_contact_drag_and_needle_are_in_balance():
     drag = medium.drag_across * (velocities - slip) + medium.drag_along * slip
     total = -(weights[:, None] * drag).sum(axis=0) * thread.segment_length + forces.contact.sum(axis=0)
     assert total == pytest.approx(forces.needle_force, abs=0.01 * np.linalg.norm(forces.needle_force))
-
-
-@pytest.mark.parametrize("attachment", ["pinned", "clamped"])
-@pytest.mark.parametrize(("segments", "jitter", "bound"), [(25, 0.0, 0.015), (100, 0.02, 0.03)])
-def test_the_needle_is_pulled_as_the_simulated_rigs_is(attachment: str, segments: int, jitter: float, bound: float):
-    """The rig is other code: springs in place of multipliers, more segments. Jitter is of the heading [rad]."""
-    thread = ThreadPredictor.create("polyamide_7_0", length=0.019, segments=segments, attachment=attachment).thread
-    properties = ThreadProperties(
-        length=thread.length,
-        segments=114,
-        bending_stiffness=thread.bending_stiffness,
-        stretching_stiffness=2.0,
-        drag_across=thread.medium.drag_across,
-        drag_along=thread.medium.drag_along,
-        attachment=NeedleJoint(attachment),
-        diameter=thread.diameter,
-    )
-    path = np.array([[0.0, 0.0], [-0.03, 0.0]])
-    body = NeedleBody(2e-3, 4e-4, 0.0, 0.0, 1.0)
-    rig = RigDynamics(body, properties, Surface(), None, (0.0, 0.0), 0.0, path, largest_step=5e-3)
-    predictor = ThreadPredictor(thread)
-    predictor.start(pose(0.0, (0.0, 0.0), (1.0, 0.0)), path, strict=False)
-    here, pulls, expected, moments, random = np.zeros(2), [], [], [], np.random.default_rng(3)
-    for k in range(1, 200):
-        heading = 1.2 * math.sin(1.1 * k / RATE) + jitter * random.standard_normal()
-        ahead = np.array([math.cos(heading), math.sin(heading)])
-        here = here + 2e-3 / RATE * ahead
-        rig.drive(here, heading, 1.0 / RATE)
-        forces = predictor.step(pose(k / RATE, here, ahead)).forces
-        assert forces is not None
-        pulls.append(forces.needle_force)
-        expected.append(rig.thread_pull)
-        moments.append((forces.needle_moment, rig.thread_moment))
-    off = np.linalg.norm(np.array(pulls) - expected, axis=1)[10:]
-    assert math.sqrt(float(np.mean(off**2))) < bound * float(np.linalg.norm(expected, axis=1).max())
-    model, true = np.array(moments)[10:].T
-    assert math.sqrt(float(np.mean((model - true) ** 2))) <= bound * float(np.abs(true).max())
-    assert (attachment == "clamped") == bool(np.abs(true).max() > 0.0)

@@ -31,11 +31,6 @@ def barriers(*discs: tuple[float, float, float], others: tuple[BarrierRows, ...]
 GATE = ((-3.5e-3, 1.9e-3, 1e-3), (-3.5e-3, -1.9e-3, 1e-3))
 
 
-def test_a_node_close_to_one_obstacle_is_free():
-    assert LAW.classify(barriers(GATE[0]), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
-    assert LAW.classify(barriers(), np.ones(8)) == Friction(FrictionState.FREE, (), 1.0)
-
-
 def test_nodes_close_to_two_obstacles_slow_the_needle_while_pulled():
     assert LAW.classify(barriers(*GATE), np.full(8, 1e-3)) == Friction(FrictionState.SLIDING, (3, 4), 0.9**2)
     third = (-3.5e-3, 1.85e-3, 1e-3)
@@ -59,11 +54,6 @@ def test_the_bound_counts_where_it_is_to_and_where_there_is_one():
     assert replace(by_bound, by_bound=False).classify(bounded, np.ones(8)).nodes == ()
 
 
-def test_the_needle_itself_is_no_friction_of_the_thread():
-    at_needle = ((0.0, 1.9e-3, 1e-3), (0.0, -1.9e-3, 1e-3))
-    assert LAW.classify(barriers(*at_needle), np.ones(8)).state is FrictionState.FREE
-
-
 def test_between_an_obstacle_and_the_wall_is_no_friction_as_the_paper_counts_it():
     close = WallAvoidance(Workspace([], 5e-3, 2, 7.5e-3), 0.0).rows(NODES)
     assert (close.clearance < 1e-3).any()
@@ -83,10 +73,3 @@ def test_speeds_are_averaged():
     back = NodeMotion(0.2)
     back.follow_on(motion)
     np.testing.assert_allclose(back.update(moved, interval), np.full(3, expected * np.exp(-0.5)), rtol=1e-12)
-
-
-def test_trembling_is_no_motion():
-    """A pose that is off by 0.02 mm, back and forth at 30 Hz, which is 1.2 mm/s from each to the next."""
-    motion, thread = NodeMotion(0.2), np.zeros((3, 2))
-    speeds = [motion.update(thread + np.array([(-1.0) ** k * 2e-5, 0.0]), 1.0 / 30.0).max() for k in range(60)]
-    assert max(speeds) < 2e-4

@@ -55,38 +55,6 @@ def test_gradient_and_hessian_are_those_of_the_energy(dimension: int, clamped: b
             np.testing.assert_allclose((ahead - behind)[:, axis] / 2e-5, hessian[:, node], atol=1e-8)
 
 
-def cantilever_error(segments: int) -> float:
-    """Return the relative error of the end of a clamped beam under an even load, by the bands alone."""
-    hessian = full(mechanics.bending_bands(segments, True))[1:, 1:] * segments**3
-    load = mechanics.end_corrected_weights(segments)[1:] / segments
-    return abs(8.0 * float(np.linalg.solve(hessian, load)[-1]) - 1.0)
-
-
-def test_a_cantilever_bends_as_beam_theory_says_to_high_order():
-    """The end of a clamped beam under the load q sinks by q L^4 / (8 EI)."""
-    assert cantilever_error(25) < 1e-6
-    assert cantilever_error(10) / cantilever_error(20) > 12.0  # fourth order
-
-
-def arc(segments: int, turn: float) -> np.ndarray:
-    """Return a chain of arcs of unit length that turns by an angle at each node, to the left."""
-    angles = turn * (np.arange(segments) + 0.5)
-    chord = 2.0 * np.sin(0.5 * turn) / turn
-    steps = chord * np.column_stack([np.cos(angles), np.sin(angles)])
-    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
-
-
-def test_a_thread_in_its_rest_shape_has_no_bending_force():
-    straight = np.arange(6.0)[:, None] * np.array([0.6, 0.8])
-    for clamped in (False, True):
-        np.testing.assert_allclose(gradient_of(straight, -np.array([0.6, 0.8]), clamped), 0.0, atol=1e-14)
-    bent = arc(12, 0.1)
-    at_rest = gradient_of(bent, np.zeros(2), False, np.full(11, 0.1))
-    assert np.abs(at_rest).max() < 0.02 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
-    wrong_way = gradient_of(bent, np.zeros(2), False, np.full(11, -0.1))
-    assert np.abs(wrong_way).max() > 1.9 * np.abs(gradient_of(bent, np.zeros(2), False)).max()
-
-
 def metric_of(positions: np.ndarray, along: float = 0.5, inertia: float = 0.0) -> np.ndarray:
     """Return the compiled metric."""
     nodes, dimension = positions.shape

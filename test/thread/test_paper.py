@@ -9,9 +9,10 @@ import pytest
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.thread.barriers import Connectivity, EnhancedConnectivity, Stiffness
-from magnetosuture_thread.thread.formulations import PaperFormulation, PaperOptions, ThreadState
+from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
 from magnetosuture_thread.thread.solvers import BandedSolver
+from magnetosuture_thread.thread.step import ThreadState
 from test.thread.scenes import (
     DT,
     TOLERANCE,
@@ -73,19 +74,6 @@ def test_the_program_is_the_printed_one():
             assert program.compliance[row] == pytest.approx(compliance)
             row += 1
     assert row == len(program.first) == 3 * 25 - 2
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_straight_thread_at_rest_stays_and_a_pulled_one_follows(dimension: int):
-    thread = polyamide()
-    for name_options in (PaperOptions(), PaperOptions.tuned(1.0)):
-        formulation = formulated(thread, name="paper", dimension=dimension, paper=name_options)
-        start = straight(thread, dimension)
-        still = followed(formulation, start, lambda _: np.zeros(dimension), 5)[-1]
-        np.testing.assert_allclose(still.state.positions, start, atol=1e-9)
-        pulled = followed(formulation, start, lambda k: k * DT * 5e-3 * east(dimension), 200)[-1]
-        behind = straight(thread, dimension) + 200 * DT * 5e-3 * east(dimension)
-        assert np.linalg.norm(pulled.state.positions - behind, axis=1).max() < 0.1 * thread.length
 
 
 @pytest.mark.parametrize(

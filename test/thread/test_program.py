@@ -5,33 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.thread.osqp_solver import as_quadratic_program
-from magnetosuture_thread.thread.program import ChainProgram, no_far_rows, residuals_of
-
-
-def random_program(seed: int, nodes: int = 9, dimension: int = 2, soft: bool = False) -> ChainProgram:
-    """Return a feasible program with segments that are equations and contacts that are bounds."""
-    random = np.random.default_rng(seed)
-    root = random.normal(size=(nodes, dimension, dimension))
-    blocks = root @ root.transpose(0, 2, 1) + 8.0 * np.eye(dimension)
-    couplings = random.uniform(-1.0, 1.0, (3, nodes))
-    rows = 2 * nodes
-    gradient = random.normal(size=(rows, 3, dimension))
-    gradient[nodes:, 1:] = 0.0
-    first = np.concatenate([np.arange(nodes), random.permutation(nodes)]).clip(0, nodes - 3)
-    inside = random.normal(size=(nodes, dimension))
-    known = np.arange(nodes) % 7 == 0
-    inside[known] = 0.0
-    image = np.einsum("rkd,rkd->r", gradient, inside[first[:, None] + np.arange(3)])
-    lower, upper = image - random.uniform(0.0, 1.0, rows), np.full(rows, np.inf)
-    lower[:3] = upper[:3] = image[:3]
-    upper[3:6] = image[3:6] + 0.1
-    compliance = np.where(np.arange(rows) % 2 == 0, 1e-3, 0.0) if soft else np.zeros(rows)
-    linear = 10.0 * random.normal(size=(nodes, dimension))
-    limit = np.full(rows, np.inf)
-    return ChainProgram(
-        blocks, couplings, linear, known, first, gradient, lower, upper, compliance, limit, *no_far_rows(dimension)
-    )
+from magnetosuture_thread.thread.program import ChainProgram, residuals_of
 
 
 def one_node(compliance: float = 0.0) -> ChainProgram:
@@ -61,13 +35,6 @@ def at(x: float, y: float) -> np.ndarray:
 
 def test_the_residuals_vanish_at_the_solution():
     assert residuals_of(one_node(), at(0.0, 1.0), np.array([-2.0, 0.0])).largest < 1e-15
-
-
-def test_a_soft_row_gives_way_by_its_compliance():
-    """With c = 1/2 the first row is x + y - l / 2 <= 1; the balance 2 x - 2 = 2 y - 4 = -l gives l = 4/3."""
-    solution = at(1.0 / 3.0, 4.0 / 3.0)
-    assert residuals_of(one_node(0.5), solution, np.array([-4.0 / 3.0, 0.0])).largest < 1e-15
-    assert residuals_of(one_node(0.0), solution, np.array([-4.0 / 3.0, 0.0])).primal > 0.3
 
 
 @pytest.mark.parametrize(
@@ -151,27 +118,3 @@ def test_a_bound_that_is_no_number_is_never_met(bound: str):
     program = one_node()
     broken = program._replace(**{bound: np.array([1.0, np.nan])})
     assert residuals_of(broken, at(0.0, 0.0), np.zeros(2)).largest == np.inf
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("soft", [False, True])
-def test_both_forms_are_the_same_program(dimension: int, soft: bool):
-    program = random_program(1, dimension=dimension, soft=soft)
-    general = as_quadratic_program(program)
-    random = np.random.default_rng(5)
-    u = random.normal(size=program.linear.shape)
-    u[program.known] = 0.0
-    slack = random.normal(size=len(general.q) - len(general.unknown))
-    x = np.concatenate([u.ravel()[general.unknown], slack])
-    dense = general.P.toarray()
-    value = 0.5 * x @ (dense + dense.T - np.diag(np.diag(dense))) @ x + general.q @ x
-    nodes = len(u)
-    expected = 0.5 * float(slack @ slack) + float((program.linear * u).sum())
-    expected += 0.5 * float(np.einsum("iab,ia,ib->", program.blocks, u, u))
-    for apart in range(1, 4):
-        expected += float((program.couplings[apart - 1, : nodes - apart, None] * u[:-apart] * u[apart:]).sum())
-    assert value == pytest.approx(expected)
-    image = np.einsum("rkd,rkd->r", program.gradient, u[program.first[:, None] + np.arange(3)])
-    image[program.compliance > 0.0] += np.sqrt(program.compliance[program.compliance > 0.0]) * slack
-    np.testing.assert_allclose(general.A @ x, image, atol=1e-12)
-    assert (len(slack) > 0) == soft

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.thread.formulations import StepResult
 from magnetosuture_thread.thread.material import Attachment, Thread
+from magnetosuture_thread.thread.step import StepResult
 from test.thread.scenes import DT, east, followed, formulated, polyamide, straight
 
 RADIUS = 0.0175

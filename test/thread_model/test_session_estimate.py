@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -10,14 +9,13 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.configuration import from_mapping
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.session import EstimationResult
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
+from magnetosuture_thread.thread_observation import ThreadObservation
 from test.estimator.threads import LENGTH, error_percent, piece_of, poses, thread_of, true_shapes, whole
 from test.thread.worlds import scene_with
 
@@ -145,45 +143,6 @@ def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
     future = session.on_pose(last + 1_000_000, replace(WAY[19], stamp=(last + 1_000_000) * 1e-9))
     assert isinstance(future.estimate_problem, InvalidInputError)
     assert future.estimate is not None
-    good = piece_of(NODES[20], 20)
-    bad = {
-        "not finite": replace(good, points=np.full_like(good.points, math.nan)),
-        "of another thread": replace(
-            good,
-            points=good.points + np.array([0.0, 0.008]),
-            first_end=PieceEnd.UNKNOWN,
-            arc_length=(math.nan, math.nan),
-        ),
-    }
-    for k, piece in zip((20, 21), bad.values(), strict=True):
-        assert not list(session.on_observation(stamp_of(WAY[k]), ThreadObservation((piece,))))
-        estimate = estimated(session.on_pose(stamp_of(WAY[k]), at(WAY[k])))
-        assert estimate.problems
-        assert not estimate.corrected
-    assert estimate.unmeasured_for == pytest.approx(2 / 30.0)
-    many = replace(good, points=np.repeat(NODES[22], 400, axis=0), deviation=np.full(10_400, 2e-5))
-    assert not list(session.on_observation(stamp_of(WAY[22]), ThreadObservation((many,))))
-    assert session.on_pose(stamp_of(WAY[22]), at(WAY[22])).estimate is not None
-    found = estimated(follow(session, 23, 45)[-1])
-    assert error_percent(found.positions, NODES[-1]) < 0.1
-
-
-def test_the_first_frame_after_a_long_pause_is_estimated():
-    session = ThreadSession(made(), None)
-    follow(session, 0, 5)
-    stamp = stamp_of(WAY[5]) + 20_000_000_000
-    assert not list(session.on_observation(stamp, whole(NODES[5], 5)))
-    assert not session.late_estimates()
-    estimate = estimated(session.on_pose(stamp, replace(WAY[5], stamp=stamp * 1e-9)))
-    assert estimate.corrected
-    assert error_percent(estimate.positions, NODES[5]) < 0.2
-
-
-def test_time_set_back_restarts_the_estimate():
-    session = ThreadSession(made(), None)
-    follow(session, 40, 45)
-    again = follow(session, 0, 5)
-    assert error_percent(estimated(again[-1]).positions, NODES[4]) < 0.1
 
 
 @pytest.mark.parametrize(
@@ -222,11 +181,6 @@ def test_what_is_learned_of_the_thread_is_kept_in_another_scene_and_not_of_anoth
     assert anew.slow_parameters[0].value == pytest.approx(told, rel=1e-6)
 
 
-def test_a_slow_parameter_that_is_none_is_refused():
-    with pytest.raises(ConfigurationError, match=r"thread_model\.estimator_slow_parameters.*stiffness_over_drag"):
-        made(estimator_slow_parameters=["length"])
-
-
 def test_a_scene_that_appears_pushes_the_estimate_out():
     session = ThreadSession(made(), None)
     estimate = estimated(follow(session, 0, 30)[-1])
@@ -249,22 +203,3 @@ def test_a_thread_that_is_fixed_beside_the_tail_is_estimated(offset: float):
     assert estimate.corrected
     assert np.linalg.norm(estimate.positions[-1] - NODES[9, -1]) < 2e-4
     np.testing.assert_allclose(estimate.positions[0], WAY[9].tail + offset * WAY[9].heading, atol=1e-12)
-
-
-@pytest.mark.parametrize("observed", [False, True])
-def test_a_pose_without_solution_restarts_the_estimate_only_of_a_thread_that_was_never_measured(
-    observed: bool, monkeypatch: pytest.MonkeyPatch
-):
-    session = ThreadSession(made(initial_shape="straight"), None)
-    for pose in WAY[:3]:
-        session.on_pose(stamp_of(pose), at(pose))
-    if observed:  # late: its pose has been
-        show(session, 2)
-    assert session._estimator is not None
-    on_pose, failure = session._estimator.on_pose, SolverError("banded", "stalled", 1.0, 1e-6)
-    results = iter((EstimationResult(None, problem=failure),))
-    monkeypatch.setattr(session._estimator, "on_pose", lambda pose: next(results, None) or on_pose(pose))
-    result = session.on_pose(stamp_of(WAY[3]), at(WAY[3]))
-    assert result.estimate_problem is (failure if observed else None)
-    after = session.on_pose(stamp_of(WAY[4]), at(WAY[4]))
-    assert (after.estimate is not None) == observed

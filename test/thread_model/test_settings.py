@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import gc
 from typing import Any
 
 import numpy as np
 import pytest
-from numba.core.registry import CPUDispatcher
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.thread.margins import SOLID
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
@@ -122,27 +119,3 @@ def test_the_attachments_velocity_is_the_rate_of_its_place():
     motion = after(0.0).motion
     assert motion is not None
     np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
-
-
-def kernels() -> int:
-    """Return how many kernels of ours are compiled, or loaded from the cache, by now."""
-    # By their types: to look at what a weak proxy stands for raises once that is gone.
-    ours = (found for found in gc.get_objects() if issubclass(type(found), CPUDispatcher))
-    return sum(len(found.signatures) for found in ours if found.py_func.__module__.startswith("magnetosuture_thread"))
-
-
-@pytest.mark.parametrize("formulation", ["rod", "paper"])
-def test_no_kernel_is_compiled_once_the_predictor_is_made(formulation: str):
-    """Else the first callback, or the first contact in the middle of an operation, would wait for a compiler."""
-    predictor = made(formulation=formulation).predictor(
-        scene_with(SQUARE, Disc((-0.009, 0.002), 0.0015), diameter=0.05)
-    )
-    before = kernels()
-    east, tail = np.array([1.0, 0.0]), np.array([-0.001, 0.0])
-    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
-    touched = False
-    for k in range(1, 200):
-        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * np.array([0.0, 6e-5]), east))
-        touched = touched or bool(any((prediction.margins[name].clearance < 1e-5).any() for name in SOLID))
-    assert touched
-    assert kernels() == before

@@ -13,7 +13,7 @@ from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.rig.camera import CameraScene, Cover, DishCamera, Lighting
 from magnetosuture_thread.scene import Scene as TrackedScene
-from magnetosuture_thread.vision.look import Track
+from magnetosuture_thread.vision.tracker import Track
 
 SCENE = TrackedScene()  # a dish of 35 mm with nothing in it
 VIEW = DishView((322.0, 238.0), 8e-5)

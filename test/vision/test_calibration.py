@@ -19,9 +19,8 @@ from magnetosuture_thread.vision.calibration import (
     calibrate_by_markers,
     measure_needle_length,
 )
-from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import SCENE, VIEW, Pose, render
 
 SPACING, SIDE = 0.034, 0.005
@@ -95,19 +94,6 @@ def test_markers_from_a_camera_that_moved_between_frames_are_refused():
         calibrate_by_markers([markers(view, (0, 1)), markers(nudged, (1, 2, 3))], 0.035, SPACING, SIDE)
     still = calibrate_by_markers([markers(view), markers(view)], 0.035, SPACING, SIDE)
     assert still.scatter_px < 0.2
-
-
-def test_what_is_written_is_a_set_up(tmp_path: Path):
-    view = DishView((318.4, 243.7), 1.2e-4, 0.1)
-    found = calibrate_by_markers([markers(view)], 0.035, SPACING, SIDE)
-    file = tmp_path / "camera.yaml"
-    file.write_text(found.to_yaml())
-    settings = load_setup(file, (VisionTrackerSettings,))["vision_tracker"]
-    read = settings.fixed_view()
-    assert read is not None
-    np.testing.assert_allclose(read.centre_px, found.view.centre_px, atol=1e-3)
-    assert read.metres_per_pixel == pytest.approx(found.view.metres_per_pixel, rel=1e-6)
-    assert read.rotation == pytest.approx(found.view.rotation, abs=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.93, 1.07])

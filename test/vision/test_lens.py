@@ -51,18 +51,6 @@ def test_what_the_lens_does_is_undone(model: str):
     assert np.abs(lens.undistorted(seen)[middle].astype(int) - pattern[middle]).max() <= 6
 
 
-def test_a_lens_without_distortion_changes_nothing():
-    frame = render(Pose(np.zeros(2), 0.3))
-    for model in ("plumb_bob", ""):
-        assert Lens(SIZE, model, np.zeros(5), MATRIX).undistorted(frame) is frame
-    tracker, other = (VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE) for _ in range(2))
-    for index in range(3):
-        other.set_lens(Lens(SIZE, "plumb_bob", np.zeros(5), MATRIX))
-        one, same = tracker.track(frame, 0.1 * index), other.track(frame, 0.1 * index)
-        assert np.array_equal(one.tail, same.tail)
-        assert one.view == same.view
-
-
 def test_with_its_lens_a_distorted_frame_is_measured_as_well_as_one_without():
     for index in range(3):
         result = measure(*frame_of("distortion", index, 31))

@@ -14,9 +14,8 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.scene import Scene as DishScene
-from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import (
     NOWHERE,
     PIXEL,
@@ -162,44 +161,6 @@ def test_what_is_no_image_is_refused(image: np.ndarray):
         TRACKER.look(image)
     with pytest.raises(InvalidInputError, match="image"):
         VisionTracker(VisionTrackerSettings(), SCENE).track(image, 0.0)
-
-
-def at_wall(end: str, gap: float, angle: float) -> tuple[np.ndarray, float]:
-    """Return tail and heading of a needle whose tip, tail or side is so far from the wall [m]."""
-    length, width, radius = 0.007, 0.0004, SCENE.dish.radius
-    outward = np.array([np.cos(angle), np.sin(angle)])
-    if end == "tip":
-        return outward * (radius - gap - length), angle
-    if end == "tail":
-        return outward * (radius - gap - 0.5 * width), angle + np.pi
-    heading = angle + 0.5 * np.pi
-    along = np.array([np.cos(heading), np.sin(heading)])
-    return outward * np.sqrt((radius - gap - 0.5 * width) ** 2 - 0.25 * length**2) - 0.5 * length * along, heading
-
-
-@pytest.mark.parametrize("gap", [0.0, 1e-4, 3e-4])
-@pytest.mark.parametrize("end", ["tip", "tail", "side"])
-def test_a_needle_at_the_wall_is_found(camera: DishCamera, thread_arc, end: str, gap: float):
-    """At once with an end at the wall; along it, where both ends may look alike, if it was seen on its way there."""
-    way = np.arange(5e-4, 0.0, -1e-4) if end == "side" else np.empty(0)
-    lost = followed = 0
-    for angle in np.linspace(0.1, 6.2, 8):
-        tracker = VisionTracker(VisionTrackerSettings(confirm_frames=1), SCENE)
-        for index, apart in enumerate((*(gap + way), gap)):
-            tail, heading = at_wall(end, apart, angle)
-            away = heading + {"tip": np.pi, "tail": 1.4, "side": np.pi - 0.6}[end]  # into the dish
-            thread = thread_arc(tail, away, 0.0, 0.008)
-            seen = tracker.track(camera.render(tail, heading, thread), 0.1 * index)
-        lost += seen.state is not State.TRACKED
-        if seen.state is State.TRACKED:
-            off, turned = Pose(tail, heading).error(seen)
-            assert off < 1.0  # px
-            assert abs(turned) < np.radians(1.0)
-            if len(seen.centreline) > 1:  # where the thread leaves along the wall's normal it is not always seen
-                assert line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[0] < 1.0
-            followed += end != "tail" and line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))[1] > 0.9
-    assert end == "tail" or followed + lost == 8
-    assert lost <= (end == "side" and gap == 0.0)  # as 1 of 240 others was
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(0.0, 1), (2e-5, 4), (1e-6, 7)])

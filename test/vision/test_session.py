@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.vision.images import decode_image
-from magnetosuture_thread.vision.look import State
-from magnetosuture_thread.vision.session import REPEATED, RepetitionDetector, TrackerSession
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import REPEATED, RepetitionDetector, State, TrackerSession
 
 TAIL = np.array([0.002, 0.001])
 
@@ -55,12 +52,3 @@ def test_a_cycle_of_frames_is_found_in_its_second_round(cycle: int):
     detector = RepetitionDetector()
     found = [detector.is_repeated(float(at), frames[at % cycle]) for at in range(3 * cycle)]
     assert found == [False] * cycle + [True] * 2 * cycle
-
-
-@pytest.mark.parametrize("quality", [None, 60])
-def test_the_simulated_camera_never_repeats_itself_over_a_needle_at_rest(camera, thread_arc, quality: int | None):
-    thread, detector = thread_arc(TAIL, 0.4 + np.pi, 40.0), RepetitionDetector()
-    for at in range(60):
-        image = camera.render(TAIL, 0.4, thread)
-        image = image if quality is None else decode_image(encode_jpeg(image, quality))
-        assert not detector.is_repeated(float(at), image)

@@ -11,16 +11,9 @@ from scipy.interpolate import CubicSpline
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.camera import DishCamera
 from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.vision.look import State
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import State, VisionTracker
 
-PLACES = {  # tail [m] and heading [rad]
-    "free": (0.004, -0.012, 2.0),
-    "in the penetration path": (0.0, -0.005, 0.5 * np.pi),
-    "on the left": (-0.00685, 0.0045, 0.5 * np.pi + 0.1),
-    "above": (-0.001, 0.01185, -0.05),
-    "on the right": (0.0068, 0.006, -0.5 * np.pi - 0.05),
-}
+PLACE = (0.004, -0.012, 2.0)  # tail [m] and heading [rad] beside the tissue
 
 
 @pytest.fixture(scope="module")
@@ -50,17 +43,6 @@ def assert_measured(setup: Setup, camera: DishCamera, image: np.ndarray, tail: n
     return float(turned)
 
 
-@pytest.mark.parametrize("place", PLACES)
-def test_the_needle_is_measured_between_tissue_and_ring(
-    setup: Setup, camera: DishCamera, fine_camera: DishCamera, place: str
-):
-    x, y, heading = PLACES[place]
-    tail = np.array([x, y])
-    behind, _ = needle_axis(tail, heading + np.pi, 0.004, 0.0, np.linspace(0.0, 1.0, 20))
-    for taking in (camera, fine_camera):
-        assert_measured(setup, taking, taking.render(tail, heading, behind), tail, heading)
-
-
 @pytest.mark.parametrize("angle", [35.0, 45.0, 60.0, 90.0])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
@@ -70,12 +52,12 @@ def test_a_thread_that_turns_back_beside_the_needle_hides_it_not(
 
     At 35 degrees the setup's own camera has too few pixels between the two: the heading may be off by 7 degrees.
     """
-    x, y, heading = PLACES["free"]
+    x, y, heading = PLACE
     tail = np.array([x, y])
     away = heading + side * np.radians(angle)
     back, _ = needle_axis(tail, away, 0.02, 0.0, np.linspace(0.0, 1.0, 50))
     for taking in (fine_camera, *([camera] if angle > 40.0 else [])):
-        frames = [taking.render(tail, heading, back) for _ in range(20)]
+        frames = [taking.render(tail, heading, back) for _ in range(12)]
         different = {frame.tobytes(): frame for frame in frames}  # the camera has few fields of noise
         turned = [assert_measured(setup, taking, frame, tail, heading) for frame in different.values()]
         assert len(turned) >= 5

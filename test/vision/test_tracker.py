@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.vision.look import State
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, random_thread, render
 
 RATE = 30.0
@@ -101,14 +100,6 @@ def test_of_two_needles_the_one_that_was_followed_is_taken():
     seen = tracker.track(np.minimum(render(moving(4)), render(other)), 4 / RATE)
     assert seen.state is State.TRACKED
     assert moving(4).is_right(seen)
-
-
-def test_two_needles_from_the_beginning_are_not_chosen_between():
-    tracker = VisionTracker(VisionTrackerSettings(), SCENE)
-    frame = np.minimum(render(moving(4)), render(Pose(np.array([-0.009, -0.006]), 2.0)))
-    for index in range(5):
-        seen = tracker.track(frame, index / RATE)
-        assert (seen.state, seen.reason) == (State.SEARCHING, "2 needles in the dish")
 
 
 def test_after_a_long_time_the_needle_is_searched_anew():

@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from shapely.geometry.polygon import orient
 
 from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.errors import ConfigurationError
@@ -21,7 +19,6 @@ from magnetosuture_thread.geometry.obstacles import Disc
 
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
-MAX_CLEARANCE = 8.0  # cells; clearances are not found beyond
 
 
 class Shapes(NamedTuple):
@@ -110,12 +107,15 @@ class Surface:
         return shapes
 
 
-def _directed(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a ring counter-clockwise and open."""
-    solid = shapely.Polygon(ring)
-    if not solid.is_valid or not solid.area > 0.0:
-        raise ConfigurationError("surface.polygons", np.asarray(ring).tolist(), "corners of a simple polygon [m]")
-    return np.ascontiguousarray(shapely.get_coordinates(orient(solid).exterior)[:-1])
+    ring = np.array(given, dtype=np.float64)
+    ring = ring[:-1] if (ring[0] == ring[-1]).all() else ring
+    x, y = (ring - ring[:1]).T
+    area = 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+    if not abs(area) > 0.0:
+        raise ConfigurationError("surface.polygons", ring.tolist(), "at least three distinct corners around an area")
+    return ring if area > 0.0 else np.ascontiguousarray(ring[::-1])
 
 
 def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -166,7 +166,8 @@ def polygon_gap(x: float, y: float, shapes: Shapes, p: int) -> tuple[float, floa
 
 @compiled
 def _find_clearances(shapes: Shapes) -> None:
-    most, side = MAX_CLEARANCE * shapes.grid[2], shapes.grid[2]
+    # Clearances are not found beyond 8 cells.
+    most, side = 8.0 * shapes.grid[2], shapes.grid[2]
     for i in range(shapes.clearances.shape[0]):
         for j in range(shapes.clearances.shape[1]):
             x, y = shapes.grid[0] + (j + 0.5) * side, shapes.grid[1] + (i + 0.5) * side

@@ -41,8 +41,6 @@ __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
-MAX_GROWTH = 2.0  # of a step; the formula is stable up to 1 + sqrt(2)
-MAX_OUTLINE = 48  # points of the needle's outline that touch
 MAX_ITERATIONS = 60  # of Newton in a step
 CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
 ROUNDING, MIN_ENERGY = 1e-10, 1e-18  # of the energy, a sum of larger terms; and J, of a move by the tolerance
@@ -242,7 +240,8 @@ class RigDynamics:
             0.5 * thread.diameter + surface.skin,
         )
         clamp = thread.bending_stiffness / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
-        touching = min(int(2.0 * needle.length / needle.diameter) + 2, MAX_OUTLINE)
+        # At most 48 points of the outline touch.
+        touching = min(int(2.0 * needle.length / needle.diameter) + 2, 48)
         self._needle = Needle(
             needle.resistance,
             needle.tip,
@@ -361,7 +360,8 @@ class RigDynamics:
             if done and self.iterations + MAX_ITERATIONS * self.halvings >= max_iterations:
                 return done
             if self._last_dt > 0.0:
-                h = min(h, MAX_GROWTH * self._last_dt)
+                # A step is at most twice the one before; the formula is stable up to 1 + sqrt(2).
+                h = min(h, 2.0 * self._last_dt)
             # What is left is taken whole or in two like steps, never with a sliver at the end.
             if left < 1.5 * h:
                 h = left if left < 1.01 * h else 0.5 * left

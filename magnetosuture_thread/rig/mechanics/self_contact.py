@@ -23,9 +23,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.rig.mechanics.contact import Shapes
 from magnetosuture_thread.rig.mechanics.rod import Rod, back_substitute
 
-NEAR = 0.5  # segments; a node farther than this from touching has no gap in a step
 NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
-MIN_ARC = 0.5 * math.pi  # diameters between places that can touch
 
 
 @compiled
@@ -77,14 +75,16 @@ def find_pairs(q: NDArray[np.float64], rod: Rod, shapes: Shapes, pairs: NDArray[
     for a in range(1, size - 1, 2):
         for b in range(1, size - 3, 2):
             between = min(abs(a - b), abs(a - b - 2)) // 2
-            if a == b or a == b + 2 or between * rod.segment <= MIN_ARC * diameter:
+            # Places less than half a circle of thread apart cannot touch.
+            if a == b or a == b + 2 or between * rod.segment <= 0.5 * math.pi * diameter:
                 continue
             ex, ey, dx, dy = q[b + 2] - q[b], q[b + 3] - q[b + 1], q[a] - q[b], q[a + 1] - q[b + 1]
             square = ex * ex + ey * ey
             s = min(max((dx * ex + dy * ey) / square, 0.0), 1.0)
             nx, ny = dx - s * ex, dy - s * ey
             gap = math.sqrt(nx * nx + ny * ny)
-            if not 0.0 < gap < diameter + NEAR * rod.segment or _cross(q, a, b) or _cross(q, a - 2, b):
+            # A node that is farther than half a segment from touching has no gap in a step.
+            if not 0.0 < gap < diameter + 0.5 * rod.segment or _cross(q, a, b) or _cross(q, a - 2, b):
                 continue
             if count + 2 > pairs.shape[0]:
                 return -1

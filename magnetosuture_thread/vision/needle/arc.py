@@ -11,13 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
-
 SET_TOLERANCE = 0.1  # of the length as it is set
-MEASURED_TOLERANCE = 0.02  # of the length once it is measured
 FRAMES = 8  # that must agree
 AGREEMENT = 0.02  # share of the length within which they agree
-CONFIDENT = 0.3  # confidence of a pose that counts
 REVERSED_PX = 3.0  # px; standard deviation, along the axis, of a tail placed where a tip was fitted
 
 
@@ -41,10 +37,18 @@ class Arc:
         p = start + s sinc(k s / 2) (cos b, sin b) + d (-sin c, cos c),  b = angle + k s / 2,  c = angle + k s
         """
         s = np.asarray(along, dtype=float)
-        result = np.empty((s.size, 2))
-        apart = np.full(s.size, aside) if np.ndim(aside) == 0 else np.broadcast_to(aside, s.shape).ravel()
-        _points(self.start[0], self.start[1], self.angle, self.curvature, s.ravel(), apart, result)
-        return result.reshape(*s.shape, 2)
+        half = 0.5 * self.curvature * s
+        middle, turned = self.angle + half, self.angle + 2.0 * half
+        chord = 2.0 / self.curvature * np.sin(half) if abs(self.curvature) > 1e-12 else s
+        result = np.empty((*s.shape, 2))
+        result[..., 0] = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
+        result[..., 1] = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
+        return result
+
+    @property
+    def axis(self) -> tuple[float, float, float, float]:
+        """First point, angle and curvature, as compiled code takes them."""
+        return float(self.start[0]), float(self.start[1]), float(self.angle), float(self.curvature)
 
     def direction(self, along: float = 0.0) -> np.ndarray:
         """Return the unit tangent after a length, shape (2,)."""
@@ -85,8 +89,23 @@ def fit_arc(points: np.ndarray) -> Arc:
     Source: [Taubin1991] G. Taubin, "Estimation of planar curves, surfaces, and nonplanar space curves defined by
     implicit equations", IEEE T-PAMI 13(11). Deviation: none.
     """
-    u, v, angle, curvature = _fit_arc(np.ascontiguousarray(points, dtype=float))
-    return Arc(np.array([u, v]), angle, curvature)
+    mean = points.mean(axis=0)
+    x, y = (points - mean).T
+    z = x * x + y * y
+    spread = max(float(z.mean()), 1e-12)
+    scaled = np.stack([(z - spread) / (2.0 * math.sqrt(spread)), x, y])
+    a, b, c = np.linalg.eigh(scaled @ scaled.T)[1][:, 0]
+    a /= 2.0 * math.sqrt(spread)
+    d = -spread * a
+    a, b, c, d = (float(value) for value in np.array([a, b, c, d]) / math.sqrt(max(b * b + c * c - 4.0 * a * d, 1e-24)))
+    gradient = math.hypot(b, c)
+    if gradient < 1e-9:  # The mean is the centre: any point is as near as another.
+        b, c, gradient = 1.0, 0.0, 1.0
+    normal = np.array([b, c]) / gradient
+    # Along the normal through the mean: a t^2 + gradient t + d = 0, the root of smaller size.
+    foot = -2.0 * d / (gradient + math.sqrt(max(gradient * gradient - 4.0 * a * d, 0.0)))
+    # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
+    return Arc(mean + foot * normal, math.atan2(-normal[0], normal[1]), -2.0 * a)
 
 
 @dataclass(frozen=True)
@@ -194,7 +213,7 @@ class LengthEstimator:
 
     def add(self, length: float, confidence: float) -> None:
         """Take the length of a needle whose ends a frame shows [m], and the confidence of its pose."""
-        if self.length is not None or confidence < CONFIDENT:
+        if self.length is not None or confidence < 0.3:
             return
         self._lengths = [*self._lengths[1 - FRAMES :], length]
         middle = float(np.median(self._lengths))
@@ -203,46 +222,5 @@ class LengthEstimator:
 
     def size(self, length: float, width: float, metres_per_pixel: float) -> NeedleSize:
         """Return the size in an image of a needle whose length and width are set [m], by the image's scale [m]."""
-        known, tolerance = (length, SET_TOLERANCE) if self.length is None else (self.length, MEASURED_TOLERANCE)
+        known, tolerance = (length, SET_TOLERANCE) if self.length is None else (self.length, 0.02)
         return NeedleSize(known / metres_per_pixel, width / metres_per_pixel, tolerance)
-
-
-@compiled
-def _fit_arc(points):
-    """Return the arc of `fit_arc`: its first point, its direction there and its curvature."""
-    count = len(points)
-    mean_u, mean_v = points[:, 0].sum() / count, points[:, 1].sum() / count
-    x, y = points[:, 0] - mean_u, points[:, 1] - mean_v
-    z = x * x + y * y
-    spread = max(z.sum() / count, 1e-12)
-    scaled = (z - spread) / (2.0 * math.sqrt(spread))
-    moments = np.empty((3, 3))
-    moments[0, 0], moments[1, 1], moments[2, 2] = (scaled * scaled).sum(), (x * x).sum(), (y * y).sum()
-    moments[0, 1] = moments[1, 0] = (scaled * x).sum()
-    moments[0, 2] = moments[2, 0] = (scaled * y).sum()
-    moments[1, 2] = moments[2, 1] = (x * y).sum()
-    _, axes = np.linalg.eigh(moments)
-    a, b, c = axes[0, 0] / (2.0 * math.sqrt(spread)), axes[1, 0], axes[2, 0]
-    d = -spread * a
-    size = math.sqrt(max(b * b + c * c - 4.0 * a * d, 1e-24))
-    a, b, c, d = a / size, b / size, c / size, d / size
-    gradient = math.hypot(b, c)
-    if gradient < 1e-9:  # The mean is the centre: any point is as near as another.
-        b, c, gradient = 1.0, 0.0, 1.0
-    normal_u, normal_v = b / gradient, c / gradient
-    # Along the normal through the mean: a t^2 + gradient t + d = 0, the root of smaller size.
-    root = math.sqrt(max(gradient * gradient - 4.0 * a * d, 0.0))
-    foot = -2.0 * d / (gradient + root)
-    # Across the tangent (n_v, -n_u) lies the normal itself, and the circle's centre lies against it where a > 0.
-    return mean_u + foot * normal_u, mean_v + foot * normal_v, math.atan2(-normal_u, normal_v), -2.0 * a
-
-
-@compiled
-def _points(u, v, angle, curvature, along, aside, points):
-    """Fill in the points of an arc; see `Arc.at`."""
-    for index in range(len(along)):
-        half = 0.5 * curvature * along[index]
-        chord = along[index] if abs(half) < 1e-9 else along[index] * math.sin(half) / half
-        middle, turned = angle + half, angle + 2.0 * half
-        points[index, 0] = u + chord * math.cos(middle) - aside[index] * math.sin(turned)
-        points[index, 1] = v + chord * math.sin(middle) + aside[index] * math.cos(turned)

@@ -1,4 +1,7 @@
-"""Measures the needle in a dark component, which may hold its thread too: beside, under or over it, as dark as it."""
+"""Finds and measures the needle: the one dark, slender thing in the dish whose two ends are a tail and a tip.
+
+A dark component may hold the needle's thread too: beside, under or over it, and as dark as it.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,151 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, middle, straightened
 from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
-from magnetosuture_thread.vision.needle.comparison import (
-    bluntness,
-    ends_beyond,
-    excess,
-    fading,
-    leaves_sideways,
-    lies_over_tail,
-    steel_rows,
-    thread_offsets,
+from magnetosuture_thread.vision.needle.template import (
+    BESIDE_PX,
+    BLOOM_PX,
+    FIRST_ROUNDS,
+    STEP_PX,
+    THIN,
+    SteelMap,
+    TemplateFit,
+    drawn_needle,
+    fit_template,
+    tail_shift,
 )
-from magnetosuture_thread.vision.needle.steel_map import SteelMap
-from magnetosuture_thread.vision.needle.tail_edge import tail_shift
-from magnetosuture_thread.vision.needle.template import BLOOM_PX, FIRST_ROUNDS, THIN, TemplateFit, fit_template
-from magnetosuture_thread.vision.sampling import middle, straighten
+from magnetosuture_thread.vision.scene_mask import SceneMask
 
-CLEAR_COST, MAX_COST = 0.03, 0.11  # of the length, in squared pixels: nothing else is better; it is no needle
+AT_WALL = "at the wall"
+MIN_AREA = 0.33  # of the needle's own
+AROUND_PX = 24.0  # around a dark thing, that is measured on
+MAX_COST = 0.11  # of the length, in squared pixels, of what is no needle
 HOPELESS = 4.0  # times the cost of one fit, that another has after its first rounds if it cannot be as good
-CLEARLY, DEARER = 1.25, 1.15  # times the cost that the other way has if both could be; if one end speaks against it
+CLEARLY = 1.25  # times the cost that the other way has if both could be
 SAME_LENGTH = 0.015  # share of the length, that need no proof
-MAX_MISSING, MAX_MISSING_END, END_ROWS = 0.13, 0.15, 3  # share of steel that the image may lack; at an end, in rows
+MAX_MISSING_END, END_ROWS = 0.15, 3  # share of steel that the image may lack at an end, and its rows
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
-BLUNT, POINTED = 0.7, 0.32  # bluntness of a tail at least, and of a tip at most
-TOWARD = 0.8  # cosine between a needle and where it must point
+BLUNT = 0.7  # bluntness of a tail at least
 CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
 ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
+
+
+def search_factor(width_px: float) -> int:
+    """Return by how much an image may be shrunk to search for a needle of a width [px]."""
+    return 2 if width_px >= 4.0 else 1
+
+
+def find_needles(
+    picture: Picture, view: DishView, dish_radius: float, size: NeedleSize, toward: np.ndarray | None = None
+) -> tuple[list[MeasuredNeedle], list[str]]:
+    """Find all that may be the needle.
+
+    Dark pixels in the dish form components; each of about the right area is measured.
+
+    Args:
+        picture: the frame or a part of it.
+        view: where the dish is in the picture, whose first pixel is (0, 0).
+        dish_radius: [m]
+        size: of the needle in the picture.
+        toward: where the needle must point, u right and v down; settles which end is which where both look
+            alike, as when the tip is blurred.
+
+    Returns:
+        The needles, and in words why each of the other candidates is none.
+    """
+    needles, refused = _measured(picture, view, dish_radius, size, toward)
+    if not needles and refused:
+        # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
+        needles, again = _measured(picture, view, dish_radius, size, toward, tight=True)
+        refused = [reason for reason in refused if reason != AT_WALL] or again or refused
+    return needles, refused
+
+
+def _measured(
+    picture: Picture,
+    view: DishView,
+    dish_radius: float,
+    size: NeedleSize,
+    toward: np.ndarray | None,
+    *,
+    tight: bool = False,
+) -> tuple[list[MeasuredNeedle], list[str]]:
+    """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`."""
+    radius = dish_radius / view.metres_per_pixel
+    radius = radius - RIM_PX if tight else 0.985 * radius  # at first off the rim
+    wall = Wall(view.centre_px, radius)
+    needles: list[MeasuredNeedle] = []
+    refused: list[str] = []
+    mask, factor = picture.mask, picture.factor
+    candidates = _dark_components(picture, view, radius, size.length_px * size.width_px, tight)
+    if len(candidates) > 6:
+        return [], [f"{len(candidates)} dark things"]
+    for points in candidates:
+        if not tight and np.hypot(*(points - view.centre_px).T).max() > radius - 2.0:
+            refused.append(AT_WALL)  # which may have cut off a part
+            continue
+        low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
+        near = mask is not None and mask.deepest(low, high) > 0.0
+
+        steel = SteelMap.around(points, picture.brightest, picture.darkest, factor, wall)
+        if mask is not None and near:
+            steel = steel.hidden_where(mask.depth[steel.box] > (0.0 if tight else mask.tolerance_px))
+        if tight:
+            steel = steel.hidden_where(wall.distances(steel.box) > radius)
+        found = measure_needle(steel, size, toward)
+        if mask is not None and near and isinstance(found, MeasuredNeedle) and _is_inside(mask, found, size.width_px):
+            found = "inside of a shape of the scene"
+        if isinstance(found, MeasuredNeedle):
+            needles.append(found)
+        else:
+            refused.append(found)
+    return needles, refused
+
+
+def _dark_components(picture: Picture, view: DishView, radius_px: float, area: float, tight: bool) -> list[np.ndarray]:
+    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2)."""
+    factor = picture.factor
+    shift = 0.5 * (factor - 1)
+    u, v = ((c - shift) / factor for c in view.centre_px)
+    radius = radius_px / factor
+    left, top = (max(0, int(c - radius)) for c in (u, v))
+    window = slice(top, max(top, int(v + radius) + 2)), slice(left, max(left, int(u + radius) + 2))
+    dark = cv2.compare(
+        picture.brightest.small[window],
+        cv2.convertScaleAbs(picture.brightest.floor[window], alpha=0.55),
+        cv2.CMP_LT,
+    )
+    if dark is None or dark.size == 0:
+        return []
+    mask = np.zeros(dark.shape, np.uint8)
+    cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
+    if picture.mask is not None:
+        cut = picture.mask.solid(picture.brightest.small.shape[::-1], 0.0 if tight else picture.mask.tolerance_px)
+        cv2.subtract(mask, cut[window], mask)
+    cv2.bitwise_and(dark, mask, dark)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    result = []
+    for outline in outlines:
+        # A component is no larger than its box, so most are passed over at once.
+        x, y, wide, high = cv2.boundingRect(outline)
+        if wide * high * factor**2 < MIN_AREA * area:
+            continue
+        own = np.zeros((high, wide), np.uint8)
+        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-x, -y))
+        rows, columns = np.nonzero(own & dark[y : y + high, x : x + wide])
+        if len(rows) * factor**2 < MIN_AREA * area:
+            continue
+        at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
+        result.append(at * factor + shift)
+    return result
+
+
+def _is_inside(mask: SceneMask, needle: MeasuredNeedle, width: float) -> bool:
+    """Say whether a needle's axis lies in shapes: that of a real one stays half its width off their outlines [px]."""
+    depths = mask.depths(needle.arc.at(np.linspace(0.0, needle.length_px, 15)))
+    return middle(depths) > mask.tolerance_px - 0.5 * width
 
 
 def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None = None) -> MeasuredNeedle | str:
@@ -64,7 +186,7 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
                 guesses.append(at)
                 fits.append(fit_template(steel, guess, length, width, rounds=FIRST_ROUNDS))
         fits.sort(key=lambda fit: fit.cost)
-        if fits and fits[0].cost < CLEAR_COST * length:
+        if fits and fits[0].cost < 0.03 * length:  # px^2: nothing else is better
             break
     found: MeasuredNeedle | str = NO_SHAPE if fits else "no arc"
     for rough in fits[:3]:
@@ -100,14 +222,13 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
     # An end that is hidden would make the needle look shorter: where it looks as long as it is set, it is so.
     agrees = shows_ends or apart < SAME_LENGTH
     length_error = 0.5 * (min(size.tolerance, max(SAME_LENGTH, apart)) if agrees else size.tolerance)
-    if reason := _what_covers(steel, shown, best, width):
+    if reason := _what_covers(steel, shown, best):
         return reason
     if steel.share_hidden(best.arc.at(np.linspace(0.0, best.length, 100))) > 0.02:
         return "hidden"
     if abs(best.arc.curvature) * best.length > 1.25 * math.pi:
         return "bent beyond a half circle"
-    around = _excess(steel.surely, best, width)
-    if max(around[4], around[5]) > 0.1:  # of the rows
+    if _excess(steel.surely, best, width)[2] > 0.1:  # of the rows
         return "something dark against it"
     is_known = True
     pointed = min((one, other), key=lambda each: each.cost)
@@ -122,13 +243,14 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         if settled is None:
             return ALIKE
         fit, is_known = settled
-    if reason := _what_prolongs(steel, fit, width, is_known):
+    beyond_tip, beyond_tail, _ = _excess(steel.surely, fit, width)
+    if reason := _what_prolongs(steel, fit, (beyond_tip, beyond_tail), is_known):
         return reason
     confidence = min(1.0, steel.depth / 0.6) * max(0.0, 1.0 - fit.cost / (MAX_COST * fit.length)) ** 0.5
     covariance = fit.covariance()
     confidence *= max(0.2, 1.0 - 2.0 * float(covariance[1, 1]))
     # A thread as wide as the needle draws a measured tail outwards by 1.5 px, one deviation.
-    pull = 1.5 * max(0.0, float(_excess(steel.surely, fit, width)[3]))
+    pull = 1.5 * beyond_tail
     if not is_measured:
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
@@ -158,18 +280,9 @@ def _fits(
 ) -> tuple[TemplateFit, TemplateFit, TemplateFit]:
     """Fit a pointed needle, the same the other way round, and a rod."""
     length, width = size.length_px, size.width_px
-    starts = [(rough.arc, length)]
-    if tolerance:
-        part = _dark_part(steel, rough.arc, size)
-        if abs(part[1] - length) > 0.4 * tolerance * length:
-            starts.append(part)
-    ones = [fit_template(steel, arc, length, width, tolerance=tolerance, start=start) for arc, start in starts]
-    one = min(ones, key=lambda each: each.cost)
+    one = fit_template(steel, rough.arc, length, width, tolerance=tolerance, start=length)
     bound = HOPELESS * one.cost
     other = fit_template(steel, one.reversed(), length, width, tolerance=tolerance, start=one.length, hopeless=bound)
-    if other.cost < one.cost:  # which then may be caught beside the best place
-        again = fit_template(steel, other.reversed(), length, width, tolerance=tolerance, start=other.length)
-        one = min((one, again), key=lambda each: each.cost)
     rod = fit_template(steel, one.arc, length, width, tolerance=tolerance, start=one.length, rod=True, hopeless=bound)
     return one, other, rod
 
@@ -183,22 +296,6 @@ def _needs_length(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     return known.cost - fit.cost > 0.1 * size.width_px
 
 
-def _dark_part(steel: SteelMap, arc: Arc, size: NeedleSize) -> tuple[Arc, float]:
-    """Return the part of an axis that is dark, with a little more: what a fit lacks draws it in from farther away."""
-    length, slack = size.length_px, (size.tolerance + 0.08) * size.length_px
-    along = np.arange(-slack, length + slack)
-    dark = np.empty((len(along), 3))
-    axis = float(arc.start[0]), float(arc.start[1]), arc.angle, arc.curvature
-    straighten(steel.surely, axis, along, np.array([-0.2, 0.0, 0.2]) * size.width_px, dark)
-    light = np.flatnonzero(dark.min(axis=1) < 0.5)
-    half = len(along) // 2
-    first = along[light[light < half].max(initial=-1) + 1]
-    last = along[light[light >= half].min(initial=len(along)) - 1]
-    if last - first > (1.0 + size.tolerance) * length:
-        return arc, length
-    return arc.moved(float(first), 0.0, 0.0, 0.0), min(float(last - first) + 3.0, (1.0 + size.tolerance) * length)
-
-
 def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """Say whether both ends of a needle are seen where its length says, so that the length is measured.
 
@@ -206,11 +303,10 @@ def _shows_ends(steel: SteelMap, fit: TemplateFit, size: NeedleSize) -> bool:
     """
     if abs(fit.length - size.length_px) > 1.2 * size.tolerance * size.length_px:
         return False
-    beyond, state = _excess(steel.perhaps, fit, size.width_px)[2:4], _state(fit.arc, fit.width)
-    if beyond.max() > 0.35 or fading(steel.surely, state, fit.length, fit.width) > 0.7:
+    if max(_excess(steel.perhaps, fit, size.width_px)[:2]) > 0.35 or _fading(steel.surely, fit) > 0.7:
         return False
     ends = fit.arc.at(np.array([-4.0, 0.0, fit.length, fit.length + 4.0]))
-    return not leaves_sideways(steel, fit) and not steel.is_glaring(ends)
+    return not _leaves_sideways(steel, fit) and not steel.is_glaring(ends)
 
 
 def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> TemplateFit | None:
@@ -221,71 +317,48 @@ def _pointed_way(steel: SteelMap, one: TemplateFit, other: TemplateFit) -> Templ
     for fit, against in ((one, other), (other, one)):
         if fit.cost > CLEARLY * against.cost:
             continue
-        tail, tip = _bluntness(steel, fit.arc, fit.length, fit.width)
+        tail, tip = _bluntness(steel.perhaps, fit).min(axis=1).tolist()  # where a coloured thread may hide steel
         if tail < BLUNT or tip > 0.45:
             continue
-        their_tail, their_tip = _bluntness(steel, against.arc, against.length, against.width)
+        their_tail, their_tip = _bluntness(steel.perhaps, against).min(axis=1).tolist()
         signs = (their_tail < 0.5) + (their_tip > 0.6)
-        needed = (CLEARLY, DEARER, 0.0)[signs]  # times the cost, for as many signs against the other way
-        if tip > POINTED:  # as the wall blunts a tip
+        needed = (CLEARLY, 1.15, 0.0)[signs]  # times the cost, for as many signs against the other way
+        if tip > 0.32:  # as the wall blunts a tip
             needed = HOPELESS if signs == 2 else math.inf
         if against.cost > needed * fit.cost:
             return fit
     return None
 
 
-def _bluntness(steel: SteelMap, arc: Arc, length: float, width: float) -> tuple[float, float]:
-    """Return how blunt tail and tip may be, where a coloured thread may hide steel; see `bluntness`."""
-    result = np.empty((2, 2))
-    bluntness(steel.perhaps, _state(arc, width), length, 0.5 * width, result)
-    return float(result[0].min()), float(result[1].min())
-
-
-def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit, width: float) -> str:
+def _what_covers(steel: SteelMap, shown: SteelMap, fit: TemplateFit) -> str:
     """Say what covers a drawn needle; empty if nothing does. Glare, which `shown` leaves out, may hide the tail."""
     if fit.cost > MAX_COST * fit.length:
         return NO_SHAPE
-    rows, state = np.empty((int(fit.length), 3)), _state(fit.arc, fit.width)
-    tip = int(0.8 * len(rows))
-    steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
-    at_tip = rows[tip:].copy()
-    steel_rows(shown.surely, shown.perhaps, state, fit.length, 0.5 * fit.width, THIN, rows)
-    share, greatest = rows[:, 0], rows[:, 2]
+    rows = _steel_rows(shown, fit, THIN)
+    share, _, greatest = rows
+    tip = int(0.8 * len(share))
     even = np.convolve(share[:tip], np.full(5, 0.2), "valid")
-    if even.max() > MAX_MISSING or share[:END_ROWS].mean() > MAX_MISSING_END:
+    if even.max() > 0.13 or share[:END_ROWS].mean() > MAX_MISSING_END:  # of the steel may be missing
         return "something over it or against it"
     if np.mean(greatest[:tip] > 0.75) < 0.97:
         return "no needle's darkness"
-    if at_tip[:, 0] @ at_tip[:, 1] > 0.2 * at_tip[:, 1].sum():
+    missing, total, _ = rows if shown is steel else _steel_rows(steel, fit, THIN)
+    if missing[tip:] @ total[tip:] > 0.2 * total[tip:].sum():
         return "something over it or against it"
     return ""
 
 
-def _what_prolongs(steel: SteelMap, fit: TemplateFit, width: float, is_known: bool) -> str:
-    """Say at which end something goes on that is too wide for a thread; empty if nothing does."""
-    beyond_tip, beyond_tail = _excess(steel.surely, fit, width)[2:4]
+def _what_prolongs(steel: SteelMap, fit: TemplateFit, beyond: tuple[float, float], is_known: bool) -> str:
+    """Say at which end something goes on that is too wide for a thread; empty if nothing does. See `_excess`."""
+    beyond_tip, beyond_tail = beyond
     if min(beyond_tip, beyond_tail) > 0.2:  # A thread leaves or passes at one only.
         return "something at both ends"
     if beyond_tip > MAX_BEYOND:
         return "something at its tip"
-    if beyond_tail > MAX_BEYOND:
-        blunt = np.empty((2, 2))
-        bluntness(steel.surely, _state(fit.arc, fit.width), fit.length, 0.5 * fit.width, blunt)
-        if not is_known or blunt[1].max() > 0.2 or ends_beyond(steel, fit):
-            return "something at its tail"
-    return ""
-
-
-def _state(arc: Arc, width: float) -> np.ndarray:
-    """Return an axis and half of the drawn width as compiled code takes them."""
-    return np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature, 0.5 * width + BLOOM_PX])
-
-
-def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> np.ndarray:
-    """Return what is dark around a drawn needle; see `excess`."""
-    result = np.empty(6)
-    excess(dark, _state(fit.arc, fit.width), fit.length, 0.5 * width, result)
-    return result
+    if beyond_tail <= MAX_BEYOND:
+        return ""
+    is_thread = is_known and _bluntness(steel.surely, fit)[1].max() <= 0.2 and not _ends_beyond(steel, fit)
+    return "" if is_thread else "something at its tail"
 
 
 def _settled(
@@ -298,22 +371,21 @@ def _settled(
     Where no thread is seen at either end of what is no rod, and does not look more like one, None: the length may be
     another's.
     """
-    offsets = thread_offsets(steel, rod)
+    offsets = _thread_offsets(steel, rod)
     if not is_rod and offsets == (None, None):
         is_blunt = CLEARLY * rod.cost < fit.cost or (rod.cost < fit.cost and _is_rod(steel, rod))
         return (rod, False) if is_blunt else None
-    blunt = np.empty((2, 2))
-    bluntness(steel.surely, _state(rod.arc, rod.width), rod.length, 0.5 * rod.width, blunt)
+    blunt = _bluntness(steel.surely, rod)
     bound = 0.3 * rod.width + 0.3
     is_pointed = rod.cost > CLEARLY * fit.cost
     for end, tail_first in ((0, rod.arc), (1, rod.reversed())):
         here, there = offsets[end], offsets[1 - end]
         leaves = is_rod and there is None and here is not None and here < bound
-        leaves = leaves and not lies_over_tail(steel, replace(rod, arc=tail_first))
+        leaves = leaves and not _lies_over_tail(steel, replace(rod, arc=tail_first))
         passes = is_pointed and here is None and there is not None and there > bound and blunt[end].min() > BLUNT
         if leaves or passes:
             return _pointing(fit, tail_first.direction(0.5 * rod.length)), True
-    if toward is not None and abs(float(fit.arc.direction() @ toward)) > TOWARD:
+    if toward is not None and abs(float(fit.arc.direction() @ toward)) > 0.8:
         return _pointing(fit, toward), True
     return fit, False
 
@@ -325,16 +397,11 @@ def _pointing(fit: TemplateFit, toward: np.ndarray) -> TemplateFit:
 
 def _is_rod(steel: SteelMap, fit: TemplateFit) -> bool:
     """Say whether a needle is blunt at both ends, and ends there."""
-    blunt = np.empty((2, 2))
-    state = _state(fit.arc, fit.width)
-    bluntness(steel.surely, state, fit.length, 0.5 * fit.width, blunt)
-    if blunt.min() < 0.87:
+    if _bluntness(steel.surely, fit).min() < 0.87:
         return False
-    around = _excess(steel.surely, fit, fit.width)
-    rows = np.empty((int(fit.length), 3))
-    steel_rows(steel.surely, steel.perhaps, state, fit.length, 0.5 * fit.width, 1.0, rows)
-    ends = max(rows[:END_ROWS, 0].mean(), rows[-END_ROWS:, 0].mean())
-    return bool(ends < MAX_MISSING_END and max(around[2], around[3]) < MAX_BEYOND)
+    missing, _, _ = _steel_rows(steel, fit, 1.0)
+    ends = max(missing[:END_ROWS].mean(), missing[-END_ROWS:].mean())
+    return bool(ends < MAX_MISSING_END and max(_excess(steel.surely, fit, fit.width)[:2]) < MAX_BEYOND)
 
 
 def axis_guesses(dark: np.ndarray, length: float, width: float) -> list[Arc]:
@@ -387,9 +454,9 @@ def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
     result: list[Arc] = []
     rows, columns = np.nonzero(own)
     steps = np.empty(own.shape, np.int32)
-    _walk(own, _pixel(own, rows[0], columns[0]), steps)
+    _walk(own, rows[0], columns[0], steps)
     last = int(np.argmax(steps))
-    _walk(own, _pixel(own, last // own.shape[1], last % own.shape[1]), steps)
+    _walk(own, last // own.shape[1], last % own.shape[1], steps)
     size = 2 * int(0.5 * width + 2.0) + 1
     highest = cv2.dilate(steps.astype(np.float32), np.ones((size, size), np.uint8))
     at = np.argwhere((steps == highest) & (own > 0))
@@ -398,7 +465,7 @@ def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
         if len(ends) < 5 and min(np.abs(place - other).max() for other in ends) > size:
             ends.append(place)
     for row, column in ends:
-        _walk(own, _pixel(own, row, column), steps)
+        _walk(own, row, column, steps)
         rows, columns = np.nonzero((steps >= 0) & (steps < 0.8 * length))
         guess = _axis_of(np.column_stack([columns, rows]).astype(float), width)
         if guess is None:
@@ -410,13 +477,6 @@ def _from_ends(own: np.ndarray, length: float, width: float) -> list[Arc]:
         for beyond in (0.1 * length, 0.03 * length):
             result.append(inwards.moved(-beyond, 0.0, 0.0, 0.0).reversed_at(length))
         result.append(inwards.moved(-CORE * width, 0.0, 0.0, 0.0))
-    return result
-
-
-def _pixel(own: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Return an image of one pixel."""
-    result = np.zeros_like(own)
-    result[row, column] = 1
     return result
 
 
@@ -436,25 +496,166 @@ def _axis_of(points: np.ndarray, width: float) -> tuple[Arc, float, float] | Non
 
 
 @compiled
-def _walk(own, start, steps):
-    """Fill in how many steps from the nearest pixel of a start each pixel of its components is, -1 elsewhere."""
+def _walk(own, row, column, steps):
+    """Fill in how many steps from a pixel each pixel of its component is, -1 elsewhere."""
     steps[:] = -1
     rows, columns = own.shape
     queue = np.empty((rows * columns, 2), np.int32)
-    head, tail = 0, 0
-    for y in range(rows):
-        for x in range(columns):
-            if start[y, x] != 0:
-                steps[y, x] = 0
-                queue[tail, 0], queue[tail, 1] = y, x
-                tail += 1
+    queue[0, 0], queue[0, 1], steps[row, column] = row, column, 0
+    head, tail = 0, 1
     while head < tail:
         r, c = queue[head]
         head += 1
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                y, x = r + i, c + j
-                if 0 <= y < rows and 0 <= x < columns and own[y, x] != 0 and steps[y, x] < 0:
+        for y in range(max(0, r - 1), min(rows, r + 2)):
+            for x in range(max(0, c - 1), min(columns, c + 2)):
+                if own[y, x] != 0 and steps[y, x] < 0:
                     steps[y, x] = steps[r, c] + 1
                     queue[tail, 0], queue[tail, 1] = y, x
                     tail += 1
+
+
+def _across(fit: TemplateFit, half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return places along and around a needle, and aside of it, at which it is compared with the image [px]."""
+    columns = int((half + BESIDE_PX) / STEP_PX)
+    return np.arange(int(fit.length + 2.0 * BESIDE_PX) + 1) - BESIDE_PX, STEP_PX * np.arange(-columns, columns + 1)
+
+
+def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> tuple[float, float, float]:
+    """Return how much darker than a drawn needle the image is around it, as shares of what it could be.
+
+    Args:
+        dark: share of steel; see `SteelMap`.
+        fit: the drawn needle.
+        width: of its body, within which dark goes on beyond its ends [px].
+
+    Returns:
+        What goes on beyond the tip, and beyond the tail; and which share of the rows is dark on one side from the body
+        on, at the side where more are: what is as wide is no thread.
+    """
+    half = 0.5 * width
+    along, aside = _across(fit, half)
+    drawn = drawn_needle(along, aside, fit.length, half, 0.5 * fit.width + BLOOM_PX - half, THIN)
+    more = np.maximum(straightened(dark, fit.arc.axis, along, aside) - drawn, 0.0)
+    outside, beside = int((np.abs(aside) >= half + 0.5).sum()) // 2, int((aside > half + 1.5).sum())
+    across, tip, tail = slice(outside, len(aside) - outside), along > fit.length + 1.0, along < -1.5
+    beyond_tip, beyond_tail = (more[e, across].sum() / max((1.0 - drawn[e, across]).sum(), 1e-9) for e in (tip, tail))
+    body = more[(along > 0.0) & (along < fit.length)]
+    sides = [side.min(axis=1, initial=1.0) > 0.5 for side in (body[:, :beside], body[:, len(aside) - beside :])]
+    return float(beyond_tip), float(beyond_tail), float(max(side.mean() for side in sides))
+
+
+def _steel_rows(steel: SteelMap, fit: TemplateFit, thin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what of its steel each row of a drawn needle has in the image, from tail to tip.
+
+    Args:
+        steel: the image.
+        fit: the drawn needle.
+        thin: share of its width to which its end tapers; 1 for a rod.
+
+    Returns:
+        Which share is missing, how much there should be [px], and the greatest share of any place, for sure.
+    """
+    half = 0.5 * fit.width
+    along, aside = np.arange(int(fit.length)) + 0.5, _across(fit, half)[1]
+    drawn = drawn_needle(along, aside, fit.length, half, BLOOM_PX, thin)
+    missing = np.maximum(drawn - straightened(steel.perhaps, fit.arc.axis, along, aside), 0.0).sum(axis=1)
+    surely = straightened(steel.surely, fit.arc.axis, along, aside[np.abs(aside) < half])
+    total = drawn.sum(axis=1)
+    return missing / np.maximum(total, 1e-9), STEP_PX * total, surely.max(axis=1)
+
+
+def _bluntness(dark: np.ndarray, fit: TemplateFit) -> np.ndarray:
+    """Return how blunt tail and tip of a needle look on either side, shape (2, 2): 0 for a point, 1 for a blunt end.
+
+        b = sum w (dark - tapered) / sum w (blunt - tapered),    w = blunt - tapered
+
+    over the corners that a blunt end has and a tapered one lacks. A thread that leaves an end, or lies over it, makes
+    one side look blunter than it is; so the lesser one tells.
+    """
+    half = 0.5 * fit.width
+    along, aside = _across(fit, half)
+    seen = straightened(dark, fit.arc.axis, along, aside)
+    blunt = drawn_needle(along, aside, fit.length, half, BLOOM_PX, 1.0)
+    forward = drawn_needle(along, aside, fit.length, half, BLOOM_PX, THIN)
+    backward = drawn_needle(fit.length - along, aside, fit.length, half, BLOOM_PX, THIN)
+    result = np.empty((2, 2))
+    for index, (end, tapered) in enumerate(
+        ((along < 0.5 * fit.length, backward), (along >= 0.5 * fit.length, forward))
+    ):
+        weight = blunt - tapered
+        more, total = (weight * (seen - tapered))[end], (weight * weight)[end]
+        for side, beside in enumerate((aside < 0.0, aside > 0.0)):
+            result[index, side] = more[:, beside].sum() / max(total[:, beside].sum(), 1e-9)
+    return result
+
+
+def _fading(surely: np.ndarray, fit: TemplateFit) -> float:
+    """Return over how much more length the steel fades at a tail than at the body's sides [px].
+
+    Glare over a tail ends it less sharply than lens and sensor do.
+    """
+    beyond, across = np.arange(-4.0, 4.1, 0.25), np.linspace(-0.3, 0.3, 5) * fit.width
+    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
+    tail = _fade(beyond, straightened(surely, fit.arc.axis, beyond, across).min(axis=1))
+    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
+    sides = (np.median(straightened(surely, fit.arc.axis, body, side * outside), axis=0) for side in (-1.0, 1.0))
+    return tail - min(_fade(-outside, usual) for usual in sides)
+
+
+def _fade(along: np.ndarray, share: np.ndarray) -> float:
+    """Return the length over which a share rises from 0.2 to 0.8."""
+    low, high = (int((share >= level).argmax()) if (share >= level).any() else -1 for level in (0.2, 0.8))
+    return float(along[high] - along[low])
+
+
+def _thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
+    """Return how far off the middle of the beginning and the end of an axis a thread goes on there; None: none does.
+
+    A thread that leaves an end goes through its middle. One that lies over or under the needle passes beside it.
+    """
+    beyond = -np.arange(1.5, 6.0, 0.5)
+    aside = np.arange(-0.5 * fit.width - 3.0, 0.5 * fit.width + 3.1, 0.5)
+    result: list[float | None] = []
+    for arc in (fit.arc, fit.reversed()):
+        dark = straightened(steel.perhaps, arc.axis, beyond, aside)
+        widths = 0.5 * dark.sum(axis=1)
+        if middle(widths) < 0.25:
+            result.append(None)
+            continue
+        centres = (dark @ aside) / np.maximum(dark.sum(axis=1), 1e-6)
+        result.append(abs(float(np.polyfit(beyond, centres, 1, w=np.minimum(widths, 1.0))[1])))
+    return result[0], result[1]
+
+
+def _leaves_sideways(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether something wide and dark lies beside a tail, whose edge may be taken for the tail's."""
+    side = 0.5 * fit.width + 1.7
+    dark = straightened(steel.surely, fit.arc.axis, np.arange(-1.0, 3.1), np.array([-side, side]))
+    return bool(dark.mean(axis=0).max() > 0.6)
+
+
+def _lies_over_tail(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether a line lies over the needle at its tail: it makes one side, or the middle, another colour than steel.
+
+    A thread that is as dark as steel there does not lie over it, or hides nothing.
+    """
+    aside = 0.35 * fit.width
+    across = np.array([-aside, -0.75, 0.0, 0.75, aside])
+    left, beside, centre, other, right = np.median(
+        straightened(steel.dark, fit.arc.axis, np.arange(2.0, 12.0), across), axis=0
+    )
+    most = max(abs(left - right), abs(beside - other), 0.5 * (beside + other) - centre)
+    return bool(most > 0.12 * steel.depth)
+
+
+def _ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread.
+
+    Half of the width of a thread that leaves sideways lies beyond the tail too.
+    """
+    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
+    dark = straightened(steel.surely, fit.arc.axis, -np.arange(1.0, 0.2 * fit.length + 4.0), aside)
+    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
+    if len(light) and light[0] < fit.width and _leaves_sideways(steel, fit):
+        return False
+    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)

@@ -3,20 +3,29 @@
 The drawn needle is a body of one width whose last fifth tapers, or a rod, seen through the lens. Steel that it has and
 the image lacks counts in full, as nothing makes steel bright; dark that the image has and it lacks may be a thread, and
 counts up to a bound. A thread over the needle that is dark in one colour counts for neither.
+
+The blunt end is then measured along the axis, where the darkness crosses half of the step at the end. Blur that is
+symmetric and pixels that integrate over their area leave the half of a straight step in place, whatever the size of the
+pixels. A thread that leaves the end makes the step lower in some lines along the axis, and none longer.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.vision.images import Layer, Wall, straighten_both, straightened
 from magnetosuture_thread.vision.needle.arc import Arc
-from magnetosuture_thread.vision.needle.steel_map import SHADOW, STEEL, SteelMap
-from magnetosuture_thread.vision.sampling import straighten, straighten_both
 
+AROUND_PX = 12.0  # around a dark thing, that is measured on
+GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
+GLARE_REACH_PX = 4  # around a place, that it is looked for, and over which it fades
+SHADOW, STEEL = 0.15, 0.8  # of the darkness of steel: up to here floor and shadow, from here on steel
 TAPER = 0.2  # of the length, towards the tip
 BLUR_PX = 1.03  # of an edge, lens and sensor together
 STEEPNESS = 1.6 / BLUR_PX  # of the edge; with it, it differs least from a normal distribution
@@ -26,16 +35,118 @@ STEP_PX = 0.75  # between samples across; along it is 1 px
 OTHER = 0.2  # of steel, at which dark beyond the drawn needle counts a quarter of steel that is missing
 BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where it is
 WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's width, and share of it
-MAX_STEP_PX, LAST_STEP_PX = 1.5, 0.02  # of a round; after a smaller one the fit is done
+MAX_STEP_PX = 1.5  # of a round
 FIRST_ROUNDS = 4  # that tell which of several fits is worth more
-ROUND_GAIN = 1.5  # by which each of these may lower the cost of a fit that begins at the axis of another
 PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
-LENGTH_BEYOND = 1.25  # times the tolerance of the length, that a fit may reach
 CORRELATED_ROWS = 3.0  # rows whose error is one and the same, by the lens' blur
 # What no fit's residual tells of: most likely for the errors over hundreds of simulated poses, needles and image sizes.
 TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.27, 0.1, math.radians(0.15)
+REACH_PX, LEVEL_PX = 4.5, 2.0  # to both sides of the end; from where on, two deviations of the blur, its step is over
+EDGE_STEP_PX, SIDE_PX = 0.25, 0.5  # between samples along the axis, and between lines
+MAX_SHIFT_PX = 1.0  # from where the end is drawn; beyond, and where lines differ more, something hides it
+
+
+@dataclass(frozen=True)
+class SteelMap:
+    """How much of each pixel is steel, by its darkness as a share of the floor's brightness.
+
+    Attributes:
+        surely: by the brightest of the three colours, in which steel alone is dark, shape (rows, columns), 0 to 1.
+        perhaps: by the darkest of them, in which a coloured thread is dark too; the same without colours.
+        dark: darkness of the brightest of the three colours, as a share of the floor's brightness.
+        depth: darkness of steel, 0 to 1.
+        light: how much brighter than the floor, as a share of it, the brightest colour is around each pixel,
+            shape (rows, columns).
+        origin: (u, v) of the first pixel in the picture.
+        size: width and height of the picture [px].
+        hidden: where nothing is known; None: nowhere.
+    """
+
+    surely: NDArray[np.float32]
+    perhaps: NDArray[np.float32]
+    dark: NDArray[np.float32]
+    depth: float
+    light: NDArray[np.float32]
+    origin: tuple[float, float]
+    size: tuple[int, int]
+    hidden: NDArray[np.bool_] | None = None
+
+    def hidden_where(self, hidden: NDArray[np.bool_]) -> SteelMap:
+        """Return the map with nothing known where something hides the needle, shape (rows, columns)."""
+        if not hidden.any():
+            return self
+        surely, perhaps = self.surely.copy(), self.perhaps.copy()
+        surely[hidden], perhaps[hidden] = 0.0, 1.0
+        hidden = hidden if self.hidden is None else self.hidden | hidden
+        return replace(self, surely=surely, perhaps=perhaps, hidden=hidden)
+
+    def share_hidden(self, points: np.ndarray) -> float:
+        """Return which share of some points, in the map's own pixels, is hidden."""
+        if self.hidden is None:
+            return 0.0
+        rows, columns = self.hidden.shape
+        u, v = np.round(points).astype(int).T
+        return float(self.hidden[v.clip(0, rows - 1), u.clip(0, columns - 1)].mean())
+
+    def is_glaring(self, points: np.ndarray) -> bool:
+        """Say whether the lamp is reflected within a few pixels of points, in the map's own pixels, shape (m, 2)."""
+        rows, columns = self.light.shape
+        reach = np.arange(-GLARE_REACH_PX, GLARE_REACH_PX + 1)
+        u = np.round(points[:, :1]).astype(int) + reach
+        v = np.round(points[:, 1:]).astype(int) + reach
+        near = self.light[v.clip(0, rows - 1)[:, :, None], u.clip(0, columns - 1)[:, None, :]]
+        return float(near.max()) > GLARE
+
+    def unknown_in_glare(self) -> SteelMap:
+        """Return the map in which steel may be anywhere that the lamp is reflected, and at the reflection's edge."""
+        glare = (self.light > GLARE).astype(np.uint8)
+        size = 2 * GLARE_REACH_PX + 1
+        covered = cv2.dilate(glare, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))) > 0
+        return replace(self, perhaps=np.where(covered, np.float32(1.0), self.perhaps)) if covered.any() else self
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the picture."""
+        (left, top), (rows, columns) = (round(value) for value in self.origin), self.surely.shape
+        return slice(top, top + rows), slice(left, left + columns)
+
+    @staticmethod
+    def around(points: np.ndarray, brightest: Layer, darkest: Layer, factor: int, wall: Wall) -> SteelMap:
+        """Return the map around some points.
+
+        Args:
+            points: of the dark thing, shape (m, 2) [px].
+            brightest: see `Picture`.
+            darkest: see there.
+            factor: see there.
+            wall: of the dish.
+        """
+        rows, columns = brightest.pixels.shape
+        left, top = np.maximum(points.min(axis=0) - AROUND_PX, 0.0).astype(int)
+        right, bottom = np.minimum(points.max(axis=0) + AROUND_PX, (columns, rows)).astype(int)
+        box = slice(top, bottom), slice(left, right)
+        dark = _darkness(brightest, box, factor, wall)
+        u, v = np.round(points - (left, top)).astype(int).T
+        own = dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)]
+        rank = round(0.9 * (len(own) - 1))
+        depth = float(np.partition(own, rank)[rank])
+        surely = _share(dark, depth)
+        perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
+        light = np.asarray(cv2.blur(-dark, (3, 3)), dtype=np.float32)
+        return SteelMap(surely, perhaps, dark, depth, light, (float(left), float(top)), (columns, rows))
+
+
+def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:
+    """Return 1 - I / F of some rows and columns."""
+    floor = np.maximum(wall.floor(channel, factor, box), 1).astype(np.float32)
+    return np.asarray(1.0 - channel.pixels[box] / floor)
+
+
+def _share(dark: NDArray[np.float32], depth: float) -> NDArray[np.float32]:
+    share = (dark / max(depth, 1e-3) - SHADOW) / (STEEL - SHADOW)
+    return np.asarray(np.clip(share, 0.0, 1.0), dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -47,7 +158,6 @@ class TemplateFit:
         length: of it [px].
         width: of the body [px].
         cost: what the image differs by, robustly [px^2].
-        missing: steel that the image lacks [px^2].
         normal: of (along, aside, angle, bend, half width, length) in the middle; see `_fit`.
         samples: number of them.
         thin: of the width, that its end tapers to; 1 for a rod.
@@ -57,7 +167,6 @@ class TemplateFit:
     length: float
     width: float
     cost: float
-    missing: float
     normal: np.ndarray
     samples: int
     thin: float = THIN
@@ -111,11 +220,9 @@ def fit_template(
     normal = np.zeros((PARAMETERS, PARAMETERS))
     deviations = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width), 0.5 * tolerance * length
     thin = 1.0 if rod else THIN
-    cost, missing, count = _fit(
-        steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, hopeless, normal
-    )
+    cost, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, hopeless, normal)
     arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
-    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, missing, normal, count, thin)
+    return TemplateFit(arc, fitted, 2.0 * (float(state[4]) - BLOOM_PX), cost, normal, count, thin)
 
 
 def _at_tail(inverse: np.ndarray, middle: float) -> np.ndarray:
@@ -156,25 +263,16 @@ def _across(own, aside, share, slope):
         slope[column] = slope[last - column] = STEEPNESS * (one * (1.0 - one) + other * (1.0 - other))
 
 
-@compiled
-def draw_needle(along, aside, length, half, bloom, thin, drawn):
-    """Fill in the share of steel of a drawn needle at places along and aside of its axis."""
-    across, slope = np.empty(len(aside)), np.empty(len(aside))
-    before = -1.0
-    for row in range(len(along)):
-        s = along[row]
-        own = _half_width(s, length, half, thin)[0] + bloom
-        if own != before:
-            _across(own, aside, across, slope)
-            before = own
-        ends = edge(s + bloom) * edge(length - s + bloom)
-        for column in range(len(aside)):
-            drawn[row, column] = min(max((across[column] * ends - SHADOW) / (STEEL - SHADOW), 0.0), 1.0)
+def drawn_needle(along: NDArray, aside: NDArray, length: float, half: float, bloom: float, thin: float) -> NDArray:
+    """Return the share of steel of a drawn needle at places along and aside of its axis, shape (m, n)."""
+    drawn, wider, longer = np.empty((3, len(along), len(aside)))
+    _draw_needle(along, aside, length, half, bloom, thin, drawn, wider, longer)
+    return drawn
 
 
 @compiled
-def _draw_with_slopes(along, aside, length, half, bloom, thin, drawn, wider, longer):
-    """Draw as `_draw` does; fill in the derivatives by half the width and by the length too."""
+def _draw_needle(along, aside, length, half, bloom, thin, drawn, wider, longer):
+    """Fill in the share of steel of a drawn needle, and its derivatives by half the width and by the length."""
     across, slope = np.empty(len(aside)), np.empty(len(aside))
     before = -1.0
     scale = 1.0 / (STEEL - SHADOW)
@@ -197,12 +295,6 @@ def _draw_with_slopes(along, aside, length, half, bloom, thin, drawn, wider, lon
             else:
                 drawn[row, column] = 0.0 if share <= 0.0 else 1.0
                 wider[row, column] = longer[row, column] = 0.0
-
-
-@compiled
-def sample_along(steel, state, along, aside, values):
-    """Fill in the image along and aside of the arc that a state begins with."""
-    straighten(steel, (state[0], state[1], state[2], state[3]), along, aside, values)
 
 
 @compiled
@@ -272,9 +364,9 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
     Place, angle and bend are those of the arc's middle, where they depend least on each other.
 
     Returns:
-        Cost [px^2], missing steel [px^2], and the number of samples.
+        Cost [px^2], and the number of samples.
     """
-    longest = length + LENGTH_BEYOND * 2.0 * deviations[1]
+    longest = length + 1.25 * 2.0 * deviations[1]  # times the tolerance of the length
     shortest = 2.0 * length - longest
     free = deviations[1] > 0.0
     columns = 2 * int((half + BESIDE_PX) / STEP_PX) + 1
@@ -284,7 +376,7 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
     all_drawn, all_wider = np.empty((most_rows, columns)), np.empty((most_rows, columns))
     all_longer = np.empty((most_rows, columns))
     right, change, own = np.empty(PARAMETERS), np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
-    best, best_missing, best_state, samples = np.inf, 0.0, state.copy(), 1
+    best, best_state, samples = np.inf, state.copy(), 1
     prior = OTHER * OTHER / (deviations[0] * deviations[0])
     length_prior = OTHER * OTHER / (deviations[1] * deviations[1]) if free else 1.0
     for done in range(rounds):
@@ -295,9 +387,9 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         least, most, drawn = all_least[:rows], all_most[:rows], all_drawn[:rows]
         wider, longer = all_wider[:rows], all_longer[:rows]
         straighten_both(surely, perhaps, (state[0], state[1], state[2], state[3]), along[0], aside, least, most)
-        _draw_with_slopes(along, aside, own_length, half, bloom, thin, drawn, wider, longer)
+        _draw_needle(along, aside, own_length, half, bloom, thin, drawn, wider, longer)
         own[:], right[:] = 0.0, 0.0
-        cost, missing = 0.0, 0.0
+        cost = 0.0
         for row in range(1, rows - 1):
             # Slopes along (a), aside (b), by the width (w) and by the end of the length (e).
             aa = ab = bb = aw = bw = ww = ae = be = we = ee = ra = rb = rw = re = 0.0
@@ -313,7 +405,6 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
                 else:
                     apart = min(most[row, column] - drawn[row, column], 0.0)
                     cost += apart * apart
-                    missing -= apart
                     a = most[row + 1, column] - most[row - 1, column]
                     b = most[row, column + 1] - most[row, column - 1]
                 a, b, w = 0.5 * a, b * (0.5 / STEP_PX), -wider[row, column]
@@ -347,10 +438,11 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         if free:
             cost += length_prior * (own_length - length) ** 2
         if cost < best:
-            best, best_missing, samples = cost, missing * STEP_PX, rows * columns
+            best, samples = cost, rows * columns
             best_state[:] = state
             normal[:] = own
-        if best > hopeless * max(1.0, ROUND_GAIN ** (FIRST_ROUNDS - done)):
+        # A round lowers the cost of a fit that begins at the axis of another by half at most.
+        if best > hopeless * max(1.0, 1.5 ** (FIRST_ROUNDS - done)):
             break
         _solve(own, right, change)
         largest = max(abs(change[0]), abs(change[1]), abs(change[2]) * middle, abs(change[3]) * 0.5 * middle * middle)
@@ -366,7 +458,94 @@ def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeles
         state[3] += change[3]
         state[4] = min(max(state[4] + change[4], 0.6 * half), 1.6 * half + BLOOM_PX)
         state[5] = min(max(state[5] + change[5], shortest), longest)
-        if largest < LAST_STEP_PX:
+        if largest < 0.02:  # px
             break
     state[:] = best_state
-    return best, best_missing, samples
+    return best, samples
+
+
+def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
+    """Return how far along the axis a needle's tail lies from where it is drawn [px]; None where it is not visible.
+
+        D(s_j, d_j) = (body(d_j) + behind(d_j)) / 2,    shift = sum w_j s_j / sum w_j
+
+    over lines at distances d_j aside of the axis, with the darkness D along each. body is its mean within the needle,
+    behind that of the floor, whose brightness may change linearly, as in a shadow, continued to the end. The weights w
+    are small where a thread leaves the end. Where the lamp is reflected at the end, the step is the reflection's.
+    """
+    if steel.is_glaring(fit.arc.at(np.array([-REACH_PX, 0.0]))):
+        return None
+    along = np.arange(-REACH_PX - MAX_SHIFT_PX, REACH_PX + MAX_SHIFT_PX + 0.5 * EDGE_STEP_PX, EDGE_STEP_PX)
+    count = max(1, int(0.5 * fit.width / SIDE_PX))
+    dark = straightened(steel.dark, fit.arc.axis, along, SIDE_PX * np.arange(-count, count + 1))
+    shift = float(_shift_of(along, dark, steel.depth))
+    return None if math.isnan(shift) else shift
+
+
+@compiled
+def _shift_of(along, dark, depth):
+    """Return the shift of `tail_shift` by the darkness at places along the lines, shape (places, lines); NaN: none."""
+    lines = dark.shape[1]
+    body, near = np.empty(lines), np.empty(lines)
+    mean, slope, ends = np.empty(lines), np.empty(lines), np.empty(lines)
+    shift = 0.0
+    for _ in range(2):  # The second time by levels around the end that the first one found.
+        body[:], near[:], mean[:], slope[:] = 0.0, -np.inf, 0.0, 0.0
+        inside, outside, middle, square = 0, 0, 0.0, 0.0
+        for row in range(len(along)):
+            s = along[row]
+            if shift + LEVEL_PX < s < shift + 2.0 * LEVEL_PX:
+                inside += 1
+                body += dark[row]
+            if shift - REACH_PX < s < shift - LEVEL_PX:
+                outside += 1
+                middle += s
+                mean += dark[row]
+            if shift - REACH_PX < s < shift - 1.25:  # px; a thread is told from the end itself
+                near = np.maximum(near, dark[row])
+        body /= inside
+        mean /= outside
+        middle /= outside
+        for row in range(len(along)):
+            if shift - REACH_PX < along[row] < shift - LEVEL_PX:
+                square += (along[row] - middle) ** 2
+                slope += (along[row] - middle) * dark[row]
+        behind = mean + slope / square * (shift - middle)
+        rising, thread = 0, np.inf
+        for line in range(lines):
+            ends[line] = np.nan
+            if body[line] - behind[line] > 0.3 * depth:  # of the darkness of steel
+                rising += 1
+                thread = min(thread, near[line])
+                ends[line] = _crossing(along, dark[:, line], 0.5 * (body[line] + behind[line]))
+                if math.isnan(ends[line]):
+                    return np.nan
+        if rising < 3:
+            return np.nan
+        total, place = 0.0, 0.0
+        weights = np.zeros(lines)
+        for line in range(lines):
+            if not math.isnan(ends[line]):
+                more = (near[line] - thread) / (0.02 * depth)  # of the darkness of steel: half the weight
+                weights[line] = 1.0 / (1.0 + more * more)
+                total += weights[line]
+                place += weights[line] * ends[line]
+        shift = place / total
+        spread = 0.0
+        for line in range(lines):
+            if weights[line] > 0.0:
+                spread += weights[line] * abs(ends[line] - shift) / total
+        if not abs(shift) < MAX_SHIFT_PX or spread > 0.5:
+            return np.nan
+    return shift
+
+
+@compiled
+def _crossing(along, dark, half):
+    """Return the last place at which the darkness rises above a level; NaN if it does not."""
+    for row in range(len(dark) - 2, -1, -1):
+        if dark[row] < half:
+            if dark[row + 1] <= half:
+                return np.nan
+            return along[row] + EDGE_STEP_PX * (half - dark[row]) / (dark[row + 1] - dark[row])
+    return np.nan

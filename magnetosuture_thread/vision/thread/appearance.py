@@ -1,35 +1,43 @@
-"""What a thread looks like across: its width and darkness, where it is visible, and how well its middle is known."""
+"""What a thread and what hides it look like: width and darkness across a thread, and areas that are not the floor.
+
+The floor's light is a smooth function of the place, fitted robustly to each colour c,
+
+    F_c(x, y) = sum_i a_ci b_i(x, y),    b = 1, x, y, x^2, x y, y^2, r^4, r^8
+
+with x, y and r as shares of the dish's radius. With q_c = I_c / F_c - 1, where slender things are taken out of I by a
+median, a pixel shows no floor where the mean of q_c, or the greatest less the least of them, is larger than noise and
+smears of the liquid explain. Brighter areas show the lamp, others an object; a thread may lie below both.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from functools import reduce
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.vision.images import Picture
+from magnetosuture_thread.vision.images import Gray, Picture, Wall, glare_mask, middle, runs, sampled
 from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
-from magnetosuture_thread.vision.sampling import middle, within
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
 MIN_SHARE = 0.3  # of the usual darkness: below, the thread isn't visible
 FAINTEST = 3.0  # grey levels; less is noise
-SMOOTHED_PX, LOCAL_PX = 9.0, 4.0  # along the thread, over which its darkness and its middle are averaged
+SMOOTHED_PX = 9.0  # along the thread, over which its darkness is averaged; its middle over 4 px
 MIN_DEVIATION_PX = 0.12  # of a middle: by pixels, compression, and the evening out of bends
 BEND = 0.004  # 1 / px; standard deviation of the curvature of a thread that isn't visible
 SPACING_PX = 2.0  # of a line's vertices
 GAP_PX, OBJECT_GAP_PX = 13.0, 6.0  # a piece has no gap longer than this, and below an object none longer than that
 NEEDLE_PX = 2.5  # beside and beyond the needle, where its blurred edge and what is next to it hide a thread
+SHRUNK = 3  # how much smaller the image is in which objects are looked for
+WALL_PX = 6.0  # before which nothing is told
 
 Values = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Gray = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ class Appearance:
         spread = self.width_px / 2.355
         height = np.maximum(strength, FAINTEST)
         noise, uneven = self.noise / height, 0.5 * self.width_px / height
-        variance = noise**2 * 2.0 * spread / (LOCAL_PX * math.sqrt(math.pi)) + uneven**2 + MIN_DEVIATION_PX**2
+        variance = noise**2 * 2.0 * spread / (4.0 * math.sqrt(math.pi)) + uneven**2 + MIN_DEVIATION_PX**2
         return np.asarray(np.sqrt(variance))
 
 
@@ -95,8 +103,10 @@ class Strand:
 
 def tangents_of(points: Points) -> Points:
     """Return unit tangents at the vertices of a polyline, shape (m, 2)."""
-    along = np.gradient(points, axis=0)
-    return np.asarray(along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9))
+    along = np.empty_like(points)
+    along[1:-1] = points[2:] - points[:-2]
+    along[0], along[-1] = points[1] - points[0], points[-1] - points[-2]
+    return np.asarray(along / np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-9)[:, None])
 
 
 def across(points: Points, aside: Values) -> Points:
@@ -104,25 +114,6 @@ def across(points: Points, aside: Values) -> Points:
     along = tangents_of(points)
     normals = np.column_stack([-along[:, 1], along[:, 0]])
     return np.asarray(points[:, None] + aside[None, :, None] * normals[:, None])
-
-
-def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float32]:
-    """Return an image at points of shape (..., 2), bilinear; outside, at the nearest point of its border."""
-    return sampled_colours(image, points)[..., 0]
-
-
-def sampled_colours(image: NDArray[Any], points: Points) -> NDArray[np.float32]:
-    """Return each colour of an image at points of shape (..., 2), shape (..., colours); see `sampled`."""
-    at = np.asarray(points.reshape(len(points), -1, 2), dtype=np.float32)  # no side of it longer than OpenCV can count
-    u, v = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
-    values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float32).reshape(*points.shape[:-1], -1)
-
-
-def runs(flags: Flags) -> list[tuple[int, int]]:
-    """Return first index and the one after the last of each run of true flags."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def respaced(points: Points, spacing: float) -> Points:
@@ -141,9 +132,9 @@ def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) 
         visible: where it is visible for sure, shape (m,), or nowhere for all of it.
     """
     shown = np.flatnonzero(visible) if visible.sum() >= 8 else np.arange(len(points))
-    shown = shown[:: max(1, len(shown) // 32)].copy()  # Compiled code is compiled anew for a view.
+    shown = shown[:: max(1, len(shown) // 32)]
     aside = np.arange(-REACH_PX, REACH_PX + 1e-9, STEP_PX)
-    profiles = _profiles(gray, points, aside, shown)
+    profiles = sampled(gray, across(points, aside)[shown])
     floors = np.median(profiles[:, np.abs(aside) > 0.5 * REACH_PX], axis=1)
     usual = -np.median(profiles - floors[:, None], axis=0)
     centre = len(aside) // 2
@@ -156,26 +147,25 @@ def appearance_of(picture: Picture, gray: Gray, points: Points, visible: Flags) 
     width = STEP_PX * (right - left + 1)
     floor = aside[:: round(1.0 / STEP_PX)]
     floor = floor[np.abs(floor) > 0.5 * width + 3.0]
-    raw = np.rint(_profiles(picture.darkest.pixels, points, floor, shown))  # Between pixels there is less noise.
+    raw = np.rint(sampled(picture.darkest.pixels, across(points, floor)[shown]))  # Between pixels there is less noise.
     noise = 1.4826 * middle(np.abs(np.diff(raw, axis=1))) / math.sqrt(2.0)
     half = 0.5 * width + BESIDE_PX
     darkness = np.array([np.median(each) for each in _integrals(picture, points[shown], half)])
     return Appearance(width, darkness, max(float(usual[peak]), FAINTEST), max(noise, 0.5))
 
 
-def _profiles(image: Gray, points: Points, aside: Values, chosen: NDArray[np.intp]) -> Values:
-    """Return an image across some vertices of a polyline, shape (vertices, distances)."""
-    profiles = np.empty((len(chosen), len(aside)))
-    sample_across(image, points, chosen, aside, profiles)
-    return profiles
-
-
 def _integrals(picture: Picture, points: Points, half: float) -> Values:
-    """Return the integrals of `integrate_across` at each vertex, in the darkest and the brightest colour, (2, m)."""
-    values = np.empty((2, len(points)))
-    for layer, own in zip((picture.darkest, picture.brightest), values, strict=True):
-        integrate_across(layer.pixels, points, half, STEP_PX, own)
-    return values
+    """Return the integrals across of the share that a thread takes of the floor's light, shape (2, m) [px].
+
+    Args:
+        picture: whose darkest and brightest colour are measured.
+        points: of a polyline, shape (m, 2) [px].
+        half: distance up to which is integrated [px].
+    """
+    at = across(points, STEP_PX * np.arange(int(2.0 * half / STEP_PX + 1e-9) + 1) - half)
+    profiles = np.stack([sampled(layer.pixels, at) for layer in (picture.darkest, picture.brightest)])
+    ground = np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1, keepdims=True), 1.0)
+    return np.asarray(STEP_PX * (1.0 - profiles / ground).sum(axis=-1))
 
 
 def looks_alike(picture: Picture, thread: Appearance, points: Points, slack: float) -> bool:
@@ -193,9 +183,9 @@ def strengths(gray: Gray, points: Points, thread: Appearance, *, two_sided: bool
 
     With `two_sided`, where it differs less: next to another strand nothing then, but nothing along an edge either.
     """
-    values = np.empty(len(points))
-    middle_strengths(gray, points, thread.beside_px, two_sided, values)
-    return values
+    reach = thread.beside_px
+    beside, inside = (sampled(gray, across(points, np.array(at))) for at in ((-reach, reach), (-1, -0.5, 0, 0.5, 1)))
+    return np.asarray((beside.min(axis=1) if two_sided else beside.max(axis=1)) - inside.min(axis=1))
 
 
 def strand_along(gray: Gray, thread: Appearance, points: Points, below: Flags | None = None) -> Strand:
@@ -251,76 +241,145 @@ def below_needle(needle: MeasuredNeedle, points: Points) -> Flags:
     return np.asarray(inside & (np.abs(aside) < 0.5 * needle.width_px + 1.0))
 
 
-@compiled
-def _normal(points, index):
-    """Return the unit normal of a polyline at a vertex, by the two vertices beside it."""
-    before, after = max(0, index - 1), min(len(points) - 1, index + 1)
-    x, y = points[after, 0] - points[before, 0], points[after, 1] - points[before, 1]
-    length = max(math.hypot(x, y), 1e-9)
-    return -y / length, x / length
+@dataclass(frozen=True)
+class Hiding:
+    """Areas of a picture where a thread can't be seen.
+
+    Attributes:
+        solid: 255 there, shape (rows, columns), uint8.
+        areas: number of the connected area at each pixel, 0 for bare floor, shape (rows, columns), int32.
+        inside: whether a pixel is farther than `WALL_PX` from the wall, shape (rows, columns).
+        floor: brightness of the bare floor in the darkest colour, shape (rows, columns), float32 [grey levels].
+        wall: of the dish; beyond it, less `WALL_PX`, nothing is told.
+    """
+
+    solid: Gray
+    areas: NDArray[np.int32]
+    inside: NDArray[np.bool_]
+    floor: NDArray[np.float32]
+    wall: Wall
+
+    def area_at(self, point: Points) -> int:
+        """Return the number of the area at a point, 0 on bare floor, -1 outside of the picture or at the wall."""
+        rows, columns = self.areas.shape
+        u, v = round(float(point[0])), round(float(point[1]))
+        if not (0 <= u < columns and 0 <= v < rows):
+            return -1
+        if math.dist((u, v), self.wall.centre) > self.wall.radius - WALL_PX:
+            return -1
+        return int(self.areas[v, u])
+
+    def outlines(self) -> list[Points]:
+        """Return the outlines of the largest areas, each of shape (m, 2) [px]."""
+        found, _ = cv2.findContours(self.solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        found = sorted(found, key=cv2.contourArea, reverse=True)[:64]
+        simple = [cv2.approxPolyDP(outline, 1.0, True)[:, 0].astype(float) for outline in found]
+        return [outline for outline in simple if len(outline) > 2]
 
 
-@compiled
-def sample_across(image, points, chosen, aside, profiles):
-    """Fill in an image at distances aside of some vertices of a polyline, bilinear; see `within`.
+def find_hiding(picture: Picture, needle: MeasuredNeedle, wall: Wall, metres_per_pixel: float) -> Hiding:
+    """Find what may hide a thread in a picture.
 
     Args:
-        image: shape (rows, columns).
-        points: of the polyline, shape (m, 2) [px].
-        chosen: numbers of the vertices, shape (k,).
-        aside: distances, positive to the right of the way along it as v goes down, shape (n,) [px].
-        profiles: filled, shape (k, n).
+        picture: the frame or a part of it.
+        needle: in the picture's pixels.
+        wall: of the dish, in the picture's pixels.
+        metres_per_pixel: of the picture [m].
     """
-    for row in range(len(chosen)):
-        index = chosen[row]
-        x, y = _normal(points, index)
-        for place in range(len(aside)):
-            u, v = points[index, 0] + aside[place] * x, points[index, 1] + aside[place] * y
-            profiles[row, place] = within(image, u, v)
+    rows, columns = picture.shape
+    glare = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    solid = cv2.resize(glare, (columns, rows), interpolation=cv2.INTER_NEAREST)
+    within = np.zeros((rows, columns), np.uint8)
+    u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - WALL_PX))
+    cv2.circle(within, (u, v), reach, 1, -1, cv2.LINE_8, 4)
+    inside = within.view(np.bool_)
+    cv2.multiply(solid, within, solid)
+    objects, floor = _objects(picture, wall, 1e-6 / metres_per_pixel**2)  # m^2
+    cv2.bitwise_or(solid, objects, solid)
+    if picture.mask is not None:
+        cv2.bitwise_or(solid, cv2.compare(picture.mask.depth, -picture.mask.tolerance_px, cv2.CMP_GT), solid)
+    axis = needle.arc.at(np.linspace(0.0, needle.length_px + NEEDLE_PX, 24))
+    at = np.round(axis * 16.0).astype(np.int32)
+    cv2.polylines(solid, [at], False, 255, max(1, round(needle.width_px + 2.0 * NEEDLE_PX)), cv2.LINE_8, 4)
+    _, areas = cv2.connectedComponents(solid, connectivity=8, ltype=cv2.CV_32S)
+    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside, floor, wall)
 
 
-@compiled
-def integrate_across(pixels, points, half, step, values):
-    """Fill in the integral across of the share that a thread takes of the floor's light [px].
+def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Gray, NDArray[np.float32]]:
+    """Return where objects are, and the floor's brightness in the darkest colour."""
+    rows, columns = picture.shape
+    size = (-(-columns // SHRUNK), -(-rows // SHRUNK))
+    small = cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA)
+    small = cv2.medianBlur(small, 5)  # wider than twice a needle, narrower than an object
+    cells = (max(4, columns // 8), max(4, rows // 8))  # to whose means the light is fitted
+    near = Wall(wall.centre, wall.radius - WALL_PX)
+    places = _places(cells, picture.shape, near)
+    means = np.atleast_3d(cv2.resize(small, cells, interpolation=cv2.INTER_AREA)).reshape(len(places), -1)
+    inside = np.hypot(places[:, 1], places[:, 2]) < 1.0
+    if inside.sum() < 4 * places.shape[1]:
+        return np.zeros((rows, columns), np.uint8), np.full((rows, columns), 1.0, np.float32)
+    some = np.zeros(cells[::-1], np.bool_)
+    some[::2, ::2] = True  # far more than enough for so few weights
+    fitted = inside & some.ravel()
+    light = np.maximum(places @ _fit_light(places[fitted], means[fitted].astype(float)), 1.0)
+    ratios = np.ascontiguousarray((means[inside] / light[inside] - 1.0).T)  # numpy is slow along a short last axis
+    # An object differs from the floor's light by 5 % in brightness, or by 3 % in colour.
+    bounds = _bound(ratios.mean(axis=0), 0.05), _bound(np.ptp(ratios, axis=0), 0.03)
+    light = light.reshape(cells[1], cells[0], -1).astype(np.float32)
+    at_small = cv2.resize(light, size).reshape(size[1], size[0], -1)
+    v, u = SHRUNK * np.arange(size[1])[:, None] - wall.centre[1], SHRUNK * np.arange(size[0]) - wall.centre[0]
+    # Colour by colour: numpy is slow along a short last axis.
+    unlike = [one / other - 1.0 for one, other in zip(cv2.split(small), cv2.split(at_small), strict=True)]
+    apart = reduce(np.maximum, unlike) - reduce(np.minimum, unlike)
+    found = (np.abs(sum(unlike)) > bounds[0] * len(unlike)) | (apart > bounds[1])
+    found &= u * u + v * v < near.radius**2
+    opened = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] * SHRUNK**2 >= min_area
+    large[0] = False
+    objects = cv2.resize(np.where(large, 255, 0).astype(np.uint8)[labels], (columns, rows))
+    objects = cv2.dilate(objects, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
+    darkest = reduce(np.minimum, cv2.split(light))
+    return cv2.compare(objects, 127, cv2.CMP_GT), cv2.resize(darkest, (columns, rows))
+
+
+def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArray[np.float64]:
+    """Return the functions that the floor's light is a sum of at each cell of a grid, shape (cells, 8)."""
+    (columns, rows), (height, width) = size, shape
+    u = ((np.arange(columns) + 0.5) * width / columns - 0.5 - wall.centre[0]) / wall.radius
+    v = ((np.arange(rows) + 0.5) * height / rows - 0.5 - wall.centre[1]) / wall.radius
+    x, y = (values.ravel() for values in np.meshgrid(u, v))
+    far = np.minimum(x * x + y * y, 1.2) ** 2
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, far, far * far])
+
+
+def _fit_light(basis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return for each colour the weights of a sum of functions near most values: least squares, Tukey's biweight.
 
     Args:
-        pixels: shape (rows, columns), uint8.
-        points: of a polyline, shape (m, 2) [px].
-        half: distance up to which is integrated [px].
-        step: between samples [px].
-        values: filled, shape (m,).
+        basis: the functions, shape (cells, functions).
+        values: of the colours, shape (cells, colours) [grey levels].
+
+    Returns:
+        Weights, shape (functions, colours).
     """
-    count = int(2.0 * half / step + 1e-9) + 1
-    profile = np.empty(count)
-    for index in range(len(points)):
-        x, y = _normal(points, index)
-        total = 0.0
-        for place in range(count):
-            aside = place * step - half
-            profile[place] = within(pixels, points[index, 0] + aside * x, points[index, 1] + aside * y)
-            total += profile[place]
-        ground = max(0.25 * (profile[0] + profile[1] + profile[count - 2] + profile[count - 1]), 1.0)
-        values[index] = step * (count - total / ground)
+    weights = np.zeros((basis.shape[1], values.shape[1]))
+    for colour, light in enumerate(values.T):
+        own = np.zeros(basis.shape[1])
+        own[0] = np.median(light)
+        for _ in range(8):
+            residuals = light - basis @ own
+            bound = 4.0 * max(0.5, 1.4826 * float(np.median(np.abs(residuals))))
+            weighted = np.maximum(1.0 - (residuals / bound) ** 2, 0.0)[:, None] ** 2 * basis
+            before = own
+            own = np.linalg.solve(weighted.T @ basis + 1e-6 * np.eye(len(own)), weighted.T @ light)
+            if np.abs(own - before).max() < 0.1:  # grey levels
+                break
+        weights[:, colour] = own
+    return weights
 
 
-@compiled
-def middle_strengths(gray, points, reach, two_sided, values):
-    """Fill in how much darker the middle of a line is than what is a distance beside it.
-
-    Args:
-        gray: shape (rows, columns), uint8.
-        points: of the line, shape (m, 2) [px].
-        reach: the distance [px].
-        two_sided: whether the side counts that differs less.
-        values: filled, shape (m,) [grey levels].
-    """
-    for index in range(len(points)):
-        x, y = _normal(points, index)
-        u, v = points[index, 0], points[index, 1]
-        one = within(gray, u - reach * x, v - reach * y)
-        other = within(gray, u + reach * x, v + reach * y)
-        darkest = np.inf
-        for place in range(-2, 3):
-            aside = 0.5 * place
-            darkest = min(darkest, within(gray, u + aside * x, v + aside * y))
-        values[index] = (min(one, other) if two_sided else max(one, other)) - darkest
+def _bound(values: NDArray[np.float64], minimum: float) -> float:
+    """Return beyond what a value is not the floor's, by the spread of those of cells."""
+    usual = middle(values)
+    return max(minimum, abs(usual) + 3.5 * 1.4826 * middle(np.abs(values - usual)))

@@ -9,23 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, Wall, glare_mask, without_wall
+from magnetosuture_thread.vision.images import RIM_PX, Gray, Layer, Picture, Wall, glare_mask, middle, without_wall
 from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
-from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, TAPER, THIN, edge
-from magnetosuture_thread.vision.sampling import middle
+from magnetosuture_thread.vision.needle.template import BLOOM_PX, BLUR_PX, STEEPNESS, TAPER, THIN
 from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.thread.crossings import Crossing, resolve_crossings
 from magnetosuture_thread.vision.thread.walk import Ridge, black_hat, follow, refine, worth
 
 WALL_PX = 4.0  # before which the walk ends
 AT_WALL_PX = 40.0  # from the wall, where its rim may look like the thread's beginning
-MARGIN_PX = 7  # around the dish, that its rim and the window of the ridge need
-SHADE, SHADE_PX = 0.12, 10.0  # of steel's darkness, that its shadow has, and how far beside it that lies
-ENOUGH = 0.85  # of the greatest length: so much thread needs no other search
-STRONG, STRONG_SHARE = 25.0, 0.068  # grey levels, and share of the length, of a thread that is dark beyond doubt
-MIN_CONFIDENCE = 0.9  # of a crossing, that the thread is followed beyond
+SHADE_PX = 10.0  # beside a needle, where its shadow lies
 BESIDE_PX = 2.0 * BLUR_PX  # of the drawn outline, up to which light of the needle is mixed in
 
 
@@ -53,14 +47,14 @@ class Walk:
     def certain_points(self) -> Points:
         """The vertices up to the first crossing where it is in doubt how the thread goes on."""
         for crossing in self.crossings:
-            if crossing.confidence < MIN_CONFIDENCE:
+            if crossing.confidence < 0.9:
                 at = arc_lengths(self.points)
                 share = self.path[min(crossing.first, len(self.path) - 1), 5] / self.path[-1, 5]
                 return self.points[: max(2, int(np.searchsorted(at, share * at[-1])))]
         return self.points
 
 
-def find_centreline(picture: Picture, needle: MeasuredNeedle, max_length: float, wall: Wall) -> Points:
+def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_length: float, wall: Wall) -> Points:
     """Follow the thread from the needle's tail to its end.
 
     The ridge strength is the black-hat transform of the darkest colour without the needle: how much darker a pixel is
@@ -72,6 +66,7 @@ def find_centreline(picture: Picture, needle: MeasuredNeedle, max_length: float,
 
     Args:
         picture: the frame or a part of it.
+        gray: its darkest colour without the needle.
         needle: the needle, in the picture's pixels.
         max_length: the walk stops at this length [px].
         wall: of the dish, before which the walk stops.
@@ -80,45 +75,35 @@ def find_centreline(picture: Picture, needle: MeasuredNeedle, max_length: float,
         Vertices from the tail on, up to the first crossing where it is in doubt how the thread goes on, shape (m, 2)
         [px]; m = 1 if no thread is visible.
     """
-    search = _Search(picture, needle, max_length, wall)
+    search = _Search(picture, gray, needle, max_length, wall)
     return search.resolved(search.best_walk()).certain_points
 
 
 class _Search:
     """Walks along one frame's ridges from the needle's tail on; see `find_centreline`."""
 
-    def __init__(self, picture: Picture, needle: MeasuredNeedle, max_length: float, wall: Wall) -> None:
-        self._picture, self._needle, self._max_length, self._wall = picture, needle, max_length, wall
+    def __init__(self, picture: Picture, gray: Gray, needle: MeasuredNeedle, max_length: float, wall: Wall) -> None:
+        self._picture, self._gray, self._needle = picture, gray, needle
+        self._max_length, self._wall = max_length, wall
         self._reach = wall.radius - WALL_PX
         self._at_wall = bool(np.hypot(*(needle.tail_px - wall.centre)) > self._reach - AT_WALL_PX)
-        rows, columns = picture.shape
-        left, top = (max(0, int(c - self._reach - MARGIN_PX)) for c in wall.centre)
-        right, bottom = (int(c + self._reach + MARGIN_PX) + 1 for c in wall.centre)
-        left, top = min(left, columns - 1), min(top, rows - 1)
-        right, bottom = max(1, min(right, columns)), max(1, min(bottom, rows))
-        factor = picture.factor
-        left, top = left // factor * factor, top // factor * factor  # a whole pixel of the small image
-        self._origin, self._box = (left, top), (slice(top, bottom), slice(left, right))
-        hidden = glare_mask(picture)[top // factor : -(-bottom // factor), left // factor : -(-right // factor)]
-        self._hidden = np.ascontiguousarray(hidden)
-        _cover_needle(self._hidden, factor, needle, self._origin)
+        self._hidden = glare_mask(picture)
+        _cover_needle(self._hidden, picture.factor, needle)
 
     def best_walk(self) -> Walk:
         """Return the walk along the black-hat at full size, or at half of it where that shows more."""
-        darkest, factor = self._picture.darkest, self._picture.factor
-        pixels, smooth = without_needle(darkest, factor, self._needle), None
+        gray, enough = self._gray, 0.85 * self._max_length  # so much thread needs no other search
         if self._at_wall:  # else the walk would leave along the rim
-            tail, wall = self._needle.tail_px, Wall(self._wall.centre, self._wall.radius - RIM_PX)
-            pixels = without_wall(darkest.replaced(pixels), factor, wall, tail - AT_WALL_PX, tail + AT_WALL_PX)
-        else:
-            smooth = smooth_without_needle(darkest, factor, self._needle)[self._box]
-        window, enough = pixels[self._box], ENOUGH * self._max_length
-        thin = self._walked(black_hat(window, self._hidden, factor, 1, smooth))
+            wall = Wall(self._wall.centre, self._wall.radius - RIM_PX)
+            picture = self._picture
+            gray = without_wall(picture.darkest, gray, picture.factor, wall, self._needle.tail_px, AT_WALL_PX)
+        thin = self._walked(black_hat(gray, self._hidden, 1))
         strength = float(np.median(thin.path[1:, 4])) if len(thin.path) > 1 else 0.0
-        is_strong = strength > STRONG and thin.shown > STRONG_SHARE * self._max_length  # the rest may be covered
+        # Grey levels, and a share of the length, of a thread that is dark beyond doubt.
+        is_strong = strength > 25.0 and thin.shown > 0.068 * self._max_length  # the rest may be covered
         if thin.shown > enough or is_strong or self._at_wall:  # The rim is wide.
             return thin
-        wide = self._walked(black_hat(window, self._hidden, factor, 2))
+        wide = self._walked(black_hat(gray, self._hidden, 2))
         return wide if wide.shown > max(1.3 * thin.shown, 0.5 * enough) else thin
 
     def resolved(self, walk: Walk) -> Walk:
@@ -141,7 +126,7 @@ class _Search:
         scale, needle = ridge.scale, self._needle
         path, strong = self._buffers(ridge)
         path[0] = 0.0  # all that there is where nothing leaves the tail
-        tail, direction = (needle.tail_px - self._origin - 0.5 * (scale - 1)) / scale, needle.direction_px
+        tail, direction = (needle.tail_px - 0.5 * (scale - 1)) / scale, needle.direction_px
         start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
         max_hidden = (needle.length_px + 12.0) / scale  # by the needle and what is next to it
         lengths = self._max_length / scale, max_hidden
@@ -155,7 +140,7 @@ class _Search:
 
     def _dish(self, ridge: Ridge) -> tuple[float, float, float]:
         """Return the dish's centre and how far from it a walk may go, in a ridge's pixels."""
-        u, v = (np.subtract(self._wall.centre, self._origin) - 0.5 * (ridge.scale - 1)) / ridge.scale
+        u, v = (np.array(self._wall.centre) - 0.5 * (ridge.scale - 1)) / ridge.scale
         return float(u), float(v), self._reach / ridge.scale
 
     def _ended(
@@ -168,17 +153,18 @@ class _Search:
             full = cv2.resize(ridge.strength, None, fx=scale, fy=scale) if scale > 1 else ridge.strength
             above = cv2.subtract(full, ridge.noise)
             at = points * scale + shift
-            kept = count_off_outline(at, above, self._picture.mask, self._origin, ridge.faintest)
+            kept = count_off_outline(at, above, self._picture.mask, ridge.faintest)
         shown = max(0.0, shown - (path[count - 1, 5] - path[kept - 1, 5]))
         points = points[:kept]
         refine(ridge, points, strong[:kept])
-        points = points * scale + shift + self._origin
+        points = points * scale + shift
         return Walk(points, shown * scale, ridge, path[:kept].copy(), strong[:kept].copy())
 
     def _clear_shade(self, ridge: Ridge) -> None:
         """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
-        shade = SHADE * self._needle.contrast * middle(self._picture.darkest.floor)
-        axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24)) - self._origin
+        # A shadow has 12 % of steel's darkness.
+        shade = 0.12 * self._needle.contrast * middle(self._picture.darkest.floor)
+        axis = self._needle.arc.at(np.linspace(SHADE_PX, self._needle.length_px, 24))
         axis = (axis - 0.5 * (ridge.scale - 1)) / ridge.scale
         thickness = round((self._needle.width_px + 2.0 * SHADE_PX) / ridge.scale)
         left, top = np.maximum(axis.min(axis=0) - thickness, 0.0).astype(int)
@@ -191,9 +177,7 @@ class _Search:
             near[(zone > 0) & (near < shade)] = 0
 
 
-def count_off_outline(
-    points: Points, ridge: NDArray[np.uint8], mask: SceneMask, origin: tuple[int, int], faintest: float
-) -> int:
+def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask, faintest: float) -> int:
     """Return how many vertices of a walk show the thread, where it may have gone on along a bare outline.
 
     A walk ends before it enters a shape. A ridge along an outline is the thread's or the shape's own edge. The last
@@ -201,13 +185,12 @@ def count_off_outline(
     the walk, or that one shows none.
 
     Args:
-        points: vertices of the walk in the ridge's pixels, shape (m, 2) [px].
+        points: vertices of the walk, shape (m, 2) [px].
         ridge: ridge strength in grey levels, uint8.
         mask: of the picture.
-        origin: (u, v) of the ridge's first pixel in the picture [px].
         faintest: a strength that is no noise.
     """
-    depths = mask.depths(points + origin)
+    depths = mask.depths(points)
     inside = depths > mask.tolerance_px
     if inside.any():  # Whatever was followed from here on, it is no thread.
         first = max(1, int(np.argmax(inside)))
@@ -216,7 +199,7 @@ def count_off_outline(
     run = len(near) if near.all() else int(np.argmin(near[::-1]))
     if run < 5 or not len(mask.rim):  # vertices along an outline
         return len(points)
-    rim = mask.rim[:, :2] - origin
+    rim = mask.rim[:, :2]
     last = mask.rim[np.argmin(((rim - points[-1]) ** 2).sum(axis=1)), 2]
     rim = rim[mask.rim[:, 2] == last]
     apart = ((rim[:, None] - points[None, ::3]) ** 2).sum(axis=2).min(axis=1)
@@ -244,76 +227,53 @@ def _strongest(ridge: NDArray[np.uint8], points: Points, reach: int) -> NDArray[
     return np.asarray(ridge[rows[:, :, None], columns[:, None, :]].max(axis=(1, 2)), dtype=np.uint8)
 
 
-def _cover_needle(hidden: NDArray[np.uint8], factor: int, needle: MeasuredNeedle, origin: tuple[int, int]) -> None:
-    """Mark where a needle hides the thread, in a mask `factor` times smaller than the picture from `origin` on.
+def _cover_needle(hidden: Gray, factor: int, needle: MeasuredNeedle) -> None:
+    """Mark where a needle hides the thread, in a mask `factor` times smaller than the picture.
 
     At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
     """
-    axis = needle.arc.at(np.linspace(1.5, needle.length_px + 3.0, 24)) - origin
+    axis = needle.arc.at(np.linspace(1.5, needle.length_px + 3.0, 24))
     small = np.round((axis - 0.5 * (factor - 1)) / factor * 16.0).astype(np.int32)
     cv2.polylines(hidden, [small], False, 255, max(1, round((needle.width_px + 3.0) / factor)), cv2.LINE_8, 4)
 
 
-def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> NDArray[np.uint8]:
+def without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> Gray:
     """Return a channel's pixels in which a needle has the floor's brightness.
 
         I' = min(I + F c share, F)
 
-    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers. It is kept with
-    the channel, as the walk and the pieces need the same: it must not be changed.
+    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers.
 
     Args:
         channel: of the picture.
         factor: how much smaller its floor is.
         needle: in the picture's pixels.
     """
-    if channel.cleared.get("needle") is needle:
-        return np.asarray(channel.cleared["pixels"])
-    half, arc = 0.5 * needle.width_px + BLOOM_PX, needle.arc
-    outline = arc.at(np.linspace(0.0, needle.length_px, 24))
-    rows, columns = channel.pixels.shape
-    left, top = np.maximum(outline.min(axis=0) - half - 2.0 * BESIDE_PX, 0.0).astype(int)
-    right, bottom = np.minimum(outline.max(axis=0) + half + 2.0 * BESIDE_PX, (columns - 1, rows - 1)).astype(int)
+    half, length = 0.5 * needle.width_px + BLOOM_PX, needle.length_px
+    outline = needle.arc.at(np.linspace(0.0, length, 24))
+    breadth, (rows, columns) = math.ceil(half + BESIDE_PX + 1.0), channel.pixels.shape
+    left, top = np.maximum(outline.min(axis=0) - breadth, 0.0).astype(int)
+    right, bottom = np.minimum(outline.max(axis=0) + breadth + 1.0, (columns, rows)).astype(int)
+    near = np.zeros((max(0, bottom - top), max(0, right - left)), np.uint8)
+    at = [np.round((outline - (left, top)) * 16.0).astype(np.int32)]
+    cv2.polylines(near, at, False, 255, 2 * breadth, cv2.LINE_8, 4)
+    v, u = np.nonzero(near)
+    v, u = v + top, u + left
+    s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
+    own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
+    share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)
+    share[share <= 0.01] = 0.0
+    ground = channel.floor[
+        np.minimum(v // factor, len(channel.floor) - 1), np.minimum(u // factor, channel.floor.shape[1] - 1)
+    ]
     result = channel.pixels.copy()
-    start = np.array([arc.start[0], arc.start[1], arc.angle, arc.curvature])
-    shape = np.array([needle.length_px, half, needle.contrast])
-    _erase(result, np.ascontiguousarray(channel.floor), factor, start, shape, (left, top, right, bottom))
-    channel.cleared.clear()
-    channel.cleared.update(needle=needle, pixels=result)
+    own_light = result[v, u]
+    result[v, u] = np.maximum(
+        own_light, np.minimum(own_light + ground * needle.contrast * share, ground).astype(np.uint8)
+    )
     return result
 
 
-def smooth_without_needle(channel: Layer, factor: int, needle: MeasuredNeedle) -> NDArray[np.uint8]:
-    """Return `without_needle`, smoothed as wide as the thinnest thread looks; kept like it."""
-    pixels = without_needle(channel, factor, needle)
-    if "smooth" not in channel.cleared:
-        channel.cleared["smooth"] = cv2.GaussianBlur(pixels, (5, 5), 0.7)
-    return np.asarray(channel.cleared["smooth"])
-
-
-@compiled
-def _erase(pixels, floor, factor, start, shape, box):
-    """Brighten the pixels of a box by what a drawn needle takes of the floor's light."""
-    length, half, contrast = shape[0], shape[1], shape[2]
-    cosine, sine, curvature = math.cos(start[2]), math.sin(start[2]), start[3]
-    # Off the tangent by more than the arc itself is, nothing is near the needle.
-    farthest = half + BESIDE_PX + 0.5 * abs(curvature) * (length + BESIDE_PX + half) ** 2
-    for row in range(box[1], box[3] + 1):
-        for column in range(box[0], box[2] + 1):
-            u, v = column - start[0], row - start[1]
-            s, d = u * cosine + v * sine, v * cosine - u * sine
-            if abs(d) > farthest:
-                continue
-            if abs(curvature) > 1e-6:
-                turned = math.atan2(curvature * s, 1.0 - curvature * d)
-                d = (1.0 - math.hypot(curvature * s, 1.0 - curvature * d)) / curvature
-                s = turned / curvature
-            if abs(d) > half + BESIDE_PX or not -BESIDE_PX < s < length + BESIDE_PX:
-                continue  # Four edges for each pixel of the box would take longer than all else.
-            part = min(max((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0), 1.0)
-            own = half * (1.0 - (1.0 - THIN) * part)
-            share = (edge(own - d) - edge(-own - d)) * edge(s) * edge(length - s)
-            if share > 0.01:
-                ground = float(floor[min(row // factor, len(floor) - 1), min(column // factor, floor.shape[1] - 1)])
-                value = pixels[row, column] + ground * contrast * share
-                pixels[row, column] = max(pixels[row, column], int(min(value, ground)))
+def _edge(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much of a blurred edge is covered at distances inside of it; see `template`."""
+    return np.asarray(1.0 / (1.0 + np.exp(-STEEPNESS * x)))

@@ -30,8 +30,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.vision.sampling import within
-from magnetosuture_thread.vision.thread.appearance import runs, sampled
+from magnetosuture_thread.vision.images import runs, sampled, within
 from magnetosuture_thread.vision.thread.walk import STEP_PX, STRONGEST, Ridge, walk_on
 
 RADIUS_PX, RING = 7.0, 48  # around a path's vertices, that belongs to a crossing; places on it that are looked at
@@ -157,7 +156,7 @@ def resolve_crossings(
         if len(longer):
             count = max(2, int(longer[0]))
             break
-        count = walk_along(ridge, dish, max_length, path, strong, count)
+        count = walk_on(ridge, dish, max_length, path, strong, count)
     return count, tuple(crossing for crossing in crossings if crossing.first < count)
 
 
@@ -182,7 +181,7 @@ def strands_meet(ridge, path, meets):
         path: shape (m, 6), see `walk_on`.
         meets: filled, shape (m,).
     """
-    hidden, factor = ridge.hidden, ridge.factor
+    hidden = ridge.hidden
     rows, columns = hidden.shape
     values, ways = np.empty(RING), np.empty((RING, 2))
     for place in range(RING):
@@ -193,8 +192,7 @@ def strands_meet(ridge, path, meets):
         is_covered = False
         for place in range(RING):
             u, v = path[index, 0] + ways[place, 0], path[index, 1] + ways[place, 1]
-            column = min(max(int(u + 0.5) // factor, 0), columns - 1)
-            row = min(max(int(v + 0.5) // factor, 0), rows - 1)
+            column, row = min(max(int(u + 0.5), 0), columns - 1), min(max(int(v + 0.5), 0), rows - 1)
             if hidden[row, column] != 0:
                 is_covered = True
                 break
@@ -225,13 +223,6 @@ def _turn(path: NDArray[np.float64], strong: NDArray[np.bool_], at: int, entry: 
     path[at:count], strong[at:count] = rows, shown
     path[at - 1 : count, 5] = path[at - 1, 5] + arc_lengths(path[at - 1 : count, :2])
     return count, at + len(curve)
-
-
-def walk_along(
-    ridge: Ridge, dish: Circle, max_length: float, path: NDArray[np.float64], strong: NDArray[np.bool_], count: int
-) -> int:
-    """Walk on along a ridge without forks; see `walk_on`."""
-    return int(walk_on(ridge, dish, max_length, path, strong, count, 9.0, np.empty((0, 3)))[0])
 
 
 def find_arms(ridge: Ridge, dish: Circle, part: NDArray[np.float64]) -> list[Arm]:
@@ -306,7 +297,7 @@ def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) 
     """Walk along an arm, and measure it where it begins; None if it is too short."""
     path, strong = np.zeros((int(ARM_PX / STEP_PX) + 3, 6)), np.ones(int(ARM_PX / STEP_PX) + 3, np.bool_)
     path[0, :5] = start[0], start[1], angle, 0.0, usual
-    count = walk_along(ridge, dish, ARM_PX, path, strong, 1)
+    count = walk_on(ridge, dish, ARM_PX, path, strong, 1)
     if count <= 4:
         return None
     path, strong = path[1:count], strong[1:count]  # The first vertex isn't in the ridge's middle.
@@ -340,14 +331,18 @@ def arm_of(arms: list[Arm], part: NDArray[np.float64], *, leaving: bool) -> int:
 def joining_curve(one: Arm, other: Arm) -> Points:
     """Return the cubic that leads from one arm to another, in steps, shape (m, 2)."""
     chord = float(np.hypot(*(other.start - one.start)))
-    t = np.linspace(0.0, 1.0, max(3, round(chord / STEP_PX) + 1))[:, None]
-    leaving = -chord * np.array([math.cos(one.angle), math.sin(one.angle)])
-    arriving = chord * np.array([math.cos(other.angle), math.sin(other.angle)])
+    leaving, arriving = (np.array([math.cos(arm.angle), math.sin(arm.angle)]) for arm in (one, other))
+    return cubic(one.start, other.start, -chord * leaving, chord * arriving, max(3, round(chord / STEP_PX) + 1))
+
+
+def cubic(start: Points, end: Points, leaving: Points, arriving: Points, count: int) -> Points:
+    """Return points of the cubic from one point to another with given tangents, shape (count, 2)."""
+    t = np.linspace(0.0, 1.0, count)[:, None]
     return np.asarray(
-        (1.0 + 2.0 * t) * (1.0 - t) ** 2 * one.start
+        (1.0 + 2.0 * t) * (1.0 - t) ** 2 * start
         + t * (1.0 - t) ** 2 * leaving
-        + t * t * (3.0 - 2.0 * t) * other.start
-        - t * t * (1.0 - t) * arriving
+        + t * t * (3.0 - 2.0 * t) * end
+        + t * t * (t - 1.0) * arriving
     )
 
 
@@ -396,7 +391,7 @@ def _beyond(
             continue
         path, strong = np.zeros((int(max_length) + 16, 6)), np.ones(int(max_length) + 16, np.bool_)
         path[: len(arm.path)] = arm.path
-        count = walk_along(ridge, dish, max_length, path, strong, len(arm.path))
+        count = walk_on(ridge, dish, max_length, path, strong, len(arm.path))
         lengths[number] = path[count - 1, 5]
         later, back = path[len(arm.path) // 2 : count], count
         for other in set(range(len(arms))) - {number}:
@@ -448,10 +443,20 @@ def continuations(
     early[entry] = 0.0
     costs[entry] += early
     costs[:, entry] += early
-    every = list(pairings(tuple(range(count))))
+    return chances_of(costs, entry)
+
+
+def chances_of(costs: NDArray[np.float64], entry: int) -> NDArray[np.float64]:
+    """Return how probable it is that a strand goes on along each arm, by all pairings of the arms, shape (n,).
+
+    Args:
+        costs: of each pair, and in the diagonal of an arm that ends, shape (n, n).
+        entry: number of the arm by which the strand comes; its own probability is that the strand ends.
+    """
+    every = list(pairings(tuple(range(len(costs)))))
     totals = np.array([sum(costs[pair] for pair in pairing) for pairing in every])
     weights = np.exp(totals.min() - totals)
-    chances = np.zeros(count)
+    chances = np.zeros(len(costs))
     for pairing, weight in zip(every, weights, strict=True):
         one, other = next(pair for pair in pairing if entry in pair)
         chances[other if one == entry else one] += weight

@@ -7,25 +7,26 @@ s^2 for each length joins them at the price
     c = 1/2 (a, b) C^-1 (a, b)^T,    C = s^2 g / 3 [[1, -1/2], [-1/2, 1]] + d^2 [[1, 0], [0, 1]]
 
 with the error d of measured directions: with d = 0 that is the least bending energy of a beam between the two ends,
-(4 / g) (a^2 + a b + b^2), over 2 s^2. All orders and directions of the pieces are tried. An order is taken only if all
-others cost more by `SURE`: where two are nearly as good, none is.
+(4 / g) (a^2 + a b + b^2), over 2 s^2. All pairings of the ends below an area are tried, as those of the strands at a
+crossing; an end is joined to another only if that is nearly certain.
 
-Source: [Mumford1994]. Deviation: small angles, and not normalised, so that only orders of the same pieces compare.
+Source: [Mumford1994]. Deviation: small angles, and not normalised, so that only pairings of the same ends compare.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import combinations
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.images import Picture, Wall
+from magnetosuture_thread.vision.images import Gray, Picture, Wall, middle, runs, sampled
 from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 from magnetosuture_thread.vision.thread.appearance import (
     FAINTEST,
@@ -33,44 +34,42 @@ from magnetosuture_thread.vision.thread.appearance import (
     MIN_SHARE,
     OBJECT_GAP_PX,
     SPACING_PX,
+    WALL_PX,
     Appearance,
-    Gray,
+    Hiding,
     Strand,
+    across,
     appearance_of,
     below_needle,
     deviations,
+    find_hiding,
     first_clear_of,
     gaps_of,
+    looks_alike,
     parts_without,
     respaced,
-    runs,
     strand_along,
     strengths,
     tangents_of,
 )
-from magnetosuture_thread.vision.thread.centreline import smooth_without_needle
-from magnetosuture_thread.vision.thread.hiding import Hiding, find_hiding
-from magnetosuture_thread.vision.thread.pieces import (
-    MIN_LENGTH_PX,
-    end_direction,
-    find_pieces,
-    fresh_parts,
-    is_bare_beyond,
-    why_it_ends,
-)
+from magnetosuture_thread.vision.thread.crossings import chances_of, cubic
+from magnetosuture_thread.vision.thread.walk import Ridge, walk_on
 
+MIN_SEED_PX, MIN_LENGTH_PX = 6, 12.0  # of a ridge from which a walk begins, and of a piece
+MAX_TWICE_PX = 10.0  # along another line, that a line may run near it where it only crosses it
+AHEAD_PX, AHEAD = (3.0, 5.0, 7.0, 9.0, 11.0), math.radians(50.0)  # beyond an end, where floor must be visible
+BESIDE_POINTS = 6  # last vertices of a piece, beside which its floor is measured
+BARE_COLOUR = 0.03  # of it, by which colours may change apart, on average over the farthest rings
 LENGTH_TOLERANCE = 0.03  # of the thread's length, that a whole thread may be seen shorter or longer by
 LENGTH_ERROR = 0.01  # of an arc length: by noise along the walk
 END_ERROR_PX = 4.0  # of an arc length, by the places where pieces begin and end
-SCALE_ERROR = 0.001  # see `look`
 MEETS_PX = 6.0  # from another piece's end, where the way through a crossing isn't known
-TURNING = 60.0  # rad^2 / m; variance of a thread's tangent for each length
-MAX_PRICE = 12.0  # of one gap
-SURE = 4.0  # by which the price of every other order must be higher
+MAX_PRICE = 12.0  # of one gap; half of it for each end that is joined to none
 
 
 def observe(
     picture: Picture,
+    gray: Gray,
     needle: MeasuredNeedle,
     walk: Points,
     view: DishView,
@@ -88,6 +87,7 @@ def observe(
 
     Args:
         picture: the frame or a part of it.
+        gray: its darkest colour without the needle, smoothed.
         needle: in the picture's pixels.
         walk: along the thread from the needle's tail on, shape (m, 2), m = 1 if none is seen [px].
         view: of the dish, in the picture's pixels.
@@ -98,7 +98,6 @@ def observe(
     """
     if len(walk) < 2 or arc_lengths(walk)[-1] < SPACING_PX:
         return ThreadObservation()
-    gray = smooth_without_needle(picture.darkest, picture.factor, needle)
     walk = respaced(walk, SPACING_PX)
     below = below_needle(needle, walk)
     thread = appearance_of(picture, gray, walk, ~below)
@@ -110,13 +109,13 @@ def observe(
     in_dish = _Dish(view, thread, scale_known)
     plain = strengths(gray, walk, thread, two_sided=True) > max(FAINTEST, MIN_SHARE * thread.strength)
     gapless = not gone.any() and not gaps_of(plain | below, OBJECT_GAP_PX, begin).any()
-    if gapless and _is_whole(line, length):  # Nothing is left of the thread to look for.
+    if gapless and _is_whole(line.points, length):  # Nothing is left of the thread to look for.
         ends_bare = is_bare_beyond(picture, gray, thread, parts[0], needle)
         end = PieceEnd.FREE if ends_bare else PieceEnd.UNKNOWN
-        whole = in_dish.piece(line, PieceEnd.TAIL, end, (0.0, 0.0), 1.0)
+        whole = in_dish.piece(line, (PieceEnd.TAIL, end), (0.0, 0.0))
         return ThreadObservation((whole,), complete=ends_bare, hidden=(_outline(needle, view),))
     if not search:
-        first = in_dish.piece(parts[0], PieceEnd.TAIL, PieceEnd.UNKNOWN, (0.0, 0.0), 1.0)
+        first = in_dish.piece(parts[0], (PieceEnd.TAIL, PieceEnd.UNKNOWN), (0.0, 0.0))
         return ThreadObservation((first,), hidden=(_outline(needle, view),))
     wall = Wall(view.centre_px, radius / view.metres_per_pixel)
     hiding = find_hiding(picture, needle, wall, view.metres_per_pixel)
@@ -138,7 +137,15 @@ def observe(
     others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
     strands = _cut_where_met(begun, others)
     strands += [strand_along(gray, thread, respaced(other, SPACING_PX)) for other in others]
-    return _joined(picture, gray, thread, needle, hiding, strands, in_dish, length)
+    ends, areas = [], []
+    for number, strand in enumerate(strands):
+        first_end, first_area = (PieceEnd.TAIL, 0)
+        if number:
+            first_end, first_area = why_it_ends(picture, gray, thread, strand.turned(), needle, hiding)
+        last_end, last_area = why_it_ends(picture, gray, thread, strand, needle, hiding)
+        ends.append([first_end, last_end])
+        areas.append((first_area, last_area))
+    return _joined(strands, ends, areas, hiding, in_dish, length)
 
 
 def _cut_where_met(strand: Strand, others: list[Points]) -> list[Strand]:
@@ -169,10 +176,9 @@ class _Dish:
     def piece(
         self,
         strand: Strand,
-        first: PieceEnd,
-        last: PieceEnd,
+        ends: tuple[PieceEnd, PieceEnd],
         arc_length: tuple[float, float],
-        confidence: float,
+        confidence: float = 1.0,
         *,
         direction_known: bool = True,
     ) -> ThreadPiece:
@@ -182,97 +188,70 @@ class _Dish:
         deviation = scale * deviations(self.thread, strand)
         if not self.scale_known:  # A wrong scale shifts what is far from the dish's centre.
             along = tangents_of(points)
-            deviation = np.hypot(deviation, SCALE_ERROR * (points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
+            deviation = np.hypot(deviation, 0.001 * (points[:, 0] * along[:, 1] - points[:, 1] * along[:, 0]))
         low, high = (float(scale * value) for value in arc_length)
-        return ThreadPiece(points, deviation, first, last, (low, high), direction_known, confidence)
+        return ThreadPiece(points, deviation, *ends, (low, high), direction_known, confidence)
 
 
 def _joined(
-    picture: Picture,
-    gray: Gray,
-    thread: Appearance,
-    needle: MeasuredNeedle,
-    hiding: Hiding,
     strands: list[Strand],
+    ends: list[list[PieceEnd]],
+    areas: list[tuple[int, int]],
+    hiding: Hiding,
     in_dish: _Dish,
     length: float,
 ) -> ThreadObservation:
-    """Order the pieces, and tell why each of them ends."""
-    ends, pieces = [], []
-    for number, strand in enumerate(strands):
-        first, area = PieceEnd.TAIL, 0
-        if number:
-            first, area = why_it_ends(picture, gray, thread, strand.turned(), needle, hiding)
-        last, last_area = why_it_ends(picture, gray, thread, strand, needle, hiding)
-        ends.append([first, last])
-        pieces.append(Piece(strand.points, (area, last_area)))
+    """Order the pieces.
+
+    Args:
+        strands: the one that leaves the needle first.
+        ends: why each of them begins and ends; an end on bare floor stays free only if it is the thread's.
+        areas: number of the hiding area that each end runs into, 0 for none.
+        hiding: these areas.
+        in_dish: turns a strand into a piece.
+        length: of the thread [px].
+    """
     longest = length * (1.0 + LENGTH_TOLERANCE)
-    order = find_order(pieces, hiding, (length * (1.0 - LENGTH_TOLERANCE), longest), in_dish.view.metres_per_pixel)
-    _tell_free(ends, order, length)
+    lines = [strand.points for strand in strands]
+    shortest = length * (1.0 - LENGTH_TOLERANCE)
+    order = find_order(lines, areas, hiding, (shortest, longest), in_dish.view.metres_per_pixel)
+    # The only end on bare floor is the thread's where it is the last in the order, and the lengths add up.
+    bare = [(number, side) for number, both in enumerate(ends) for side in (0, 1) if both[side] is PieceEnd.FREE]
+    last = order[-1]
+    low, high = (arc + float(arc_lengths(lines[last.index])[-1]) for arc in last.arc_length)
+    adds_up = low < longest + END_ERROR_PX and high > shortest - END_ERROR_PX
+    if not adds_up or bare != [(last.index, 0 if last.turned else 1)]:
+        for number, side in bare:
+            ends[number][side] = PieceEnd.UNKNOWN
     result = []
-    for placed in (*order.placed, *order.wide):
-        strand, (first, last) = strands[placed.index], ends[placed.index]
+    for placed in order:
+        strand, (first_end, last_end) = strands[placed.index], ends[placed.index]
         if placed.turned:
-            strand, first, last = strand.turned(), last, first
+            strand, first_end, last_end = strand.turned(), last_end, first_end
         low, high = placed.arc_length
         if placed.index:
             low = max(0.0, low - LENGTH_ERROR * low - END_ERROR_PX)
-            high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - pieces[placed.index].length))
-        confidence = 1.0 if not placed.index else order.share if placed in order.placed else 0.6
-        result.append(in_dish.piece(strand, first, last, (low, high), confidence))
-    told = {placed.index for placed in (*order.placed, *order.wide)}
-    nowhere = (math.nan, math.nan)
-    for number in sorted(set(range(len(strands))) - told)[:24]:
-        first, last = ends[number]
-        result.append(in_dish.piece(strands[number], first, last, nowhere, 0.3, direction_known=False))
-    alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(strands[0], length)
-    outlines = [in_dish.view.to_dish(outline) for outline in hiding.outlines()]
-    return ThreadObservation(tuple(result), alone, tuple(outlines))
+            high = min(high + LENGTH_ERROR * high + END_ERROR_PX, max(low, longest - arc_lengths(strand.points)[-1]))
+        result.append(in_dish.piece(strand, (first_end, last_end), (low, high), placed.chance))
+    unplaced = [number for number in range(len(strands)) if all(number != placed.index for placed in order)]
+    for number in unplaced[:24]:  # more are texture
+        nowhere = (math.nan, math.nan)
+        result.append(
+            in_dish.piece(strands[number], (ends[number][0], ends[number][1]), nowhere, 0.3, direction_known=False)
+        )
+    alone = len(strands) == 1 and ends[0][1] is PieceEnd.FREE and _is_whole(lines[0], length)
+    return ThreadObservation(tuple(result), alone, tuple(in_dish.view.to_dish(each) for each in hiding.outlines()))
 
 
-def _is_whole(strand: Strand, length: float) -> bool:
+def _is_whole(line: Points, length: float) -> bool:
     """Say whether a piece is as long as the thread."""
-    return bool(abs(arc_lengths(strand.points)[-1] / length - 1.0) < LENGTH_TOLERANCE)
-
-
-def _tell_free(ends: list[list[PieceEnd]], order: Order, length: float) -> None:
-    """Let an end on bare floor count as the thread's only where it is the only one, and the lengths add up."""
-    bare = [(number, side) for number, both in enumerate(ends) for side in (0, 1) if both[side] is PieceEnd.FREE]
-    low, high = order.length
-    adds_up = low < length * (1.0 + LENGTH_TOLERANCE) + END_ERROR_PX
-    adds_up &= high > length * (1.0 - LENGTH_TOLERANCE) - END_ERROR_PX
-    if order.last is not None and bare == [(order.last[0], 0 if order.last[1] else 1)] and adds_up:
-        return
-    for number, side in bare:
-        ends[number][side] = PieceEnd.UNKNOWN
+    return bool(abs(arc_lengths(line)[-1] / length - 1.0) < LENGTH_TOLERANCE)
 
 
 def _outline(needle: MeasuredNeedle, view: DishView) -> Points:
     """Return the outline of a needle in the dish frame, shape (m, 2) [m]."""
     at, half = np.linspace(0.0, needle.length_px, 9), 0.5 * needle.width_px
     return view.to_dish(np.vstack([needle.arc.at(at, half), needle.arc.at(at[::-1], -half)]))
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A piece before it is told where in the thread it lies.
-
-    Attributes:
-        points: along it, shape (m, 2) [px].
-        areas: number of the hiding area that each end runs into, 0 for none.
-    """
-
-    points: Points
-    areas: tuple[int, int]
-
-    @property
-    def length(self) -> float:
-        """Return its length [px]."""
-        return float(arc_lengths(self.points)[-1])
-
-    def turned(self) -> Piece:
-        """Return the piece from its other end."""
-        return Piece(self.points[::-1], (self.areas[1], self.areas[0]))
 
 
 @dataclass(frozen=True)
@@ -283,150 +262,108 @@ class Placed:
         index: of the piece.
         turned: whether the thread runs from its last point to its first.
         arc_length: least and greatest of the point that comes first [px].
+        chance: that it lies there, 0 to 1.
     """
 
     index: int
     turned: bool
     arc_length: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Order:
-    """Where the thread runs surely.
-
-    Attributes:
-        placed: pieces from the needle on.
-        share: how likely this order is among those that were tried, 0 to 1.
-        wide: pieces that may lie in different places beyond these, but in one direction, with all of these places.
-        last: the piece that is the last one for sure, with its direction; None if that isn't known.
-        length: least and greatest length of the thread up to the end of the last piece [px].
-    """
-
-    placed: tuple[Placed, ...]
-    share: float
-    wide: tuple[Placed, ...]
-    last: tuple[int, bool] | None
-    length: tuple[float, float]
+    chance: float = 1.0
 
 
 @dataclass(frozen=True)
 class _Gap:
-    """A way from one piece's end to the beginning of another."""
+    """A way below a hiding area: its price, the straight distance, and the length of its curve [px]."""
 
     price: float
     chord: float
     length: float
-    curve: Points
 
 
-Step = tuple[int, bool]  # index of a piece, and whether it is turned
-
-
-def find_order(pieces: list[Piece], hiding: Hiding, length: tuple[float, float], metres_per_pixel: float) -> Order:
-    """Find the order in which the thread runs through its pieces.
+def find_order(
+    lines: list[Points],
+    areas: list[tuple[int, int]],
+    hiding: Hiding,
+    length: tuple[float, float],
+    metres_per_pixel: float,
+) -> list[Placed]:
+    """Find where the thread surely runs from its first piece on.
 
     Args:
-        pieces: the one that leaves the needle first, with its first point at the tail; then the longest first.
-        hiding: areas where the thread can't be seen.
+        lines: the pieces: the one that leaves the needle first, with its first point at the tail, each of shape (m, 2)
+            [px].
+        areas: number of the hiding area that both ends of each piece run into, 0 for none.
+        hiding: these areas, where the thread can't be seen.
         length: least and greatest of the whole thread [px].
         metres_per_pixel: of the picture [m].
 
     Returns:
-        The pieces that every order that is nearly the best begins with, and what else all of these agree on.
+        The pieces in their order.
     """
-    gaps: dict[tuple[Step, Step], _Gap] = {}
-    oriented = {
-        (k, turned): piece.turned() if turned else piece for k, piece in enumerate(pieces) for turned in (False, True)
-    }
-    count = min(len(pieces), 6)  # Only the longest are tried in all orders.
-    for before in oriented:
-        for after in oriented:
-            if before[0] != after[0] and after[0] != 0 and max(before[0], after[0]) < count:
-                gap = _gap(oriented[before], oriented[after], hiding, TURNING * metres_per_pixel)
-                if gap is not None:
-                    gaps[before, after] = gap
-    lengths = [piece.length for piece in pieces]
-    tried = [
-        (price, chain)
-        for chain in _chains((0, False), gaps, count)
-        if (price := _price(chain, gaps, lengths, count, length, oriented)) < math.inf
-    ]
-    tried.sort(key=lambda each: each[0])
-    best, chain = tried[0] if tried else (0.0, ((0, False),))
-    near = [other for price, other in tried if price < best + SURE] or [chain]
-    same = 1
-    while same < len(chain) and all(len(other) > same and other[same] == chain[same] for other in near):
-        same += 1
-    total = sum(math.exp(best - price) for price, _ in tried) or 1.0
-    share = sum(math.exp(best - price) for price, other in tried if other[:same] == chain[:same]) / total or 1.0
-    ways = [_placed(other, gaps, lengths, length[1]) for other in near]
-    last = chain[-1] if all(other[-1] == chain[-1] for other in near) else None
-    reached = [
-        (
-            sum(lengths[k] for k, _ in other) + sum(gap.chord for gap in used),
-            way[-1].arc_length[1] + lengths[other[-1][0]],
-        )
-        for other, way in zip(near, ways, strict=True)
-        for used in [[gaps[pair] for pair in pairwise(other)]]
-    ]
-    return Order(
-        ways[0][:same],
-        share,
-        _wide(ways, same),
-        last,
-        (min(low for low, _ in reached), max(high for _, high in reached)),
-    )
-
-
-def _wide(ways: list[tuple[Placed, ...]], same: int) -> tuple[Placed, ...]:
-    """Return the pieces beyond the first ones that lie in one direction in all ways, with all of their places."""
+    lengths, longest = [float(arc_lengths(line)[-1]) for line in lines], length[1]
+    placed, end = [Placed(0, False, (0.0, 0.0))], (0, 1)
+    way = [lengths[0]]  # lengths of pieces and gaps along the thread, in turn
+    while area := areas[end[0]][end[1]]:
+        below = [(number, side) for number, both in enumerate(areas) for side in (0, 1) if both[side] == area]
+        others = sorted((each for each in below if each != end), key=lambda each: -lengths[each[0]])
+        ends = [end, *others][:8]  # of which all pairings can be tried
+        # A thread's tangent varies by 60 rad^2 for each metre.
+        gaps = _gaps_below(ends, lines, lengths, longest, hiding, 60.0 * metres_per_pixel)
+        costs = np.full((len(ends), len(ends)), math.inf)
+        np.fill_diagonal(costs, 0.5 * MAX_PRICE)
+        for (one, other), gap in gaps.items():
+            costs[one, other] = costs[other, one] = gap.price
+        chances = chances_of(costs, 0)
+        best = int(chances.argmax())
+        index, side = ends[best]
+        if best == 0 or chances[best] < 0.98 or any(index == each.index for each in placed):
+            break
+        gap, last = gaps[0, best], placed[-1]
+        if sum(way) + gap.chord + lengths[index] > longest:
+            break
+        low, high = (arc + lengths[last.index] for arc in last.arc_length)
+        # A half circle is the longest way below what hides it.
+        arc = (low + gap.chord, high + 0.5 * math.pi * gap.length)
+        placed.append(Placed(index, side == 1, arc, last.chance * float(chances[best])))
+        way += [gap.chord, lengths[index]]
+        end = (index, 1 - side)
+    last = placed[-1]
+    if not areas[end[0]][end[1]] and last.arc_length[1] + lengths[last.index] < length[0]:
+        return placed[:1]  # It ends in sight and is too short: a piece between two of these is left out.
+    rest = np.cumsum(way[::-1])[::-1][::2]  # from the beginning of each piece on, at least
     result = []
-    for piece in ways[0][same:]:
-        places = [other for way in ways for other in way if (other.index, other.turned) == (piece.index, piece.turned)]
-        if len(places) == len(ways):
-            low, high = (pick(place.arc_length[k] for place in places) for k, pick in ((0, min), (1, max)))
-            result.append(Placed(piece.index, piece.turned, (low, high)))
-    return tuple(sorted(result, key=lambda placed: placed.arc_length))
+    for each, later in zip(placed, rest, strict=True):
+        low, high = each.arc_length
+        result.append(replace(each, arc_length=(low, max(low, min(high, longest - float(later))))))
+    return result
 
 
-def _chains(first: Step, gaps: dict[tuple[Step, Step], _Gap], count: int) -> Iterator[tuple[Step, ...]]:
-    """Give all ways through pieces, each at most once."""
-    waiting: list[tuple[Step, ...]] = [(first,)]
-    steps = [(index, turned) for index in range(1, count) for turned in (False, True)]
-    while waiting:
-        chain = waiting.pop()
-        yield chain
-        used = {index for index, _ in chain}
-        waiting += [(*chain, step) for step in steps if step[0] not in used and (chain[-1], step) in gaps]
-
-
-def _price(
-    chain: tuple[Step, ...],
-    gaps: dict[tuple[Step, Step], _Gap],
+def _gaps_below(
+    ends: list[tuple[int, int]],
+    lines: list[Points],
     lengths: list[float],
-    count: int,
-    length: tuple[float, float],
-    oriented: dict[Step, Piece],
-) -> float:
-    """Return what an order costs; infinite if the thread is too short for it."""
-    used = [gaps[pair] for pair in pairwise(chain)]
-    seen = sum(lengths[index] for index, _ in chain)
-    if seen + sum(gap.chord for gap in used) > length[1]:
-        return math.inf
-    price = sum(gap.price for gap in used) + MAX_PRICE * (count - len(chain))  # for each piece that is left out
-    if used and not oriented[chain[-1]].areas[1]:  # The thread ends in sight: it is known how much is hidden.
-        hidden = sum(gap.length for gap in used)
-        off = max(length[0] - seen - hidden, seen + hidden - length[1], 0.0)
-        price += min(0.5 * (off / (0.15 * hidden + 1.0)) ** 2, MAX_PRICE)
-    return price
+    longest: float,
+    hiding: Hiding,
+    turning: float,
+) -> dict[tuple[int, int], _Gap]:
+    """Return the ways between the ends of pieces below one area, by their places among these ends."""
+    gaps = {}
+    for one, other in combinations(range(len(ends)), 2):
+        (before, first_side), (after, side) = ends[one], ends[other]
+        if before == after:
+            continue
+        leaving = lines[before] if first_side else lines[before][::-1]
+        arriving = lines[after][::-1] if side else lines[after]
+        gap = _gap(leaving, arriving, hiding, turning)
+        if gap is not None and lengths[before] + gap.chord + lengths[after] <= longest:
+            gaps[one, other] = gap
+    return gaps
 
 
-def _gap(before: Piece, after: Piece, hiding: Hiding, turning: float) -> _Gap | None:
-    """Return the way from a piece's end to the beginning of another; None where none is hidden, or too bent."""
-    if not before.areas[1] or before.areas[1] != after.areas[0]:
-        return None
-    start, end = before.points[-1], after.points[0]
-    leaving, arriving = end_direction(before.points), -end_direction(after.points[::-1])
+def _gap(before: Points, after: Points, hiding: Hiding, turning: float) -> _Gap | None:
+    """Return the way from a piece's end to the beginning of another; None where it is not hidden, or too bent."""
+    start, end = before[-1], after[0]
+    leaving, arriving = end_direction(before), -end_direction(after[::-1])
     chord = float(np.hypot(*(end - start)))
     along = (end - start) / max(chord, 1e-9)
     angles = np.array([_angle(along, leaving), _angle(along, arriving)])
@@ -435,40 +372,230 @@ def _gap(before: Piece, after: Piece, hiding: Hiding, turning: float) -> _Gap | 
     price = 0.5 * float(angles @ np.linalg.solve(spread, angles))
     if price > MAX_PRICE:
         return None
-    curve = _curve(start, end, leaving * chord, arriving * chord)
-    bare = sum(hiding.area_at(point) == 0 for point in curve[1:-1]) * arc_lengths(curve)[-1] / len(curve)
-    if bare > 10.0:  # px of it may lie on bare floor
-        return None
-    return _Gap(price, chord, float(arc_lengths(curve)[-1]), curve)
+    curve = cubic(start, end, leaving * chord, arriving * chord, 17)
+    length = float(arc_lengths(curve)[-1])
+    bare = sum(hiding.area_at(point) == 0 for point in curve[1:-1]) * length / len(curve)
+    return _Gap(price, chord, length) if bare <= 10.0 else None  # px of it may lie on bare floor
 
 
 def _angle(from_: Points, to: Points) -> float:
     return math.atan2(from_[0] * to[1] - from_[1] * to[0], float(from_ @ to))
 
 
-def _curve(start: Points, end: Points, leaving: Points, arriving: Points) -> Points:
-    """Return the cubic from a point to another with given tangents, shape (17, 2)."""
-    t = np.linspace(0.0, 1.0, 17)[:, None]
-    return np.asarray(
-        (1.0 + 2.0 * t) * (1.0 - t) ** 2 * start
-        + t * (1.0 - t) ** 2 * leaving
-        + t * t * (3.0 - 2.0 * t) * end
-        + t * t * (t - 1.0) * arriving
-    )
+def _off_line() -> NDArray[np.float64]:
+    """Return the matrix that takes light at the vertices and ahead to what it is off a straight line fitted to it."""
+    line = np.vander(np.concatenate([SPACING_PX * np.arange(1 - BESIDE_POINTS, 1), AHEAD_PX]), 2)
+    return np.asarray(np.eye(len(line)) - line @ np.linalg.pinv(line))
 
 
-def _placed(
-    chain: tuple[Step, ...], gaps: dict[tuple[Step, Step], _Gap], lengths: list[float], longest: float
-) -> tuple[Placed, ...]:
-    """Return where along the thread the pieces of an order begin."""
-    used = [gaps[pair] for pair in pairwise(chain)]
-    result = [Placed(chain[0][0], chain[0][1], (0.0, 0.0))]
-    for position, (index, turned) in enumerate(chain[1:], start=1):
-        low, high = result[-1].arc_length
-        length, gap = lengths[chain[position - 1][0]], used[position - 1]
-        later = sum(lengths[step[0]] for step in chain[position:]) + sum(each.chord for each in used[position:])
-        low += length + gap.chord
-        # A half circle is the longest way below what hides it.
-        high = max(low, min(high + length + 0.5 * math.pi * gap.length, longest - later))
-        result.append(Placed(index, turned, (low, high)))
-    return tuple(result)
+OFF_LINE = _off_line()
+
+
+def two_sided_ridge(gray: Gray, thread: Appearance, hiding: Hiding) -> Gray:
+    """Return how much darker each pixel is than the floor on both sides of it.
+
+        R(p) = max_k min(I(p + d n_k), I(p - d n_k)) - I(p)
+
+    with d a little more than half of the thread's width and n_k unit vectors all around, so that an edge, bright on
+    one side only, is none. It is 0 where something hides the floor.
+    """
+    reach = thread.beside_px
+    edge = math.ceil(reach) + 1
+    padded = cv2.copyMakeBorder(gray, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
+    rows, columns = gray.shape
+    best = np.zeros_like(gray)
+    for index in range(8):
+        angle = math.pi * index / 8
+        u, v = round(reach * math.cos(angle)), round(reach * math.sin(angle))
+        one = padded[edge + v : edge + v + rows, edge + u : edge + u + columns]
+        other = padded[edge - v : edge - v + rows, edge - u : edge - u + columns]
+        best = cv2.max(best, cv2.subtract(cv2.min(one, other), gray))
+    best[hiding.solid > 0] = 0
+    return np.ascontiguousarray(best)
+
+
+def find_pieces(
+    picture: Picture,
+    gray: Gray,
+    thread: Appearance,
+    hiding: Hiding,
+    known: list[Points],
+    max_length: float,
+) -> list[Points]:
+    """Find all other pieces of a thread.
+
+    Args:
+        picture: the frame or a part of it.
+        gray: its darkest colour without the needle, smoothed.
+        thread: how the piece looks that leaves the needle.
+        hiding: areas where nothing can be seen.
+        known: pieces that are known, each of shape (m, 2) [px].
+        max_length: of all these pieces: what is left of the thread, so that anything longer is none of it [px].
+
+    Returns:
+        Pieces in the picture's pixels, the longest first, each of shape (m, 2), m >= 2 [px].
+    """
+    if max_length < MIN_LENGTH_PX or thread.strength < 2.0 * FAINTEST:  # The floor's texture looks like a faint thread.
+        return []
+    ridge = two_sided_ridge(gray, thread, hiding)
+    (u, v), reach = hiding.wall.centre, hiding.wall.radius - WALL_PX
+    ridge[~hiding.inside] = 0
+    inside = hiding.inside[::5, ::5]
+    noise = middle(ridge[::5, ::5][inside]) if inside.any() else 0.0
+    faintest = max(FAINTEST, 4.0 * noise)
+    fresh = (ridge > max(noise + faintest, 0.45 * thread.strength)).astype(np.uint8)
+    for line in known:
+        _clear(fresh, line, thread.beside_px)
+    found: list[Points] = []
+    walked, dish = Ridge(ridge, np.zeros_like(ridge), noise, faintest), (u, v, reach)
+    for _ in range(24):
+        seed = _seed(fresh, ridge)
+        if seed is None:
+            break
+        line = _traced(walked, seed, max(thread.strength, faintest), dish, max_length + MIN_LENGTH_PX)
+        _clear(fresh, line, thread.beside_px)
+        cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
+        for part in fresh_parts(line, known + found):
+            long = MIN_LENGTH_PX <= arc_lengths(part)[-1] <= max_length
+            if long and _is_thread(picture, gray, thread, hiding, part):
+                found.append(part)
+    return sorted(found, key=lambda line: -arc_lengths(line)[-1])
+
+
+def _seed(fresh: NDArray[np.uint8], ridge: Gray) -> tuple[float, float, float] | None:
+    """Return place and direction of the largest ridge that no walk has begun at yet: u, v, angle."""
+    outlines, _ = cv2.findContours(fresh, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    boxes = [cv2.boundingRect(outline) for outline in outlines]
+    extents = [math.hypot(width, height) for _, _, width, height in boxes]
+    if not extents or max(extents) < MIN_SEED_PX:
+        return None
+    largest = int(np.argmax(extents))
+    left, top, width, height = boxes[largest]
+    own = np.zeros((height, width), np.uint8)
+    cv2.drawContours(own, outlines, largest, 1, -1, cv2.LINE_8, offset=(-left, -top))
+    box = slice(top, top + height), slice(left, left + width)
+    own &= fresh[box]
+    v, u = np.unravel_index(int(np.argmax(np.where(own, ridge[box], 0))), own.shape)
+    at_v, at_u = np.nonzero(own)
+    near = np.hypot(at_u - u, at_v - v) < 7.0
+    spread = np.cov(np.stack([at_u[near], at_v[near]])) if near.sum() > 2 else np.eye(2)
+    along = np.linalg.eigh(spread)[1][:, 1]
+    return float(u + left), float(v + top), math.atan2(along[1], along[0])
+
+
+def _traced(
+    ridge: Ridge,
+    seed: tuple[float, float, float],
+    strength: float,
+    dish: tuple[float, float, float],
+    max_length: float,
+) -> Points:
+    """Walk from a place along a ridge to both of its ends."""
+    halves = []
+    for turn in (math.pi, 0.0):
+        path, strong = np.zeros((int(max_length) + 16, 6)), np.zeros(int(max_length) + 16, np.bool_)
+        path[0, :5] = seed[0], seed[1], seed[2] + turn, 0.0, strength
+        count = walk_on(ridge, dish, max_length, path, strong, 1)
+        halves.append(path[:count, :2].copy())
+    line = np.vstack([halves[0][::-1], halves[1][1:]])
+    return line if len(line) > 1 else np.vstack([line, line + 1e-3])
+
+
+def _clear(fresh: NDArray[np.uint8], line: Points, reach: float) -> None:
+    """Take what lies along a line out of where walks may begin."""
+    at = np.round(line * 16.0).astype(np.int32)
+    cv2.polylines(fresh, [at], False, 0, 2 * math.ceil(reach) + 1, cv2.LINE_8, 4)
+
+
+def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
+    """Return the parts of a line that run along no known one, nor along itself; they may cross them."""
+    line = respaced(line, 1.0)
+    others = np.vstack([line, *(respaced(other, 1.0) for other in known)])
+    # Within 2.5 px it shows the same thread, unless it only crosses it.
+    near = np.linalg.norm(line[:, None] - others, axis=2) < 2.5
+    near[:, : len(line)] &= np.tri(len(line), k=-int(MAX_TWICE_PX) - 1, dtype=np.bool_)  # its own from long before
+    twice = near.any(axis=1)
+    for first, last in runs(twice):
+        if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
+            twice[first:last] = False
+    return [line[first:last] for first, last in runs(~twice) if last - first > 1]
+
+
+def _is_thread(picture: Picture, gray: Gray, thread: Appearance, hiding: Hiding, line: Points) -> bool:
+    """Say whether a line looks like the thread and lies on the floor."""
+    reach = thread.beside_px
+    ground = sampled(gray, across(line, np.array([-reach, reach])))
+    floor = sampled(hiding.floor, line)[:, None]
+    if abs(float(np.median(ground / floor)) - 1.0) > 0.06:  # of the floor's brightness
+        return False
+    return looks_alike(picture, thread, line, 0.35)
+
+
+def end_direction(points: Points) -> Points:
+    """Return the unit direction in which a polyline leaves at its last point, shape (2,)."""
+    at = arc_lengths(points)
+    first = int(np.searchsorted(at, at[-1] - 8.0))
+    near = points[min(first, len(points) - 2) :]
+    if len(near) > 3:  # A parabola's tangent at its end: a bent thread turns on the way.
+        s = arc_lengths(near)
+        powers = np.vander(s - s[-1], 3)
+        direction = np.linalg.solve(powers.T @ powers, powers.T @ near)[1]
+    else:
+        direction = near[-1] - near[0]
+    return np.asarray(direction / max(float(np.hypot(*direction)), 1e-9))
+
+
+def why_it_ends(
+    picture: Picture,
+    gray: Gray,
+    thread: Appearance,
+    strand: Strand,
+    needle: MeasuredNeedle,
+    hiding: Hiding,
+) -> tuple[PieceEnd, int]:
+    """Tell why a piece ends at its last point, and the number of the area that it runs into, 0 for none."""
+    point, way = strand.points[-1], end_direction(strand.points)
+    aside = np.array([-way[1], way[0]])
+    rows, columns = gray.shape
+    for ahead in np.arange(0.0, 7.0 + 0.5):  # px
+        for beside in (0.0, -1.5, 1.5):
+            at = point + ahead * way + beside * aside
+            area = hiding.area_at(at)
+            if area > 0:
+                return PieceEnd.COVERED, area
+            if not (1.0 <= at[0] < columns - 2 and 1.0 <= at[1] < rows - 2):
+                return PieceEnd.FRAME, 0
+            if area < 0:
+                return PieceEnd.UNKNOWN, 0
+    return (PieceEnd.FREE if is_bare_beyond(picture, gray, thread, strand, needle) else PieceEnd.UNKNOWN), 0
+
+
+def is_bare_beyond(picture: Picture, gray: Gray, thread: Appearance, strand: Strand, needle: MeasuredNeedle) -> bool:
+    """Say whether there is nothing but floor beyond a piece's last point, like that beside it, where it is strong."""
+    if len(strand.points) < BESIDE_POINTS:
+        return False
+    usual = float(np.median(strand.strength[-BESIDE_POINTS:]))
+    if usual < max(2.0 * FAINTEST, 4.0 * thread.noise):
+        return False
+    point, way = strand.points[-1], end_direction(strand.points)
+    angle = math.atan2(way[1], way[0])
+    turns = np.linspace(-AHEAD, AHEAD, 9)
+    reach = np.array(AHEAD_PX)
+    ahead = point + reach[:, None, None] * np.stack([np.cos(angle + turns), np.sin(angle + turns)], axis=-1)[None]
+    rows, columns = gray.shape
+    if ahead.min() < 2.0 or (ahead > np.array([columns, rows]) - 3.0).any():
+        return False
+    if below_needle(needle, ahead.reshape(-1, 2)).any():
+        return False
+    aside = thread.beside_px + np.array([0.5, 1.5, 2.5])
+    last = strand.points[-BESIDE_POINTS - 1 :]  # with one more, for the direction at the first
+    beside = across(last, np.concatenate([-aside, aside]))[-BESIDE_POINTS:]
+    floor, beyond = float(np.median(sampled(gray, beside))), sampled(gray, ahead)
+    if floor - float(beyond[1:].min()) > max(0.5 * usual, FAINTEST + 3.0 * thread.noise):  # It goes on.
+        return False
+    light = np.vstack([np.median(np.atleast_3d(sampled(picture.image, at)), axis=1) for at in (beside, ahead)])
+    light /= np.maximum(np.median(light[: len(beside)], axis=0), 1.0)
+    mean = light.mean(axis=1)
+    step = np.abs(OFF_LINE @ mean).max()
+    even = step < 0.025 and np.abs(mean - 1.0).max() < 0.06
+    return bool(even and np.ptp(light[-3:].mean(axis=0)) < BARE_COLOUR)

@@ -1,7 +1,7 @@
 """The walk along a dark ridge, in compiled code.
 
 A walk leaves the needle's tail along the best of many arcs, and goes on by steps, each along the best of many arcs that
-look some steps ahead. Where it sees much less of the thread than there is, it tries other ways at its forks.
+look some steps ahead. Of the ways out that look like a thread the one is taken along which the walk shows most of it.
 """
 
 from __future__ import annotations
@@ -13,17 +13,14 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.images import shrunk
-from magnetosuture_thread.vision.sampling import middle, sample
+from magnetosuture_thread.vision.images import Gray, middle, sample, shrunk
 
 STEP_PX = 2.0  # of the walk
-AHEAD, NEAR_STEPS, FAR_WEIGHT = 9, 5, 0.6  # steps looked ahead; those that count in full; weight of the others
+AHEAD = 9  # steps looked ahead, of which five count in full
 BENDS, SHARPEST = 31, 0.21  # curvatures tried at each step, up to this [1/px]
-WEAK, STRONGEST = 0.3, 1.25  # of the usual strength: below, there is no thread; above, it counts no more
+STRONGEST = 1.25  # of the usual strength; above, it counts no more
 ACROSS, ASIDE_PX = 9, 0.5  # samples across a ridge, and the distance between them
-GAP_PX = 13.0  # the walk goes on over a gap of this length
 WAYS_AHEAD = 8  # steps of an arc out of the tail, of which at least five must show the thread
-MIN_GAIN_PX = 8.0  # that another way must show more of the thread
 
 
 class Ridge(NamedTuple):
@@ -31,8 +28,7 @@ class Ridge(NamedTuple):
 
     Attributes:
         strength: shape (rows, columns), uint8 [grey levels].
-        hidden: where nothing can be seen, not 0 there, `factor` times smaller, uint8.
-        factor: see `hidden`.
+        hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
         noise: strength where nothing is.
         faintest: a strength above noise that is no noise.
         scale: how much smaller the ridge is than the picture.
@@ -40,48 +36,41 @@ class Ridge(NamedTuple):
 
     strength: np.ndarray
     hidden: np.ndarray
-    factor: int
     noise: float
     faintest: float
     scale: int = 1
 
 
-def black_hat(
-    window: np.ndarray, hidden: np.ndarray, factor: int, scale: int, smooth: np.ndarray | None = None
-) -> Ridge:
-    """Return how much darker a window is than the brightest background within a few pixels.
+def black_hat(gray: Gray, hidden: Gray, scale: int) -> Ridge:
+    """Return how much darker an image is than the brightest background within a few pixels.
 
     An edge has no black-hat, so that shadows, covers and the rim are no thread.
 
     Args:
-        window: shape (rows, columns), uint8.
-        hidden: see `Ridge`.
-        factor: see `Ridge`.
-        scale: by which the window is shrunk first.
-        smooth: the window smoothed, if it is known and not shrunk.
+        gray: shape (rows, columns), uint8.
+        hidden: where nothing can be seen, not 0 there, of any size, uint8.
+        scale: by which the image is shrunk first.
     """
-    window = shrunk(window, scale)
-    if scale > 1:
-        hidden, factor = cv2.resize(hidden, window.shape[::-1], interpolation=cv2.INTER_NEAREST), 1
-    if smooth is None or scale > 1:
-        smooth = cv2.GaussianBlur(window, (5, 5), 0.7)  # as wide as the thinnest thread looks
-    strength = cv2.morphologyEx(smooth, cv2.MORPH_BLACKHAT, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    small = shrunk(gray, scale)
+    hidden = cv2.resize(hidden, small.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    strength = cv2.morphologyEx(smoothed(small), cv2.MORPH_BLACKHAT, kernel)
     noise = middle(strength[::5, ::5])
-    return Ridge(strength, hidden, factor, noise, max(3.0, 3.0 * noise), scale)
+    return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise), scale)
+
+
+def smoothed(gray: Gray) -> Gray:
+    """Return an image smoothed as wide as the thinnest thread looks."""
+    return np.asarray(cv2.GaussianBlur(gray, (5, 5), 0.7))
 
 
 @compiled
 def is_hidden(ridge, u, v):
     """Say whether a point of a ridge is hidden."""
-    hidden, scale = (
-        ridge.hidden,
-        1.0 / ridge.factor,
-    )  # Dividing whole numbers for each point would take longer than all else.
-    x, y = (u + 0.5) * scale, (v + 0.5) * scale
-    c, r = int(x), int(y)
-    if x < 0.0 or y < 0.0 or c >= hidden.shape[1] or r >= hidden.shape[0]:
+    c, r = int(u + 0.5), int(v + 0.5)
+    if c < 0 or r < 0 or c >= ridge.hidden.shape[1] or r >= ridge.hidden.shape[0]:
         return False
-    return hidden[r, c] != 0
+    return ridge.hidden[r, c] != 0
 
 
 @compiled
@@ -104,34 +93,22 @@ def arc_scores(ridge, usual, bend_cost, state, bends, scores):
             value = min((sample(strength, x, y) - noise) / usual, STRONGEST)
             if value < 0.45 and is_hidden(ridge, x, y):
                 value = 0.45  # as a hidden pixel counts
-            share = 1.0 if step < NEAR_STEPS else FAR_WEIGHT
+            share = 1.0 if step < 5 else 0.6
             score += share * value
             weight += share
         scores[index] = score / weight - bend_cost * abs(tried - bend) - 0.15 * abs(tried)
 
 
 @compiled
-def best_arcs(ridge, usual, state, bends, scores):
-    """Return the curvature of the arc ahead that follows the ridge best, and of another, with its score.
-
-    The other's score is -1 if there is none: it must be the best of its neighbours, apart from the first, and
-    lie on a ridge by itself.
-    """
+def best_arc(ridge, usual, state, bends, scores):
+    """Return the curvature of the arc ahead that follows the ridge best."""
     bend = state[3]
     bend_cost = 1.1 * (1.0 + 2.0 * (ridge.faintest / usual) ** 2)  # for 1 / px; higher where the thread is faint
     for index in range(BENDS):
         part = 2.0 * index / (BENDS - 1) - 1.0  # closer together near the present one
         bends[index] = min(SHARPEST, max(-SHARPEST, bend + 1.6 * SHARPEST * part * abs(part)))
     arc_scores(ridge, usual, bend_cost, state, bends, scores)
-    first = scores.argmax()
-    second, score = first, -1.0
-    for index in range(1, BENDS - 1):
-        apart = abs(bends[index] - bends[first])
-        if apart > 0.05 and scores[index] > scores[index - 1] and scores[index] >= scores[index + 1]:
-            plain = scores[index] + bend_cost * abs(bends[index] - bend)
-            if plain > max(score, 0.75):  # of the usual strength, at least, along the other way
-                second, score = index, plain
-    return bends[first], bends[second], score
+    return bends[scores.argmax()]
 
 
 @compiled
@@ -154,7 +131,7 @@ def centred(ridge, u, v, angle, max_shift):
 
 
 @compiled
-def walk_on(ridge, dish, max_length, path, strong, count, bend_first, forks):
+def walk_on(ridge, dish, max_length, path, strong, count):
     """Walk along a ridge from a path's last vertex to the ridge's end.
 
     Args:
@@ -164,37 +141,26 @@ def walk_on(ridge, dish, max_length, path, strong, count, bend_first, forks):
         path: u, v, angle, bend, usual strength and length at each vertex, shape (most, 6); filled in.
         strong: whether the thread is visible at each, shape (most,); filled in.
         count: vertices that there are.
-        bend_first: curvature to begin with [1/px]; beyond 1 the best.
-        forks: filled with where there was another way: index, curvature, score; shape (most forks, 3).
 
     Returns:
-        The number of vertices, and of forks.
+        The number of vertices.
     """
     faintest = ridge.faintest
     u, v, angle, bend, usual, length = path[count - 1]
     bends, scores = np.empty(BENDS), np.empty(BENDS)
-    gap, last, fork_count, forced = 0.0, count, 0, 0
-    if bend_first < 1.0:
-        forced = 4  # steps that a walk is held to the other way
-    while length < max_length and gap < GAP_PX and count < len(path):
-        if forced > 0:
-            bend_ahead, forced = bend_first, forced - 1
-        else:
-            bend_ahead, other, score = best_arcs(ridge, usual, (u, v, angle, bend), bends, scores)
-            if score > 0.0 and fork_count < len(forks):
-                forks[fork_count, 0], forks[fork_count, 1], forks[fork_count, 2] = count, other, score
-                fork_count += 1
+    gap, last = 0.0, count
+    while length < max_length and gap < 13.0 and count < len(path):  # px; a gap is crossed
+        bend_ahead = best_arc(ridge, usual, (u, v, angle, bend), bends, scores)
         if gap > 0.0:
             bend_ahead = 0.5 * (bend_ahead + bend)
         halfway = angle + 0.5 * bend_ahead * STEP_PX
         x, y = u + STEP_PX * math.cos(halfway), v + STEP_PX * math.sin(halfway)
         turned = angle + bend_ahead * STEP_PX
         shift, strength = centred(ridge, x, y, turned, 0.7)
-        seen = strength > max(WEAK * usual, faintest)
+        seen = strength > max(0.3 * usual, faintest)  # of the usual strength
         if seen:
-            if forced == 0:
-                x, y = x - shift * math.sin(turned), y + shift * math.cos(turned)
-                turned += 0.25 * shift / STEP_PX
+            x, y = x - shift * math.sin(turned), y + shift * math.cos(turned)
+            turned += 0.25 * shift / STEP_PX
             usual = max(faintest, 0.95 * usual + 0.05 * min(strength, STRONGEST * usual))
             gap = 0.0
         else:
@@ -211,7 +177,7 @@ def walk_on(ridge, dish, max_length, path, strong, count, bend_first, forks):
         count += 1
         if seen:
             last = count
-    return last, fork_count
+    return last
 
 
 @compiled
@@ -419,54 +385,11 @@ def follow(ridge, start, dish, max_length, max_hidden, simple, path, strong):
     other, other_strong = np.empty_like(path), np.empty_like(strong)
     for index in range(found):
         count = begin_path(ridge, start, ways[index], other, other_strong)
-        count, value = _follow_forks(ridge, dish, max_length, other, other_strong, count, enough)
-        if value > 1.25 * best_value + (MIN_GAIN_PX if index > 0 else 0.0):  # The first begins strongest.
+        count = walk_on(ridge, dish, max_length, other, other_strong, count)
+        value = worth(other, other_strong, count)
+        if value > 1.25 * best_value + (8.0 if index > 0 else 0.0):  # px; the first begins strongest
             best, best_value = count, value
             path[:count], strong[:count] = other[:count], other_strong[:count]
         if best_value > enough:
             break
     return best, best_value
-
-
-@compiled
-def _follow_forks(ridge, dish, max_length, path, strong, begun, enough):
-    """Walk on from a path's last vertex; where much less of the thread is visible than there is, try forks.
-
-    Returns:
-        The number of vertices, and their worth.
-    """
-    forks = np.empty((200, 3))
-    count, fork_count = walk_on(ridge, dish, max_length, path, strong, begun, 9.0, forks)
-    value = worth(path, strong, count)
-    if value > enough or fork_count == 0:
-        return count, value
-    other, other_strong, other_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
-    best, best_strong, best_forks = np.empty_like(path), np.empty_like(strong), np.empty_like(forks)
-    for _ in range(4):
-        best_value, best_count, best_fork_count = value + MIN_GAIN_PX, 0, 0
-        for index in range(fork_count):
-            at = int(forks[index, 0])
-            if at >= count or at < begun:
-                continue
-            # Of forks in a row, towards one and the same other way, the best only.
-            poorer = False
-            for near in range(max(0, index - 2), min(fork_count, index + 3)):
-                if abs(forks[near, 0] - at) < 2.5 and forks[near, 2] > forks[index, 2]:
-                    poorer = True
-            if poorer:
-                continue
-            other[:at], other_strong[:at] = path[:at], strong[:at]
-            bend = forks[index, 1]
-            reached, found = walk_on(ridge, dish, max_length, other, other_strong, at, bend, other_forks)
-            tried = worth(other, other_strong, reached)
-            if tried > best_value:
-                best_value, best_count, best_fork_count = tried, reached, found
-                best[:reached], best_strong[:reached] = other[:reached], other_strong[:reached]
-                best_forks[:found] = other_forks[:found]
-        if best_count == 0:
-            break
-        value, count, fork_count = best_value, best_count, best_fork_count
-        path[:count], strong[:count], forks[:fork_count] = best[:count], best_strong[:count], best_forks[:fork_count]
-        if value > enough:
-            break
-    return count, value

@@ -10,7 +10,7 @@ import shapely
 
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
-from magnetosuture_thread.thread.formulations import ThreadState
+from magnetosuture_thread.thread.step import ThreadState
 from test.thread.scenes import DT, east, formulated, lead, silk
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))

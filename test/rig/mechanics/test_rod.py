@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, polygon_gap, segment_contacts
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle
@@ -119,6 +120,17 @@ def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
         check_derivatives(contact_term(Surface(polygons=(wedge,)).packed()), q)
 
 
+@compiled
+def gap_to(x: float, y: float, shapes: Shapes) -> tuple[float, float, float, float]:
+    return polygon_gap(x, y, shapes, 0)  # which is for compiled code alone, as the next
+
+
+@compiled
+def contacts_of(q: Vector, shapes: Shapes, rows: Vector) -> int:
+    length = math.sqrt((q[3] - q[1]) ** 2 + (q[4] - q[2]) ** 2)
+    return segment_contacts(q, 1, length, 3e-5, shapes, rows)
+
+
 def test_the_distance_from_a_polygon():
     shapes = Surface(polygons=(L_SHAPE[::-1],)).packed()
     cases = [
@@ -129,11 +141,11 @@ def test_the_distance_from_a_polygon():
         ((0.9e-3, 0.8e-3), -math.hypot(0.1e-3, 0.2e-3), (0.1 / math.hypot(0.1, 0.2), 0.2 / math.hypot(0.1, 0.2)), None),
     ]
     for point, gap, normal, curvature in cases:
-        found = polygon_gap(*point, shapes, 0)
+        found = gap_to(*point, shapes)
         assert found[0] == pytest.approx(gap, rel=1e-12)
         assert found[1:3] == pytest.approx(normal, abs=1e-12)
         assert found[3] == pytest.approx(1.0 / gap if curvature is None else curvature, abs=1e-9)
-    assert polygon_gap(2e-3, 0.0, shapes, 0)[:3] == pytest.approx((0.0, 0.0, -1.0))
+    assert gap_to(2e-3, 0.0, shapes)[:3] == pytest.approx((0.0, 0.0, -1.0))
     np.testing.assert_array_equal(np.flatnonzero(shapes.convex == 0.0), [np.argmin(abs(shapes.corners - 1e-3).sum(1))])
 
 
@@ -141,7 +153,7 @@ def test_a_segment_touches_only_corners_that_stick_out():
     shapes, rows = Surface(polygons=(L_SHAPE,)).packed(), np.zeros((9, 6))
 
     def contacts(*ends: float) -> int:
-        return segment_contacts(np.array([0.0, *ends]), 1, math.dist(ends[:2], ends[2:]), 3e-5, shapes, rows)
+        return contacts_of(np.array([0.0, *ends]), shapes, rows)
 
     # Across the corner at (4, 1) mm, at 45 degrees, 10 um off; and the same beside the reflex corner (1, 1) mm.
     for gap in (1e-5, -1e-5):

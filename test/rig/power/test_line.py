@@ -7,13 +7,11 @@ import select
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.power.board import RoboClawBoard, checksum
-from magnetosuture_thread.rig.power.stage import Line, PowerStage
+from magnetosuture_thread.rig.power import Line, PowerStage, RoboClawBoard, checksum
 
 QUESTION = bytes((128, 24))
 ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")
@@ -45,33 +43,6 @@ def ask(path: Path, enough: int, patience: float = 10.0, question: bytes = QUEST
 def test_a_board_answers_at_the_path(line):
     for _ in range(3):  # nobody has it open in between
         assert ask(line.path, 4) == ANSWER
-
-
-@pytest.mark.parametrize("fault", [{"deaf": True}, {"silent": True}, {"mute": frozenset({128})}])
-def test_there_may_be_no_answer(line, fault: dict[str, Any]):
-    vars(line.faults).update(fault)
-    assert ask(line.path, 1, 0.1) == b""
-    assert (line.boards[0].heard > 0.0) is ("silent" in fault)
-
-
-@pytest.mark.parametrize("fault", ["garbage", "wrong_checksum"])
-def test_an_answer_may_be_wrong(line, fault: str):
-    setattr(line.faults, fault, True)
-    assert ask(line.path, 4)[:4] not in (b"", ANSWER)
-
-
-def test_an_answer_may_be_late(line):
-    line.faults.lateness = 0.2
-    began = time.monotonic()
-    assert ask(line.path, 4) == ANSWER
-    assert time.monotonic() - began >= 0.2
-
-
-def test_bytes_may_get_lost_on_either_way(line):
-    line.faults.lose_out = 3
-    assert ask(line.path, 3) == ANSWER[:2] + ANSWER[3:]
-    line.faults.lose_out, line.faults.lose_in = 0, 2
-    assert ask(line.path, 1, 0.1) == b""
 
 
 def test_a_line_that_is_taken_away_hangs_up_and_can_come_back(line):

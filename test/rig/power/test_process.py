@@ -13,13 +13,14 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.rig.power.board import ACKNOWLEDGED, SET_DUTIES, checksum
-from magnetosuture_thread.rig.power.stage import StageProcess
+from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, StageProcess, checksum
 
-HALF_AND_BACK = bytes((129, SET_DUTIES, 0x40, 0x00, 0xE0, 0x00))  # of the supply: a half, and a quarter reversed
+HALF_AND_BACK = bytes(
+    (129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00)
+)  # of the supply: a half, and a quarter reversed
 RIG = """
 import sys, time
-from magnetosuture_thread.rig.power.stage import StageProcess
+from magnetosuture_thread.rig.power import StageProcess
 StageProcess([sys.argv[1]], 24.0, 1.0, 0.01).open()
 print("open", flush=True)
 time.sleep(60.0)

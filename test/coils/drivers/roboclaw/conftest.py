@@ -14,8 +14,7 @@ import pytest
 
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.rig.power.board import RoboClawBoard
-from magnetosuture_thread.rig.power.stage import PowerStage
+from magnetosuture_thread.rig.power import PowerStage, RoboClawBoard
 
 
 class Bench:

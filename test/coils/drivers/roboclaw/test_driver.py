@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import signal
 import struct
@@ -12,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,11 @@ import pytest
 
 from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
-from magnetosuture_thread.coils.drivers.roboclaw import driver as driver_module
-from magnetosuture_thread.coils.drivers.roboclaw.board import DeviceError
-from magnetosuture_thread.coils.drivers.roboclaw.driver import LineThread, Mailbox
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
-from magnetosuture_thread.rig.power import board as packets
-from magnetosuture_thread.rig.power.board import RoboClawBoard
+from magnetosuture_thread.rig import power as packets
+from magnetosuture_thread.rig.power import RoboClawBoard
 
 CURRENTS = (3.0, -6.0, 1.5, 0.0)
 DUTIES = [(4095, -8191), (2047, 0)]
@@ -188,15 +183,6 @@ def test_errors_of_a_board_are_losses_in_the_makers_words(bench, bits: int, word
         bench.wait(lambda: bench.duties(0) == DUTIES[0], "the duties again")
 
 
-def test_warnings_of_a_board_are_said_and_it_goes_on(bench):
-    driver = bench.open()
-    bench.boards[1].warnings = 0x0010
-    bench.wait(lambda: bool(driver.state().warnings), "the warning")
-    assert driver.state().warnings[0].endswith("address 129): Temperature Warning")
-    assert "board 1" in driver.state().warnings[0]
-    bench.wait(lambda: driver.state().ready, "the driver to be ready")
-
-
 def test_too_much_current_is_a_loss(bench):
     driver = bench.open()
     bench.boards[0].mismeasured = 11.9
@@ -211,20 +197,12 @@ def test_too_much_current_is_a_loss(bench):
     bench.wait(lambda: driver.state().ready, "the driver to be back")
 
 
-def test_whatever_happens_in_its_thread_it_comes_back(bench, monkeypatch):
-    driver = bench.open()
-    with monkeypatch.context() as patch:
-        patch.setattr(driver._lines[0], "_report", lambda: 1 / 0)
-        bench.wait(lambda: "ZeroDivisionError" in driver.state().problem, "the failure")
-    bench.wait(lambda: driver.state().ready, "the driver to be back")
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (packets.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
-        (packets.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
-        (packets.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.Command.SET_TIMEOUT, "serial timeout in tenths of a second 0 instead of 2"),
+        (packets.Command.SET_LIMIT_1, "current limit in 10 mA 3000 instead of 1000"),
+        (packets.Command.SET_LIMIT_2, "current limit in 10 mA 3000 instead of 1000"),
     ],
 )
 def test_a_board_that_does_not_take_its_limits_is_never_ready(bench, command: int, words: str):
@@ -239,7 +217,7 @@ def test_a_board_that_does_not_take_its_limits_is_never_ready(bench, command: in
 
 def test_a_board_that_acknowledges_duties_and_does_not_take_them_is_found(bench):
     driver = bench.open()
-    bench.boards[0].ignored.add(packets.SET_DUTIES)
+    bench.boards[0].ignored.add(packets.Command.SET_DUTIES)
     with bench.held(driver, *CURRENTS):
         bench.wait(lambda: "has duties (0, 0) instead of (4095, -8191)" in driver.state().problem, "the problem")
         bench.wait(lambda: bench.duties(1) == (0, 0), "zero")
@@ -262,7 +240,7 @@ def tapped(board: RoboClawBoard, then: Callable[[bytes], bytes]) -> list[tuple[i
 
     def hear(data: bytes, now: float) -> bytes:
         answer = receive(data, now)
-        if data[:2] != bytes((board.address, packets.SET_DUTIES)):
+        if data[:2] != bytes((board.address, packets.Command.SET_DUTIES)):
             return answer
         driven = any(any(pair) for pair in heard)
         heard.append(struct.unpack(">hh", data[2:6]))
@@ -325,31 +303,12 @@ def test_nothing_waits_for_a_board(bench):
     assert longest < 1.0  # of 200 calls, each of which would have waited
 
 
-def test_a_dead_board_floods_no_log(bench, caplog):
-    with caplog.at_level(logging.WARNING):
-        driver = bench.open()
-        bench.stage.lines[0].faults.deaf = True
-        bench.wait(lambda: not driver.state().ready, "the loss")
-        driver.close()
-    assert caplog.records == []
-
-
 def test_what_is_no_current_is_refused(bench):
     driver = bench.open()
     for currents in (np.zeros(3), np.array([math.nan, 0.0, 0.0, 0.0]), np.full(4, math.inf)):
         with pytest.raises(ValueError, match="4 finite currents"):
             driver.apply(currents, time.monotonic())
     assert driver.state().ready
-
-
-def test_a_port_that_is_not_there_is_waited_for(bench):
-    driver = RoboClawDriver(bench.settings())
-    bench.drivers.append(driver)
-    driver.open()
-    bench.wait(lambda: f"there is no {bench.stage.lines[0].path}" in driver.state().problem, "the problem")
-    bench.stage.open()
-    bench.wait(lambda: driver.state().ready, "the driver to be ready")
-    assert driver.state().losses == 0
 
 
 @pytest.mark.parametrize(
@@ -423,99 +382,3 @@ def test_boards_that_are_exchanged_when_they_are_plugged_again_are_never_ready(b
         assert not driver.state().ready
     assert [board.heard for board in bench.boards] == heard
     assert not any(board.timeline for board in bench.boards)
-
-
-@pytest.mark.parametrize("stable", [True, False])
-def test_boards_that_answer_to_any_address_need_paths_that_stay(bench, stable: bool):
-    """As all do over USB, where the board's address is not looked at."""
-
-    def usb(board: RoboClawBoard) -> Callable[[bytes, float], bytes]:
-        def receive(data: bytes, now: float) -> bytes:
-            board.address = data[0]
-            return RoboClawBoard.receive(board, data, now)
-
-        return receive
-
-    for board in bench.boards:
-        vars(board)["receive"] = usb(board)
-    bench.stage.open()
-    ports = [str(line.path if stable else line.path.resolve()) for line in bench.stage.lines]
-    driver = bench.open(ready=stable, roboclaw_ports=ports, **PATIENT)
-    if not stable:
-        bench.wait(lambda: "address 128): answers to address 129 too" in driver.state().problem, "the refusal")
-        tried = failures(driver)
-        bench.wait(lambda: min(tried.count(0), tried.count(1)) >= 3, "three attempts at each")
-        assert not driver.state().ready
-
-
-def test_a_supply_that_breaks_down_is_a_loss(bench):
-    driver = bench.open()
-    bench.boards[0].supply = 3.0
-    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
-
-
-def test_closing_waits_for_no_line_longer_than_it_promises(bench, monkeypatch):
-    now, calls = 100.0, []
-
-    class Endless:
-        def stop(self) -> None:
-            calls.append("stop")
-
-        def join(self, timeout: float) -> None:
-            nonlocal now
-            now += timeout
-            calls.append("join")
-
-    driver = RoboClawDriver(bench.settings())
-    vars(driver)["_lines"] = [Endless(), Endless()]
-    monkeypatch.setattr(driver_module, "time", SimpleNamespace(monotonic=lambda: now))
-    driver.close()
-    assert now - 100.0 == pytest.approx(0.3)
-    assert calls == ["stop", "stop", "join", "join"]
-
-
-class Stub:
-    """A board that does not hear the first requests for zero, and a port."""
-
-    def __init__(self, deaf: float = 0) -> None:
-        self.requests = 0
-        self.closed = False
-        self._deaf = deaf
-
-    def write_zero(self) -> None:
-        """Take a request for zero."""
-        self.requests += 1
-        if self.requests <= self._deaf:
-            raise DeviceError("nothing came")
-
-    def reset_output_buffer(self) -> None:
-        """Do nothing."""
-        raise OSError("gone")
-
-    def close(self) -> None:
-        """Keep that it was closed."""
-        self.closed = True
-
-
-def left(*boards: Stub) -> LineThread:
-    """Return a line that has left its boards."""
-    line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, ["connecting"], 0.1))
-    port = Stub()
-    vars(line)["_boards"] = dict(enumerate(boards))
-    assert not line._no_retry()
-    vars(LineThread)["_leave"](line, port)
-    assert port.closed
-    return line
-
-
-def test_a_board_that_did_not_hear_is_asked_for_zero_again():
-    boards = Stub(), Stub(deaf=2), Stub()
-    line = left(*boards)
-    assert [board.requests for board in boards] == [1, 3, 1]
-    assert line._no_retry()  # each request only once, as there are few milliseconds
-
-
-def test_a_board_that_never_hears_keeps_nobody():
-    boards = Stub(deaf=float("inf")), Stub()
-    left(*boards)
-    assert boards[1].requests == 1

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.coils.drivers.roboclaw import board
+from magnetosuture_thread.coils.drivers import roboclaw as board
 
 CURRENTS = np.array([3.0, -6.0, 1.5, 2.0])
 

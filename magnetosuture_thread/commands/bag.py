@@ -1,0 +1,161 @@
+"""The command `magnetosuture bag`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import pluralize
+from magnetosuture_thread.commands.command import (
+    DONE,
+    FAILED,
+    Terminal,
+    add_actions,
+    add_remap,
+    output_file,
+    write_json,
+)
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.texts import one_line
+
+MAX_PLACES = 100  # of damage that are shown; `--json` writes all
+
+DESCRIPTION = """\
+Check a recorded bag, or repair it.
+
+BAG is an mcap or sqlite3 file of any recorder, or the folder of a bag.
+"""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    check, repair = add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, repair=run_repair)
+    for action in (check, repair):
+        action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
+        add_remap(action)
+    check.add_argument("--frame", default="dish", metavar="NAME", help="the bag's name of the dish frame")
+    check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
+
+
+def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Report what a bag holds, and whether it is intact.
+
+    The whole bag is read: every checksum, and every message's time and stamp. For each topic: its type, how
+    many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
+    went back; the types follow. What is damaged is reported, with what is lost; all else is shown as it can be read.
+    """
+    with terminal.progress("bag check") as advance:
+        bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
+        found = inspect_bag(bag, options.frame, lambda share: advance(0.5 + 0.5 * share))
+    terminal.print(_table(found))
+    for line in _lines(found):
+        terminal.log(line)
+    write_json(options.json, found)
+    return FAILED if found["damage"] or found["refused"] or found["unverified"] else DONE
+
+
+def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Write every intact message of a bag into a new one.
+
+    Messages, their times and numbers, definitions, attachments, metadata records and notes stay as they are; chunks,
+    indices and metadata.yaml are made anew. The command reports how many messages there are and what is lost or
+    changed, where and when.
+
+    A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others.
+    """
+    with terminal.progress("bag repair") as advance:
+        bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
+        with whole_folder(options.output) as folder:
+            name = options.output.name
+            report = write_repaired_bag(bag, folder, name, lambda share: advance(0.5 + 0.5 * share))
+    places = bag.damage.regions if bag.damage is not None else ()
+    doubts = [str(bag.damage or ""), f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks]
+    lines = [line for line in doubts if line]
+    if report.is_same and not lines:
+        kept = "messages, definitions, attachments, metadata records and notes"
+        lines.append(f"is not damaged: the new bag holds the same {kept}")
+    lines += [f"{reason}: {pluralize(lost, 'message')} lost" for reason, lost in report.refused.items()]
+    lines += [f"not kept: {lost} of this: {reason}" for reason, lost in report.dropped.items()]
+    if report.unpacked:
+        lines.append(f"{pluralize(report.unpacked, 'message')} packed by the recorder, and unpacked in the new bag")
+    if report.defined:
+        lines.append(f"without a definition, now with ours: {', '.join(sorted(set(report.defined)))}")
+    if report.rewritten:
+        topics = ", ".join(one_line(topic) for topic in sorted(set(report.rewritten)))
+        lines.append(f"quality of service written by name, as Jazzy reads it: {topics}")
+    lines += _shown([f"{place}{_times(place.first, place.last, bag.start)}" for place in places])
+    for line in (*lines, f"{report.messages} messages in {options.output}"):
+        terminal.log(line)
+    return DONE
+
+
+def _times(first: int | None, last: int | None, start: int) -> str:
+    """Return between which times messages are missing, if any are."""
+    if first is None and last is None:
+        return ""
+    begin = "the beginning" if first is None else f"{(first - start) * 1e-9:.3f} s"
+    end = "the end" if last is None else f"{(last - start) * 1e-9:.3f} s"
+    return f"; messages between {begin} and {end}"
+
+
+def _shown(places: list[str]) -> list[str]:
+    """Return a line for each damaged place, and how many are not shown."""
+    others = len(places) - MAX_PLACES
+    return [f"  {place}" for place in places[:MAX_PLACES]] + ([f"  and {others} other places"] if others > 0 else [])
+
+
+def _table(found: dict[str, Any]) -> Table:
+    """Return a row for each topic."""
+    table = Table(title=f"{found['messages']} messages in {found['duration_s']:.3f} s", box=SIMPLE_HEAD, padding=0)
+    table.caption = "times in s since the first message; * is taken by our graph"
+    table.add_column("topic", overflow="fold")
+    for name in ("messages", "Hz", "first", "last", "gap", "back"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for topic in found["topics"]:
+        times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
+        name, messages = one_line(topic["topic"]) + (" *" if topic["known"] else ""), str(topic["messages"])
+        cells = ("-" if value is None else f"{value:.2f}" for value in times)
+        table.add_row(Text(name), messages, *cells, str(topic["stamps_going_back"]))
+    return table
+
+
+def _lines(found: dict[str, Any]) -> Iterator[str]:
+    """Return in words what the table does not say."""
+    for topic in found["topics"]:
+        types = " and ".join(kind.replace("/msg/", "/") for kind in topic["types"])
+        yield f"{one_line(topic['topic'])}: {one_line(types) or 'no type'}"
+    for topic in found["topics"]:
+        name = one_line(topic["topic"])
+        if len(topic["types"]) > 1:
+            yield f"{name} has two types"
+        elif topic["problem"]:
+            yield topic["problem"]
+        if topic["stamps_going_back"]:
+            yield f"{name}: {topic['stamps_going_back']} stamps are before the one before them"
+        if topic["unreadable_stamps"]:
+            yield f"{name}: {topic['unreadable_stamps']} stamps cannot be read"
+    for file in found["files"]:
+        yield "; ".join(f"{key} {value}" for key, value in file.items())
+    for key, value in found["notes"].items():
+        yield f"{key}: {shorten(value, 200, placeholder=' ...')}"
+    yield from found["remarks"]
+    if found["unverified"] or found["unchecked"]:
+        yield f"unverified: {found['unverified']}" if found["unverified"] else found["unchecked"]
+    for reason, count in found["refused"].items():
+        yield f"{reason}: {pluralize(count, 'message')} lost"
+    if found["damage"] is not None:
+        yield found["damage"]["text"]
+        byte = "{file}, bytes {start_byte} to {end_byte}: {what}"
+        yield from _shown([byte.format(**place) for place in found["damage"]["places"]])
+    elif not (found["refused"] or found["unchecked"] or found["unverified"]):
+        yield "nothing is damaged"

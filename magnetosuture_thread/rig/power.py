@@ -1,0 +1,601 @@
+"""The rig's power stage: simulated RoboClaw boards, behind pseudo-terminals, in a process of their own.
+
+Nothing here knows the maker's library. Real boards answer while the computer is busy. In the process of the rig's node
+they could not: rclpy holds the interpreter while DDS publishes, for up to 0.3 s, where a process that reads the message
+lost the processor. A driver takes such a board for dead.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import select
+import struct
+import subprocess
+import sys
+import threading
+import time
+import tty
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.errors import ConfigurationError, GraphError
+
+ACKNOWLEDGED = b"\xff"
+ADDRESSES = range(0x80, 0x88)
+
+
+class Command(IntEnum):
+    """The commands that a board knows."""
+
+    SET_TIMEOUT = 14
+    GET_TIMEOUT = 15
+    GET_VERSION = 21
+    GET_MAIN_VOLTAGE = 24
+    GET_LOGIC_VOLTAGE = 25
+    SET_DUTY_1 = 32
+    SET_DUTY_2 = 33
+    SET_DUTIES = 34
+    GET_DUTIES = 48
+    GET_CURRENTS = 49
+    GET_TEMPERATURE = 82
+    GET_STATUS = 90
+    GET_VOLTAGES = 100
+    SET_LIMIT_1 = 133
+    SET_LIMIT_2 = 134
+    GET_LIMIT_1 = 135
+    GET_LIMIT_2 = 136
+    RESET_STOP = 200
+
+
+# What each command that changes something carries, between command and checksum.
+ARGUMENTS: dict[int, str] = {
+    Command.SET_TIMEOUT: ">B",
+    Command.SET_DUTY_1: ">h",
+    Command.SET_DUTY_2: ">h",
+    Command.SET_DUTIES: ">hh",
+    Command.SET_LIMIT_1: ">II",
+    Command.SET_LIMIT_2: ">II",
+    Command.RESET_STOP: ">",
+}
+# Those that only ask come without a checksum.
+QUESTIONS: frozenset[int] = frozenset(command for command in Command if command.name.startswith("GET"))
+
+FULL = 32767  # duty of the whole supply voltage
+FACTORY_LIMIT = 3000  # in units of 10 mA
+FACTORY_TIMEOUT = 0  # none
+EMERGENCY_STOP = 0x0001
+
+
+class RoboClawBoard:
+    """What a board does with the packets for it, and what its coils do with the duties. Time comes in [s].
+
+    A coil's current follows L di/dt = d U - R i, with the duty d from -1 to 1, the supply's voltage U, and
+    resistance R and inductance L of the coil; the board takes back the duty of a coil at its current limit.
+    Without a packet for longer than its serial timeout, it sets both duties to zero.
+
+    Source: Basicmicro, "RoboClaw Series User Manual", packet serial. Deviation: the sign of a current that it
+    reports is not documented; here it is positive while the board drives it and negative while it flows back.
+
+    Args:
+        address: on its line, 0x80 to 0x87.
+        supply: [V]
+        resistance: of each coil [ohm].
+        inductance: of each coil [H].
+
+    Attributes:
+        duties: in force, from -32767 to 32767.
+        currents: in the two coils [A].
+        timeout: of the serial line, in tenths of a second; 0 is none.
+        limits: of the currents, in units of 10 mA.
+        errors: bits that stop it, as in its status.
+        warnings: bits that do not.
+        ignored: commands that it acknowledges and does not obey.
+        mismeasured: what it adds to the currents it reports [A].
+        broken: channels, 0 or 1, whose coil has a broken wire and so no current.
+        timeline: when the duties changed, and to what.
+        heard: when the last packet for it came.
+    """
+
+    def __init__(
+        self, address: int = 0x80, supply: float = 24.0, resistance: float = 1.0, inductance: float = 0.01
+    ) -> None:
+        self.address = address
+        self.supply, self.resistance, self.inductance = supply, resistance, inductance
+        self.duties = (0, 0)
+        self.currents = (0.0, 0.0)
+        self.timeout = FACTORY_TIMEOUT
+        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
+        self.errors = self.warnings = 0
+        self.ignored: set[int] = set()
+        self.mismeasured = 0.0
+        self.broken: set[int] = set()
+        self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=10_000)
+        self.heard = -math.inf
+        self._parser = _Parser()
+        self._time = -math.inf
+
+    def receive(self, data: bytes, time: float) -> bytes:
+        """Receive bytes from the line and return the answers."""
+        self.advance(time)
+        answers = b""
+        for packet in self._parser.feed(data, time):
+            if packet[0] == self.address:
+                answers += self._handle(packet)
+        return answers
+
+    def advance(self, time: float) -> None:
+        """Let the coils' currents follow up to a time; nothing happens for one that is past."""
+        if self.errors:
+            self._set((0, 0), self._time)
+        off_at = self.heard + 0.1 * self.timeout
+        if self.timeout and any(self.duties) and off_at <= time:
+            self._move(off_at)
+            self._set((0, 0), self._time)
+        self._move(time)
+
+    def power_cycle(self) -> None:
+        """Let its supply go and come back at once: duties zero, timeout and limits as it was delivered."""
+        self._set((0, 0), self._time)
+        self.timeout = FACTORY_TIMEOUT
+        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
+        self._parser = _Parser()
+
+    @property
+    def outputs(self) -> tuple[int, int]:
+        """What is left of the duties where a coil is at its limit."""
+        first, second = (self._output(channel) for channel in (0, 1))
+        return first, second
+
+    def _output(self, channel: int) -> int:
+        duty, limit = self.duties[channel], 0.01 * self.limits[channel]
+        if abs(self.currents[channel]) < 0.999 * limit or duty * self.currents[channel] <= 0.0:
+            return duty
+        most = FULL * limit * self.resistance / self.supply
+        return round(max(-most, min(most, duty)))
+
+    def _move(self, time: float) -> None:
+        if time <= self._time:
+            return
+        share = math.exp(-(time - self._time) * self.resistance / self.inductance)
+        moved = []
+        for channel, (current, duty, limit) in enumerate(zip(self.currents, self.duties, self.limits, strict=True)):
+            goal = duty / FULL * self.supply / self.resistance
+            limited = max(-0.01 * limit, min(0.01 * limit, goal + (current - goal) * share))
+            moved.append(0.0 if channel in self.broken else limited)
+        self.currents = (moved[0], moved[1])
+        self._time = time
+
+    def _set(self, duties: tuple[int, int], time: float) -> None:
+        if duties != self.duties:
+            self.duties = duties
+            self.timeline.append((time, duties))
+
+    def _handle(self, packet: bytes) -> bytes:
+        command = packet[1]
+        if command in QUESTIONS:
+            self.heard = self._time
+            return answer(self.address, command, self._data(command))
+        if checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
+            return b""
+        self.heard = self._time
+        if command not in self.ignored:
+            self._obey(command, struct.unpack(ARGUMENTS[command], packet[2:-2]))
+        return ACKNOWLEDGED
+
+    def _obey(self, command: int, values: tuple[int, ...]) -> None:
+        if command == Command.SET_TIMEOUT:
+            self.timeout = values[0]
+        elif command in (Command.SET_LIMIT_1, Command.SET_LIMIT_2):
+            self.limits[command - Command.SET_LIMIT_1] = values[0]
+        elif command == Command.RESET_STOP:
+            self.errors &= ~EMERGENCY_STOP
+        elif not self.errors:
+            first = values[0] if command != Command.SET_DUTY_2 else self.duties[0]
+            second = values[-1] if command != Command.SET_DUTY_1 else self.duties[1]
+            self._set((first, second), self._time)
+
+    def _data(self, command: int) -> bytes:
+        """Return what the answer to a question says."""
+        if command == Command.GET_VERSION:
+            return b"RoboClaw simulated 2x15A v4.2.4\n\x00"
+        if command == Command.GET_TIMEOUT:
+            return bytes((self.timeout,))
+        if command == Command.GET_STATUS:
+            return struct.pack(">I", self.warnings << 16 | self.errors)
+        if command in (Command.GET_LIMIT_1, Command.GET_LIMIT_2):
+            return struct.pack(">II", self.limits[command - Command.GET_LIMIT_1], 0)
+        if command == Command.GET_DUTIES:
+            return struct.pack(">hh", *self.outputs)
+        if command == Command.GET_CURRENTS:
+            return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
+        volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
+        answers: dict[int, bytes] = {
+            Command.GET_MAIN_VOLTAGE: volts,
+            Command.GET_LOGIC_VOLTAGE: logic,
+            Command.GET_VOLTAGES: volts + logic,
+            Command.GET_TEMPERATURE: struct.pack(">H", 250),
+        }
+        return answers[command]
+
+    def _reported(self, channel: int) -> int:
+        """Return the current that it reports, in units of 10 mA."""
+        current, duty = self.currents[channel], self.duties[channel]
+        driven = math.copysign(current, current * duty) if duty else abs(current)
+        return max(-0x8000, min(0x7FFF, round(100.0 * (driven + self.mismeasured))))
+
+
+def checksum(data: bytes) -> int:
+    """Return the CRC-16 of a packet, of the polynomial x^16 + x^12 + x^5 + 1, from zero and not reflected.
+
+    Source: Basicmicro, "RoboClaw Series User Manual", packet serial. Deviation: none.
+
+    >>> hex(checksum(b"123456789"))
+    '0x31c3'
+    """
+    crc = 0
+    for byte in data:
+        crc ^= byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x1021 if crc & 0x8000 else 0)) & 0xFFFF
+    return crc
+
+
+def _length(command: int) -> int | None:
+    """Return the number of bytes of a packet with a command, None if it is unknown."""
+    if command in QUESTIONS:
+        return 2
+    return 4 + struct.calcsize(ARGUMENTS[command]) if command in ARGUMENTS else None
+
+
+def answer(address: int, command: int, data: bytes) -> bytes:
+    """Return the answer to a question: data, and the checksum over the question and the data."""
+    return data + struct.pack(">H", checksum(bytes((address, command)) + data))
+
+
+class _Parser:
+    """Cuts a stream of bytes into packets."""
+
+    def __init__(self) -> None:
+        self._bytes = b""
+        self._heard = 0.0
+
+    def feed(self, data: bytes, time: float) -> list[bytes]:
+        """Receive bytes at a time [s] and return the packets that they complete, checksums not yet verified."""
+        # A packet that is not complete is forgotten after a gap of 10 ms.
+        if time - self._heard > 0.01:
+            self._bytes = b""
+        self._heard = time
+        self._bytes += data
+        packets: list[bytes] = []
+        while True:
+            while self._bytes and self._bytes[0] not in ADDRESSES:
+                self._bytes = self._bytes[1:]
+            if len(self._bytes) < 2:
+                return packets
+            size = _length(self._bytes[1])
+            if size is None:  # nobody can tell where it ends
+                self._bytes = b""
+                return packets
+            if len(self._bytes) < size:
+                return packets
+            packets.append(self._bytes[:size])
+            self._bytes = self._bytes[size:]
+
+
+TICK = 0.01  # s between two looks at the boards' own timeouts
+ASK = b"?"
+TIMEOUT = 5.0  # s for the boards to be taken away
+
+
+@dataclass
+class LineFaults:
+    """What goes wrong on a line; may be set at any time.
+
+    Attributes:
+        deaf: whether nothing gets to the boards, as if they were off.
+        silent: whether nothing comes back from them.
+        garbage: whether other bytes come back than they sent.
+        wrong_checksum: whether the last bit of each answer is turned.
+        lateness: how long an answer takes [s].
+        lose_in: of the bytes to the boards, each of this number gets lost; 0 is none.
+        lose_out: the same of the bytes from them.
+        mute: addresses of boards that neither hear nor answer.
+    """
+
+    deaf: bool = False
+    silent: bool = False
+    garbage: bool = False
+    wrong_checksum: bool = False
+    lateness: float = 0.0
+    lose_in: int = 0
+    lose_out: int = 0
+    mute: frozenset[int] = frozenset()
+
+
+class Line:
+    """Serves boards on a pseudo-terminal, in a thread; the path is a symbolic link to it.
+
+    It stands in for hardware, and so, unlike the rest of the rig, it reads a clock and waits.
+
+    Args:
+        path: where the line is to be found.
+        boards: on it, each with an address of its own.
+        clock: tells the time [s].
+
+    Attributes:
+        faults: what goes wrong on it.
+        boards: on it; look at them while holding `lock`.
+    """
+
+    def __init__(
+        self, path: str | Path, boards: Sequence[RoboClawBoard], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.path = Path(path)
+        self.boards = tuple(boards)
+        self.faults = LineFaults()
+        self.lock = threading.Lock()
+        self._clock = clock
+        self._random = random.Random(0)
+        self._late: deque[tuple[float, bytes]] = deque()
+        self._counts = {"in": 0, "out": 0}
+        self._ends = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._host = self._device = -1
+
+    def plug(self) -> None:
+        """Let the line be found, and serve it; harmless if it already is.
+
+        Raises:
+            ConfigurationError: the path cannot be a symbolic link.
+        """
+        if self._thread is not None:
+            return
+        self._host, self._device = os.openpty()
+        # Held open here, so that the line does not hang up while nobody else has it.
+        tty.setraw(self._device)
+        os.set_blocking(self._host, False)
+        try:
+            self._link(os.ttyname(self._device))
+        except OSError as error:
+            self._shut()
+            expectation = f"a path for a symbolic link ({error.strerror})"
+            raise ConfigurationError("rig_simulator.power_stage_ports", str(self.path), expectation) from None
+        self._ends.clear()
+        self._thread = threading.Thread(target=self._serve, name=f"line {self.path}", daemon=True)
+        self._thread.start()
+
+    def unplug(self) -> None:
+        """Remove the line; its boards keep their state. No effect if there is none."""
+        if self._thread is None:
+            return
+        self._ends.set()
+        self._thread.join()
+        self._thread = None
+        with suppress(OSError):
+            if os.readlink(self.path) == os.ttyname(self._device):  # else somebody else has put his own there
+                self.path.unlink()
+        self._shut()
+
+    def advance(self) -> None:
+        """Let the boards be where they are now."""
+        with self.lock:
+            for board in self.boards:
+                board.advance(self._clock())
+
+    def _link(self, name: str) -> None:
+        if self.path.exists() and not self.path.is_symlink():
+            raise FileExistsError(17, "there is something else")
+        new = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        new.unlink(missing_ok=True)
+        new.symlink_to(name)
+        new.replace(self.path)
+
+    def _shut(self) -> None:
+        os.close(self._host)
+        os.close(self._device)
+        self._late.clear()
+
+    def _serve(self) -> None:
+        while not self._ends.is_set():
+            readable, _, _ = select.select([self._host], [], [], self._patience())
+            if readable:
+                with suppress(OSError):
+                    self._receive(os.read(self._host, 4096))
+            self.advance()
+            while self._late and self._late[0][0] <= self._clock():
+                with suppress(OSError):  # nobody reads, and the line is full
+                    os.write(self._host, self._late.popleft()[1])
+
+    def _patience(self) -> float:
+        return max(0.0, min(TICK, self._late[0][0] - self._clock())) if self._late else TICK
+
+    def _receive(self, data: bytes) -> None:
+        now, faults = self._clock(), self.faults
+        if faults.deaf:
+            return
+        data = self._lossy(data, "in", faults.lose_in)
+        with self.lock:
+            answers = [b.receive(data, now) for b in self.boards if b.address not in faults.mute]
+        for answer in answers:
+            if answer and not faults.silent:
+                self._late.append((now + faults.lateness, self._distorted(answer)))
+
+    def _distorted(self, answer: bytes) -> bytes:
+        if self.faults.garbage:
+            answer = self._random.randbytes(len(answer) + 3)
+        if self.faults.wrong_checksum:
+            answer = answer[:-1] + bytes((answer[-1] ^ 1,))
+        return self._lossy(answer, "out", self.faults.lose_out)
+
+    def _lossy(self, data: bytes, way: str, each: int) -> bytes:
+        if not each:
+            return data
+        first = self._counts[way]
+        self._counts[way] = first + len(data)
+        return bytes(byte for at, byte in enumerate(data, first + 1) if at % each)
+
+
+def board_addresses(boards: int) -> list[int]:
+    """Return the addresses of so many boards: different ones, as far as there are that many."""
+    return [ADDRESSES[index % len(ADDRESSES)] for index in range(boards)]
+
+
+class PowerStage:
+    """Boards with two coils each, in the order of their ports.
+
+    Args:
+        ports: the path at which each board is to be found; boards with the same path share a line. Their addresses
+            are `board_addresses`.
+        supply: of each board [V].
+        resistance: of each coil [ohm].
+        inductance: of each coil [H].
+
+    Attributes:
+        boards: in the order of their ports.
+        lines: in the order of their first boards.
+    """
+
+    def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
+        by_path: dict[str, list[RoboClawBoard]] = defaultdict(list)
+        self.boards = []
+        for path, address in zip(ports, board_addresses(len(ports)), strict=True):
+            board = RoboClawBoard(address, supply, resistance, inductance)
+            by_path[path].append(board)
+            self.boards.append(board)
+        self.lines = [Line(path, boards) for path, boards in by_path.items()]
+
+    def open(self) -> None:
+        """Let the boards be found.
+
+        Raises:
+            ConfigurationError: a path cannot be used.
+        """
+        try:
+            for line in self.lines:
+                line.plug()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Remove the lines."""
+        for line in self.lines:
+            line.unplug()
+
+    def currents(self) -> NDArray[np.float64]:
+        """Return the coils' currents now, shape (2 boards,) [A]."""
+        for line in self.lines:
+            line.advance()
+        return np.array([current for board in self.boards for current in board.currents])
+
+
+class StageProcess:
+    """Runs a power stage elsewhere, and reads its currents; the boards go when this process does, whatever ends it.
+
+    Args:
+        ports: the path at which each board is to be found, as `PowerStage` takes them.
+        supply: of each board [V].
+        resistance: of each coil [ohm].
+        inductance: of each coil [H].
+    """
+
+    def __init__(self, ports: Sequence[str], supply: float, resistance: float, inductance: float) -> None:
+        self._arguments = json.dumps([list(ports), supply, resistance, inductance])
+        self._bytes = 2 * len(ports) * np.dtype(float).itemsize
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._running().pid
+
+    def open(self) -> None:
+        """Start the process, and wait until its boards can be found.
+
+        Raises:
+            ConfigurationError: a path cannot be used.
+            GraphError: the process ended.
+        """
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", __name__, self._arguments],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is for the rig, which then takes the boards away
+        )
+        problem = json.loads(self._read())
+        if problem is not None:
+            self.close()
+            raise ConfigurationError(*problem)
+
+    def close(self) -> None:
+        """Take the boards away; harmless if there are none."""
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        try:
+            process.communicate(timeout=TIMEOUT)  # closes its input, which ends it
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+    def currents(self) -> NDArray[np.float64]:
+        """Return the coils' currents now, shape (2 boards,) [A].
+
+        Raises:
+            GraphError: the process ended.
+        """
+        with suppress(BrokenPipeError):  # reading tells
+            cast(BinaryIO, self._running().stdin).write(ASK)
+        return np.frombuffer(self._read(self._bytes))
+
+    def _read(self, size: int | None = None) -> bytes:
+        """Return so many bytes, or a line, of what the process says."""
+        process = self._running()
+        answers = cast(BinaryIO, process.stdout)
+        said = answers.readline() if size is None else answers.read(size)
+        if len(said) < (size or 1):
+            raise GraphError(f"the process with the simulated boards ended (exit code {process.wait()})")
+        return said
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._process is None:
+            raise GraphError("the simulated boards are not open")
+        return self._process
+
+
+def serve(stage: PowerStage, asks: BinaryIO, answers: BinaryIO) -> int:
+    """Open a stage, say how that went, and tell its currents as often as asked, until nobody can ask any more."""
+    try:
+        stage.open()
+    except ConfigurationError as error:
+        answers.write(json.dumps([error.name, error.value, error.expectation]).encode() + b"\n")
+        return 1
+    try:
+        answers.write(json.dumps(None).encode() + b"\n")
+        while asks.read(1):
+            answers.write(stage.currents().tobytes())
+    except BrokenPipeError:
+        pass  # who asked is gone
+    finally:
+        stage.close()
+    return 0
+
+
+if __name__ == "__main__":
+    with suppress(OSError):  # only some may
+        # Before the processes that boards would not share a processor with, where the user may say so.
+        os.nice(-10)
+    with open(sys.stdin.fileno(), "rb", 0) as asking, open(sys.stdout.fileno(), "wb", 0) as answering:
+        sys.exit(serve(PowerStage(*json.loads(sys.argv[1])), asking, answering))

@@ -1,1 +1,0 @@
-"""The dish in a camera frame."""

@@ -1,0 +1,92 @@
+"""The dish is found, and only where there is one; the watch over it notices a bumped camera."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
+from magnetosuture_thread.vision.dish import (
+    LONG_SEARCH,
+    RIM_RAYS,
+    DishWatch,
+    find_cut_dish,
+    find_dish,
+    rim_shift,
+    see_dish,
+)
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.vision.scenes import NOWHERE, Pose, finger, render
+
+
+def gray_of(centre: tuple[float, float], scale: float, seed: int, lighting: Lighting | None = None) -> np.ndarray:
+    """Return the measured channel of a frame with a needle."""
+    camera = DishCamera(CameraScene(), DishView(centre, scale), seed=seed, lighting=lighting)
+    return np.ascontiguousarray(camera.render(np.zeros(2), 0.3, NOWHERE)[:, :, 1])
+
+
+@pytest.mark.parametrize(
+    ("centre", "scale", "seed"), [((322.0, 238.0), 8e-5, 0), ((300.4, 246.7), 8.6e-5, 1), ((341.0, 231.0), 9.5e-5, 2)]
+)
+@pytest.mark.parametrize("lighting", [Lighting(), Lighting(gain=0.5, slope=4.0, noise=3.0)])
+def test_the_dish_is_found_to_a_quarter_of_a_pixel(centre, scale: float, seed: int, lighting: Lighting):
+    found = find_dish(gray_of(centre, scale, seed, lighting), 0.035)
+    assert found is not None
+    assert np.linalg.norm(np.subtract(found.centre_px, centre)) < 0.25
+    assert found.metres_per_pixel == pytest.approx(scale, rel=6e-3)
+
+
+def test_a_hand_over_a_third_of_the_rim_does_not_move_the_dish():
+    frame = render(Pose(np.zeros(2), 0.3), covers=(finger(np.array([0.008, 0.0]), 0.0, 0.024, (120.0, 150.0, 200.0)),))
+    found = find_dish(np.ascontiguousarray(frame[:, :, 1]), 0.035)
+    assert found is not None
+    assert np.linalg.norm(np.subtract(found.centre_px, (322.0, 238.0))) < 0.5
+    assert found.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)
+
+
+def test_the_quick_check_tells_how_far_the_rim_has_moved():
+    gray = gray_of((322.0, 238.0), 8e-5, 3)
+    radius = 0.0175 / 8e-5
+    assert rim_shift(gray, (322.0, 238.0), radius)[0] < 0.2
+    shift, rays = rim_shift(gray, (324.0, 236.0), radius)
+    assert shift == pytest.approx(np.hypot(2.0, 2.0), abs=0.4)
+    assert rays > 0.8 * RIM_RAYS
+    assert rim_shift(0 * gray, (322.0, 238.0), radius)[1] == 0
+
+
+def test_a_dish_that_only_its_ellipse_tells_is_found_within_a_few_frames():
+    bright = np.full((480, 640), 128, np.uint8)
+    cv2.circle(bright, (322, 238), 200, 255, -1, cv2.LINE_AA)  # saturated, so that the rim's dark is not told
+    assert see_dish(bright, VisionTrackerSettings(), 0.035, photographed=False) is None
+    watch = DishWatch(VisionTrackerSettings(), 0.035)
+    assert watch.look(bright)[0] == ""  # in the first frame at once
+    watch.forget()
+    for _ in range(2):
+        assert watch.look(0 * bright)[0] != ""
+    reasons = [watch.look(bright)[0] for _ in range(LONG_SEARCH)]
+    assert reasons[0] != ""
+    assert reasons[-1] == ""
+
+
+def test_a_bright_rim_around_a_bright_floor_is_no_dark_field():
+    clear = np.full((480, 640), 240, np.uint8)
+    cv2.circle(clear, (322, 238), 217, 180, -1, cv2.LINE_AA)
+    cv2.circle(clear, (322, 238), 220, 255, 6, cv2.LINE_AA)
+    assert find_dish(255 - clear, 0.035) is not None  # its negative looks like a dish
+    found = see_dish(clear, VisionTrackerSettings(), 0.035)
+    assert found is None or not found.dark_field
+
+
+def test_a_dish_that_the_frame_cuts_off_is_found_on_whichever_side():
+    gray = gray_of((322.0, 238.0), 8e-5, 0)
+    for left, top, right, bottom in ((0, 0, 440, 480), (200, 0, 640, 480), (0, 120, 640, 480)):
+        u, v = 322.0 - left, 238.0 - top
+        cut = np.ascontiguousarray(gray[top:bottom, left:right])
+        found = find_cut_dish(cut, (u + 3.0, v - 2.0, 217.0), 0.035)
+        assert found is not None
+        assert math.dist(found.centre_px, (u, v)) < 0.3
+        assert found.metres_per_pixel == pytest.approx(8e-5, rel=6e-3)

@@ -1,0 +1,120 @@
+"""Dishes in drawn photographs are found by their ellipse, and none where there is none."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.vision.photographs import DIAMETER, RIGHT, ellipse_error, photo_of
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.vision.dish import FoundDish, Tilt, find_tilt, see_dish
+from magnetosuture_thread.vision.ellipse import Ellipse, find_ellipse
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.vision.scenes import Pose, render
+
+CLASSES = (
+    "photo_on_cloth",
+    "photo_on_light_box",
+    "photo_on_wood",
+    "photo_blood",
+    "photo_tilted",
+    "photo_hand",
+)
+
+
+def drawn(ellipse: Ellipse, size: tuple[int, int], inside: int, outside: int) -> np.ndarray:
+    """Draw an ellipse by the distance from its edge, to first order; polygons of OpenCV are half a pixel too large."""
+    u, v = np.meshgrid(np.arange(size[0]) - ellipse.centre_px[0], np.arange(size[1]) - ellipse.centre_px[1])
+    cosine, sine = math.cos(ellipse.direction), math.sin(ellipse.direction)
+    x, y = (u * cosine + v * sine) / ellipse.minor, (v * cosine - u * sine) / ellipse.major
+    away = np.hypot(x, y)
+    slope = np.hypot(x / ellipse.minor, y / ellipse.major) / np.maximum(away, 1e-9)
+    share = np.clip(0.5 - (away - 1.0) / np.maximum(slope, 1e-9), 0.0, 1.0)
+    return cv2.GaussianBlur(np.round(outside + (inside - outside) * share).astype(np.uint8), (0, 0), 0.8)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_most_dishes_in_photographs_are_found(name: str):
+    right = 0
+    for index in range(6):
+        photo = photo_of(name, index, 41)
+        found = see_dish(photo.image, VisionTrackerSettings(), DIAMETER)
+        right += (
+            found is not None and min(ellipse_error(found, DIAMETER, at) for at in (photo.floor, photo.top)) < RIGHT
+        )
+    assert right >= 4
+
+
+@pytest.mark.parametrize("levels", [(40, 200), (200, 40), (255, 128), (120, 100)])
+@pytest.mark.parametrize("ratio", [1.0, 0.93, 0.84])
+def test_an_ellipse_is_measured_to_a_part_of_a_pixel_whichever_side_is_brighter(levels: tuple[int, int], ratio: float):
+    given = Ellipse((330.3, 228.6), 150.0, ratio * 150.0, 0.7)
+    found = find_ellipse(drawn(given, (640, 480), *levels))
+    assert found is not None
+    assert math.dist(found.centre_px, given.centre_px) < 0.3
+    assert found.major == pytest.approx(given.major, abs=0.5)
+    assert found.minor == pytest.approx(given.minor, abs=0.5)
+
+
+@pytest.mark.parametrize("size", [(320, 240), (480, 640), (1920, 1080), (3840, 2160)])
+def test_sizes_portrait_frames_and_small_dishes_in_wide_ones(size: tuple[int, int]):
+    radius = 0.15 * min(size)
+    given = Ellipse((0.3 * size[0], 0.6 * size[1]), radius, radius, 0.0)
+    found = find_ellipse(drawn(given, size, 190, 120))
+    assert found is not None
+    assert math.dist(found.centre_px, given.centre_px) < 0.01 * radius + 0.3
+    assert found.major == pytest.approx(radius, rel=0.015)
+
+
+def test_a_given_scale_that_differs_from_the_dish_by_up_to_a_tenth_gives_way_and_is_warned_of():
+    frame = render(Pose(np.zeros(2), 0.3))
+    for share, remark in ((1.02, False), (1.07, True), (0.94, True)):
+        found = see_dish(frame, VisionTrackerSettings(metres_per_pixel=share * 8e-5), 0.035)
+        assert found is not None
+        assert bool(found.warning) == remark
+        expected = 8e-5 if remark else share * 8e-5
+        assert found.view.metres_per_pixel == pytest.approx(expected, rel=5e-3)
+    assert see_dish(frame, VisionTrackerSettings(metres_per_pixel=1.15 * 8e-5), 0.035) is None
+
+
+def test_the_covariance_of_an_unknown_tilt_holds_the_perspective_of_any_below_it():
+    radius, distance = 0.0175, 0.25
+    for angle, about in ((0.05, 0.3), (0.05, 2.0), (0.15, -1.0)):
+        tail, heading = np.array([0.008, -0.005]), np.array([0.6, 0.8])
+        along = np.array([math.cos(about), math.sin(about)])
+        near = math.sin(angle) / distance
+
+        def seen(point: np.ndarray, along: np.ndarray = along, near: float = near) -> np.ndarray:
+            return point / (1.0 - near * float(along @ point))
+
+        ends = (seen(radius * along), seen(-radius * along))
+        off = seen(tail) - 0.5 * (ends[0] + ends[1]) - tail
+        turned = seen(tail + 1e-5 * heading) - seen(tail)
+        angle_off = math.atan2(turned[1], turned[0]) - math.atan2(heading[1], heading[0])
+        found = FoundDish(
+            DishView((0.0, 0.0), 8e-5), tilt=Tilt(angle, -about) if angle > 0.1 else None, unseen_tilt=0.06
+        )
+        error = np.array([*off, angle_off])
+        covariance = found.covariance(tail, heading, radius) + np.diag([4e-6, 4e-6, 1e-3]) ** 2
+        assert float(error @ np.linalg.solve(covariance, error)) < 14.16
+
+
+def test_of_a_tilted_dish_that_was_taken_for_a_circle_centre_scale_and_tilt_are_found():
+    given = Ellipse((335.3, 228.6), 150.0, 140.0, 0.7)
+    tilt, view = find_tilt(drawn(given, (640, 480), 190, 120), DishView((333.3, 231.6), DIAMETER / 290.0), DIAMETER)
+    assert tilt is not None
+    assert (tilt.angle, tilt.direction) == pytest.approx((math.acos(140.0 / 150.0), 0.7), abs=0.02)
+    assert math.dist(view.centre_px, given.centre_px) < 0.8
+    assert view.metres_per_pixel == pytest.approx(0.5 * DIAMETER / given.major, rel=6e-3)
+
+
+def test_no_ellipse_is_found_where_there_is_none():
+    square = np.full((480, 640), 180, np.uint8)
+    cv2.rectangle(square, (150, 60), (500, 410), 20, 8)
+    cloud = cv2.GaussianBlur(np.random.default_rng(0).standard_normal((480, 640)), (0, 0), 8.0)
+    clouds = np.clip(128.0 + 50.0 * cloud / cloud.std(), 0, 255).astype(np.uint8)
+    for image in (square, clouds, np.full((4000, 70), 120, np.uint8)):
+        assert find_ellipse(image) is None
