@@ -17,7 +17,7 @@ from magnetosuture_thread.campaign.run import (
     RunInstant,
     RunResult,
 )
-from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
+from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure

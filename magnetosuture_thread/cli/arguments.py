@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from magnetosuture_thread import ConfigurationError
-from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.bags import parse_remap
 from magnetosuture_thread.files import parse_location
 from magnetosuture_thread.outputs import input_problem, output_problem
 

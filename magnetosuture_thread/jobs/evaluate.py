@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
-from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
+from magnetosuture_thread.bags.storage import METADATA_FILE, find_bag_files
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import Row, failed_row, flat, table_csv, table_json
 from magnetosuture_thread.files import is_url

@@ -18,11 +18,11 @@ from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.figures import STAGES, BagDetails, Figures, LiveFigures
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation, WorstFrame
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.page import write_page
 from magnetosuture_thread.evaluation.plots import Photo, ReportPicture, draw_worst_frame
-from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, Figures, LiveFigures
-from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.tables import Row, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.bags.bag_folder import UNVERIFIED_NOTE
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.storage import UNVERIFIED_NOTE
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
+from magnetosuture_thread.evaluation.metrics import RunMetrics, compare_errors, finite_or_none
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import (
     DISH_FRAME,

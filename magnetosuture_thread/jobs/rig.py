@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory
-from magnetosuture_thread.evaluation.reference_scores import (
+from magnetosuture_thread.evaluation.reference import (
+    NOT_ONE,
     CaseResult,
     Evaluation,
     Progress,
+    ReferenceTrajectory,
     StepFigures,
     run_case,
     score_each,

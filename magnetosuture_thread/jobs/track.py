@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from magnetosuture_thread import InvalidInputError, Scene
-from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.storage import pluralize
+from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES

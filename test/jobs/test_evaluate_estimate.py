@@ -14,8 +14,8 @@ import pytest
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import GraphCollector
+from magnetosuture_thread.evaluation.metrics import compare_errors
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.interface import GROUND_TRUTH_THREAD, MEASURED_THREAD, THREAD_OBSERVATION
 from magnetosuture_thread.jobs import replay_inputs

@@ -141,7 +141,7 @@ def _evaluate_bags(options: argparse.Namespace) -> int:
 
 def _score_references(options: argparse.Namespace) -> int:
     from magnetosuture_thread.evaluation.plots import draw_case
-    from magnetosuture_thread.evaluation.reference_scores import CaseResult, find_references, score
+    from magnetosuture_thread.evaluation.reference import CaseResult, find_references, score
     from magnetosuture_thread.evaluation.tables import evaluation_table
     from magnetosuture_thread.jobs.rig import score_rig
 
