@@ -17,8 +17,8 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "campaign/page.html",
-            "campaign/page.css",
+            "commands/campaign.html",
+            "commands/campaign.css",
             "evaluation/page.html",
             "evaluation/page.css",
             "evaluation/page.js",

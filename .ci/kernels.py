@@ -13,7 +13,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from magnetosuture_thread.cli.commands.compile_kernels import kernel_steps
+from magnetosuture_thread.commands.compile import kernel_steps
 from magnetosuture_thread.compiled import PACKAGE
 
 ROOT = Path(__file__).resolve().parent.parent

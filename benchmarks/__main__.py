@@ -11,19 +11,25 @@ from typing import Any
 
 from rich.console import Console
 
-from benchmarks import attack, contact, forecast, golden, keep_out, lies, page, solver
+from benchmarks import attack, contact, forecast, frame, golden, keep_out, lies, page, solver
 from benchmarks.bridge import command as bridge
 from benchmarks.estimator import command as estimator
 from benchmarks.network import command as network
 from benchmarks.vision import command as vision
-from magnetosuture_thread.cli.arguments import EXIT_CODES, STANDARD_OUTPUT, check_outputs, output_file
-from magnetosuture_thread.cli.main import exit_code
-from magnetosuture_thread.cli.terminal import make_console, write_json
+from magnetosuture_thread.cli import exit_code
+from magnetosuture_thread.commands.command import (
+    EXIT_CODES,
+    STANDARD_OUTPUT,
+    check_outputs,
+    make_console,
+    output_file,
+    write_json,
+)
 
 # Each has `add_options(parser)` and `run(options, console)`, which returns the figures and whether they passed.
 BENCHMARKS: dict[str, Any] = {
     **{"solver": solver, "bridge": bridge, "page": page, "keep-out": keep_out, "contact": contact, "lies": lies},
-    "golden": golden,
+    **{"golden": golden, "frame": frame},
     **{"attack": attack, "vision": vision, "estimator": estimator, "forecast": forecast, "network": network},
 }
 

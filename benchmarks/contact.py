@@ -24,7 +24,7 @@ from benchmarks.friction import friction_table, measure_friction
 from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.cli.terminal import make_log
+from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.reproduce.hernia import (
     paper_model,

@@ -1,9 +1,9 @@
 """Time forecasts, and compare them with what then happened on the simulated rig in closed loop.
 
-Times: one forecast of 3 s in steps at 66 Hz of a thread of 81 segments among three posts, on one core, and the same by
-stepping filter and predictor from Python. Errors: of forecasts from random moments of runs of the shipped procedures in
-the loop of a campaign, and of a path follower, under the commands that were then sent, in per cent of the thread's
-length. What a seed varies (viscosity, stiffness, friction, coils) the nodes do not know.
+Times: one forecast of 3 s in steps at 66 Hz of a thread of 81 segments among three posts, on one core. Errors: of
+forecasts from random moments of runs of the shipped procedures in the loop of a campaign, and of a path follower, under
+the commands that were then sent, in per cent of the thread's length. What a seed varies (viscosity, stiffness, friction,
+coils) the nodes do not know.
 
 In the loop (simulated rig, the tracker's noise, estimator, and coil bridge) forecasts start from the estimated thread
 and the tracked needle, as those of the node `thread_model` do. Each is given the commands of the following seconds as
@@ -30,12 +30,11 @@ from magnetosuture_thread import (
     Scene,
     Thread,
     ThreadForecaster,
-    ThreadPredictor,
 )
 from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.campaign.run import run_procedure, vary
-from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.coils.bridge import BridgeOutput
+from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
@@ -190,27 +189,13 @@ def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict
 
 
 def measure_times(repeats: int) -> dict[str, Any]:
-    """Return the medians of wall-clock time of a forecast, and of the same by hand [ms]."""
+    """Return the median of wall-clock time of a forecast [ms]."""
     scene = Scene.create(dish_diameter=0.05, shapes={name: Disc(centre, 0.0015) for name, centre in POSTS.items()})
     safety = NeedleSafetyFilter(scene, needle_length=NEEDLE, max_speed=0.01)
     thread = Thread.of(MATERIALS["polyamide_7_0"], length=LENGTH, segments=81, attachment=Attachment.PINNED)
     made = ThreadForecaster(thread, scene, safety, step=1.0 / RATE, max_step=1.001 / RATE)
     start = made.straight(POSE)
-    single = _median(lambda: made.forecast(start, COMMAND, HORIZON), repeats)
-    return {"single_ms": single, "by_hand_ms": _median(lambda: _by_hand(made, start), max(3, repeats // 10))}
-
-
-def _by_hand(made: ThreadForecaster, start: ForecastStart) -> None:
-    predictor, pose = ThreadPredictor(made.thread, made.scene), start.pose
-    predictor.start_at(pose, start.vertices)
-    safety, kinematics = made.safety, made.safety.kinematics
-    for _ in range(round(HORIZON * RATE)):
-        velocity = safety.filter(COMMAND, pose.tail, pose.heading).filtered
-        moved = kinematics.moved(pose.tail, pose.heading, *kinematics.body_velocity(pose.heading, velocity), made.step)
-        pose = NeedlePose(pose.stamp + made.step, *moved)
-        prediction = predictor.step(pose)
-        assert prediction.margins
-        assert prediction.forces
+    return {"single_ms": _median(lambda: made.forecast(start, COMMAND, HORIZON), repeats)}
 
 
 def _median(work: Any, repeats: int) -> float:
@@ -236,7 +221,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Measure; return the figures."""
     log, times = make_log(console), measure_times(options.repeats)
-    log(f"one forecast of 3 s, n = 81: {times['single_ms']:.1f} ms; stepped from Python: {times['by_hand_ms']:.1f} ms")
+    log(f"one forecast of 3 s, n = 81: {times['single_ms']:.1f} ms")
     loops = []
     for name in options.loops:
         log(f"the loop of {name}, and {options.forecasts} forecasts from it")

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.osqp_solver import QuadraticProgram, as_quadratic_program
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector, residuals_of
+from magnetosuture_thread.thread.solvers import QuadraticProgram, as_quadratic_program
 
 TOLERANCE = 1e-9  # the residual that the banded solver leaves is between 1e-9 and 1e-8
 ITERATIONS = 200

@@ -24,11 +24,11 @@ import numpy as np
 import shapely
 from rich.console import Console
 
-from magnetosuture_thread.cli.terminal import make_log
 from magnetosuture_thread.coils.bridge import CoilBridge
 from magnetosuture_thread.coils.drivers.protocol import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import MAX_BLIND_DISTANCE, CoilBridgeSettings
+from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, shape_from_mapping

@@ -17,7 +17,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -27,8 +26,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
@@ -51,39 +49,20 @@ LISTEN = """() => { window.bench_keys = []; addEventListener('keydown', (event) 
     if (!event.repeat) window.bench_keys.push(performance.timeOrigin + event.timeStamp); }, true); }"""
 
 
-@dataclass(frozen=True)
-class KeyDelays:
-    """Times from a key press to a velocity.
+def key_delays(station: str, keys: Sequence[float], moving: Sequence[float]) -> dict[str, Any]:
+    """Return the times from each key press to the first velocity after it: median, p99 and greatest [s].
 
-    Attributes:
+    `count` is of those that were answered, `lost` of the others.
+
+    Args:
         station: where the velocity came.
-        count: of key presses that did.
-        lost: of those that did not.
-        median: [s]
-        p99: [s]
-        greatest: [s]
+        keys: when a key was pressed, rising [s].
+        moving: when a velocity that is not zero came, rising [s]; at least one within a second of a key.
     """
-
-    station: str
-    count: int
-    lost: int
-    median: float
-    p99: float
-    greatest: float
-
-    @classmethod
-    def between(cls, station: str, keys: Sequence[float], moving: Sequence[float]) -> KeyDelays:
-        """Return the times from each key press to the first velocity after it.
-
-        Args:
-            station: where the velocity came.
-            keys: when a key was pressed, rising [s].
-            moving: when a velocity that is not zero came, rising [s]; at least one within a second of a key.
-        """
-        delays = np.append(moving, np.inf)[np.searchsorted(moving, keys)] - np.asarray(keys)
-        found = delays[delays < LOST]
-        middle, high, most = np.percentile(found, [50.0, 99.0, 100.0])
-        return cls(station, len(found), len(keys) - len(found), float(middle), float(high), float(most))
+    delays = np.append(moving, np.inf)[np.searchsorted(moving, keys)] - np.asarray(keys)
+    found = delays[delays < LOST]
+    figures = dict(zip(("median", "p99", "greatest"), np.percentile(found, [50.0, 99.0, 100.0]).tolist(), strict=True))
+    return {"station": station, "count": len(found), "lost": len(keys) - len(found), **figures}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -100,10 +79,10 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     console.print(page_table(delays))
     log(f"limit: {1e3 * MAX_DELAY:g} ms at the bridge, 99th percentile; {FRAME_RATE:g} pictures a second")
     log("the page drew {drawn:.1f} pictures a second, of {states:.1f} states and {frames:.1f} frames".format(**rates))
-    return {"scenario": SETUP, "segments": SEGMENTS, "delays": [asdict(each) for each in delays], **rates}, True
+    return {"scenario": SETUP, "segments": SEGMENTS, "delays": delays, **rates}, True
 
 
-def page_table(delays: Sequence[KeyDelays]) -> Table:
+def page_table(delays: Sequence[dict[str, Any]]) -> Table:
     """Return the figures as a table that fits 80 columns."""
     title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
     table = Table(title=title, title_justify="left", title_style="bold")
@@ -111,12 +90,12 @@ def page_table(delays: Sequence[KeyDelays]) -> Table:
     for name in ("median", "p99", "maximum", "keys", "lost"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in delays:
-        values = (f"{1e3 * value:.1f}" for value in (each.median, each.p99, each.greatest))
-        table.add_row(each.station, *values, str(each.count), str(each.lost))
+        values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest"))
+        table.add_row(each["station"], *values, str(each["count"]), str(each["lost"]))
     return table
 
 
-def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[KeyDelays], dict[str, float]]:
+def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], dict[str, float]]:
     """Press keys in a browser on the page; return the delays, and pictures, states and frames a second.
 
     Raises:
@@ -136,21 +115,18 @@ def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[KeyD
             keys = [float(stamp) * 1e-3 for stamp in page.evaluate("() => window.bench_keys")]
     if not all(sent.values()):
         raise GraphError("no key moved the needle")
-    delays = [KeyDelays.between(words, keys, sent[channel.recorded]) for channel, words in STATIONS.items()]
+    delays = [key_delays(words, keys, sent[channel.recorded]) for channel, words in STATIONS.items()]
     return delays, {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
 
 
 class _Server:
-    """The command `magnetosuture console`, running."""
+    """The command `magnetosuture console`, running; what it prints goes to a file."""
 
-    def __init__(self, setup: Path) -> None:
-        command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-        )
-        self._lines: list[str] = []
-        self._reading = threading.Thread(target=self._read, daemon=True)
-        self._reading.start()
+    def __init__(self, setup: Path, output: Path) -> None:
+        command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
+        self._output = output
+        with output.open("wb") as file:
+            self._process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
 
     def find(self, pattern: str) -> str:
         """Wait for a line, and return what the pattern's group holds.
@@ -160,10 +136,11 @@ class _Server:
         """
         deadline = time.monotonic() + TIMEOUT
         while time.monotonic() < deadline and self._process.poll() is None:
-            if found := re.search(pattern, "\n".join(self._lines)):
+            if found := re.search(pattern, self._output.read_text()):
                 return found[1]
             time.sleep(0.05)
-        raise GraphError(f"the console ended, or is not ready after {TIMEOUT:g} s: {' '.join(self._lines[-1:])}")
+        last = self._output.read_text().splitlines()[-1:]
+        raise GraphError(f"the console ended, or is not ready after {TIMEOUT:g} s: {' '.join(last)}")
 
     def end(self) -> None:
         """Press Ctrl-C."""
@@ -173,12 +150,6 @@ class _Server:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._reading.join()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.append(line.rstrip())
 
 
 @contextmanager
@@ -190,7 +161,7 @@ def _serving() -> Iterator[_Server]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{SETUP}.yaml"
         path.write_text(yaml.safe_dump(content), encoding="utf-8")
-        server = _Server(path)
+        server = _Server(path, Path(folder) / "output")
         try:
             yield server
         finally:
@@ -243,8 +214,8 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
     """
     from magnetosuture_thread.messages.cdr import header_stamp
     from magnetosuture_thread.nodes import topics
+    from magnetosuture_thread.nodes.clients import Recorder
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment
-    from magnetosuture_thread.nodes.recorder import Recorder
 
     taken = [topics.OPERATOR_COMMAND, topics.NEEDLE_COMMAND, topics.NEEDLE_SETPOINT]
     times: dict[str, list[float]] = {channel.recorded: [] for channel in STATIONS}

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from benchmarks.general_solvers import PEERS
 from benchmarks.track import OBSTACLES, Case, case
-from magnetosuture_thread.cli.terminal import progress
+from magnetosuture_thread.commands.command import progress
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.formulations import PrescribedMotion, RodFormulation, StepResult, ThreadState

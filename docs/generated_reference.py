@@ -12,7 +12,7 @@ from typing import Any
 
 import magnetosuture_thread
 from magnetosuture_thread import MATERIALS, interface
-from magnetosuture_thread.cli.main import make_parser
+from magnetosuture_thread.cli import make_parser
 from magnetosuture_thread.configuration import Configuration, ConfigurationField, configuration_fields
 from magnetosuture_thread.setups import SETTINGS_CLASSES
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
@@ -144,8 +144,7 @@ def _topics_in(tree: ast.Module) -> Iterator[tuple[str, ast.AST]]:
 
 def _modules_of(node: str) -> set[Path]:
     """Return the files in `nodes/` that a node consists of: its own, and all that these import."""
-    home = NODES / node
-    waiting = [home / "node.py" if home.is_dir() else home.with_suffix(".py")]
+    waiting = [NODES / f"{node}.py"]
     found: set[Path] = set()
     while waiting:
         path = waiting.pop()

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magnetosuture_thread.barrier import Barrier, Gradient, check_gradient
+    from magnetosuture_thread.commands.calibrate import calibrate_bags
+    from magnetosuture_thread.commands.replay import replay_offline
     from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
     from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-    from magnetosuture_thread.jobs.calibrate import calibrate_bags
-    from magnetosuture_thread.jobs.replay_offline import replay_offline
     from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
     from magnetosuture_thread.thread.margins import BarrierMargins, Margins
@@ -30,8 +30,8 @@ _HOME = {
     "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
-    "jobs.calibrate": ("calibrate_bags",),
-    "jobs.replay_offline": ("replay_offline",),
+    "commands.calibrate": ("calibrate_bags",),
+    "commands.replay": ("replay_offline",),
     "estimator": ("EstimatorOptions", "EstimatorSession", "ThreadEstimate", "ThreadEstimator"),
     "thread.margins": ("BarrierMargins", "Margins"),
     "thread.prediction": ("NeedlePose", "Prediction"),

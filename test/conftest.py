@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.jobs.render import render_bag
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.setups import read_setup
 

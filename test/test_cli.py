@@ -6,13 +6,11 @@ import argparse
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from magnetosuture_thread import cli
-from magnetosuture_thread.cli import commands
-from magnetosuture_thread.cli.main import COMMANDS, MOVED, make_parser
+from magnetosuture_thread.cli import COMMANDS, make_parser
 from magnetosuture_thread.thread.formulations import FORMULATIONS
 from magnetosuture_thread.thread.solvers import SOLVERS
 
@@ -43,17 +41,11 @@ def test_help_names_every_command_and_the_exit_codes():
         assert words in shown.stdout
 
 
-def test_every_command_of_every_file_is_in_the_parser():
-    files = {path.stem for path in Path(commands.__path__[0]).glob("*.py")} - {"__init__"}
-    assert files == {module.__name__.split(".")[-1] for module in COMMANDS}
-    written = {value for module in COMMANDS for name, value in vars(module).items() if name.startswith("run_")}
-
-    def added(parser: argparse.ArgumentParser) -> set[Any]:
-        below = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-        inner = [found for action in below for choice in action.choices.values() for found in added(choice)]
-        return {*inner, parser.get_default("run")} - {None}
-
-    assert added(make_parser()) == written
+def test_every_command_has_its_summary_and_a_file():
+    subparsers = next(action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))
+    for name, summary in COMMANDS.items():
+        first_line = (subparsers.choices[name].description or "").partition("\n")[0]
+        assert first_line == summary[:1].upper() + summary[1:] + "."
 
 
 def test_help_waits_for_no_package_of_a_command():
@@ -143,17 +135,12 @@ def test_a_failed_job_is_one_line(tmp_path: Path, monkeypatch, capsys, arguments
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("name", "instead"), MOVED.items())
-def test_a_command_of_before_is_refused_and_the_new_one_named(
-    name: str, instead: str, capsys: pytest.CaptureFixture[str]
-):
-    for arguments in ([name], [name, "--help"], [name, "x", "--output", "out"]):
-        assert cli.main(arguments) == 2
-        assert capsys.readouterr().err == f"error: the command '{name}' is now {instead}\n"
-
-
 def test_without_ros_it_says_what_is_missing(monkeypatch, capsys, tmp_path: Path, short_bag: Path):
-    with_ros = ("magnetosuture_thread.nodes", "magnetosuture_thread.jobs.replay", "magnetosuture_thread.jobs.simulate")
+    with_ros = (
+        "magnetosuture_thread.nodes",
+        "magnetosuture_thread.commands.live",
+        "magnetosuture_thread.commands.simulate",
+    )
     for name in [name for name in sys.modules if name.startswith(with_ros[0]) or name in with_ros]:
         monkeypatch.delitem(sys.modules, name)
     for name in [name for name in sys.modules if name.split(".")[0] == "rclpy"]:

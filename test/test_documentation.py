@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.cli.main import make_parser
+from magnetosuture_thread.cli import make_parser
 from magnetosuture_thread.configuration import ROS_PARAMETERS, configuration_fields
 from magnetosuture_thread.planning.procedure import parse_procedure
 from magnetosuture_thread.scene import read_scene

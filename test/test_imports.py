@@ -28,9 +28,9 @@ LAYERS = (
         "rig",
     },  # the core
     {"messages", "bags", "setups", "console", "workers"},
-    {"evaluation", "calibration", "offline", "campaign"},
+    {"evaluation", "calibration", "campaign"},
     {"nodes"},
-    {"jobs", "reproduce"},
+    {"commands", "reproduce"},
     {"cli"},
 )
 
@@ -48,13 +48,13 @@ OWNERS = {
     "osqp": {"thread"},
     "dask": {"workers"},
     "distributed": {"workers"},
-    "pyarrow": {"jobs"},
+    "pyarrow": {"commands"},
     "upath": {"files"},
     "shapely": {"geometry", "scene"},
     "jinja2": {"evaluation"},
     "matplotlib": {"evaluation", "calibration", "reproduce"},
     "plotly": {"evaluation"},
-    "rich": {"cli", "evaluation", "calibration", "reproduce"},
+    "rich": {"commands", "evaluation", "calibration", "reproduce"},
     "rclpy": {"nodes"},
     "rcl_interfaces": {"nodes"},
     "builtin_interfaces": {"nodes"},
@@ -129,10 +129,10 @@ def test_imports_run_one_way():
     assert_none(found, "may not import")
 
 
-def test_nodes_jobs_and_commands_use_the_public_api():
+def test_nodes_and_commands_use_the_public_api():
     found = {}
     for path in MODULES:
-        if part(path) in {"nodes", "jobs", "cli"}:
+        if part(path) in {"nodes", "commands", "cli"}:
             imports = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
             inside = [node for node in imports if str(node.module).startswith("magnetosuture_thread.")]
             found[path] = {alias.name for node in inside for alias in node.names if alias.name in PUBLIC}
@@ -159,7 +159,7 @@ LATE = {"matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.sp
 def test_what_few_need_delays_no_start():
     """Each of these takes a third of a second or more to import, and a graph is many processes."""
     modules = ["nodes.scene_server", "nodes.rig_simulator", "nodes.perception", "nodes.coil_bridge"]
-    modules += ["nodes.path_follower", "nodes.console", "jobs.simulate", "jobs.replay", "jobs.campaign"]
+    modules += ["nodes.path_follower", "nodes.console", "commands.simulate", "commands.replay", "commands.campaign"]
     code = "import sys, " + ", ".join(f"magnetosuture_thread.{name}" for name in modules) + "; print(*sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
     assert not LATE & set(found.stdout.split())

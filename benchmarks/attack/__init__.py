@@ -16,8 +16,7 @@ from typing import Any
 
 from rich.console import Console
 
-from magnetosuture_thread.cli.arguments import count_argument, whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
 
 TARGETS = ("bags", "nodes")
 MAX_LINES = 20  # on broken promises that are shown; `--json` writes all

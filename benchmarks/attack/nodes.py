@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
 import random
-import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
 
-import aiohttp
 import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-from benchmarks.attack.hostile import Attacker
-from benchmarks.attack.probe import READY, STOP, UNARMED
+from benchmarks.attack.hostile import READY, STOP, UNARMED, Attacker
+from magnetosuture_thread.commands.live import START_TIMEOUT, OwnGraph, own_graph
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NODES, RIG_NODES, SCENE_SERVER
-from magnetosuture_thread.jobs.graph import START_TIMEOUT, OwnGraph, own_graph
 from magnetosuture_thread.setups import read_setup
 
 SETUP = "petri_35mm_polyamide"
 TARGETS = (SCENE_SERVER, *RIG_NODES, *NODES)
-CONSOLE, PAGE = "console", "page"
-PAGE_URL = "the operator's page: "  # before it in what the console prints
-WORDS = {STOP: "emergency stop: {} answers", PAGE: "operator's page: {} intervals between states"}
+CONSOLE = "console"  # which gets hostile messages, but no requests
 MAX_DELAY, MAX_STOP_DELAY = 0.5, 0.2  # s
 RATE = 150.0  # attacks a second
 CLOCK_SHARE = 0.25  # of all attacks, on a graph with a simulated clock
@@ -59,7 +51,7 @@ def attack_nodes(count: int, seed: int, progress: Callable[[float], None]) -> tu
 
 
 class _Attack:
-    """Counts of all attacks, and delays of all answers [s] by the node's name, `STOP` or `PAGE`."""
+    """Counts of all attacks, and delays of all answers [s] by the node's name, or `STOP`."""
 
     def __init__(self, count: int, progress: Callable[[float], None]) -> None:
         self.sent, self.events = Counter[str](), Counter[str]()
@@ -75,8 +67,7 @@ class _Attack:
         for name, each in sorted(self.delays.items()):
             median, p99, largest = (float(1e3 * value) for value in np.quantile(each, (0.5, 0.99, 1.0)))
             answers[name] = {"count": len(each), "median_ms": median, "p99_ms": p99, "max_ms": largest}
-            what = WORDS.get(name, f"{name}: {{}} answers").format(len(each))
-            lines.append(f"{what}, median {median:.1f} ms, at most {largest:.1f} ms")
+            lines.append(f"{name}: {len(each)} answers, median {median:.1f} ms, at most {largest:.1f} ms")
             limit = MAX_STOP_DELAY if name == STOP else MAX_DELAY
             if late := sum(delay > limit for delay in each):
                 took = f"took longer than {limit:g} s, at most {max(each):.2f} s"
@@ -97,12 +88,12 @@ class _Attack:
             logs = Path(temporary)
             with own_graph(TARGETS, arguments, logs, "", lambda text: None) as graph:
                 graph.nodes.start(CONSOLE, arguments=["-p", "console:port:=0"])
-                targets = f"nodes:=[{', '.join(TARGETS)}]"
-                graph.nodes.start("probe", module="benchmarks.attack.probe", arguments=["-p", targets])
+                targets = f"nodes:=[{', '.join((CONSOLE, *TARGETS))}]"
+                graph.nodes.start("probe", module="benchmarks.attack.hostile", arguments=["-p", targets])
                 self._attack(graph, logs, count, chance, clock)
             for line in (logs / "probe.log").read_text().splitlines():
                 name, _, delay = line.partition(" ")
-                if delay and name in (STOP, *TARGETS):
+                if delay and name in (STOP, CONSOLE, *TARGETS):
                     self.delays[name].append(float(delay))
                 self.events[UNARMED] += line == UNARMED
 
@@ -119,90 +110,29 @@ class _Attack:
             _spin(executor, DISCOVERY_TIME)
             attacker = Attacker(node, listener, list(TARGETS), chance, clock=clock)
             _spin(executor, DISCOVERY_TIME)
-            with _WatchingPage(logs / f"{CONSOLE}.log") as page:
-                _wait_until(lambda: bool(page.gaps), graph)
-                page.gaps.clear()
-                began = time.monotonic()
-                for index in range(count):
-                    attacker.attack()
-                    self._progress((sum(self.sent.values()) + index + 1) / self._count)
-                    for name in (CONSOLE, *TARGETS):
-                        if graph.nodes.ended(name):
-                            last = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()[-1:]
-                            self.broken.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
-                            self.events["ended"] += 1
-                            graph.nodes.start(name)
-                    _spin(executor, began + (index + 1) / RATE - time.monotonic())
-                until = time.monotonic() + LAST_ANSWERS
-                while attacker.unanswered and time.monotonic() < until:
-                    _spin(executor, 0.1)
+            began = time.monotonic()
+            for index in range(count):
+                attacker.attack()
+                self._progress((sum(self.sent.values()) + index + 1) / self._count)
+                for name in (CONSOLE, *TARGETS):
+                    if graph.nodes.ended(name):
+                        last = (logs / f"{name}.log").read_text(errors="replace").strip().splitlines()[-1:]
+                        self.broken.append(f"{name} ended after {index + 1} attacks: {' '.join(last)}")
+                        self.events["ended"] += 1
+                        graph.nodes.start(name)
+                _spin(executor, began + (index + 1) / RATE - time.monotonic())
+            until = time.monotonic() + LAST_ANSWERS
+            while attacker.unanswered and time.monotonic() < until:
+                _spin(executor, 0.1)
             self.events["unanswered"] += len(attacker.unanswered)
             for service, number in Counter(attacker.unanswered.values()).items():
                 self.broken.append(f"{service}: {number} requests were not answered")
             self.sent.update(attacker.sent)
-            self.delays[PAGE] += page.gaps
-            if page.losses:
-                self.broken.append(f"the page lost the console {page.losses} times")
         finally:
             executor.shutdown()
             listener.destroy_node()
             node.destroy_node()
             context.try_shutdown()
-
-
-class _WatchingPage:
-    """A page in a thread of its own that watches the graph under attack; it connects again when it has to.
-
-    Args:
-        log: the file with what the console prints.
-
-    Attributes:
-        gaps: between two states of one connection [s].
-        losses: connections that the server ended.
-    """
-
-    def __init__(self, log: Path) -> None:
-        self.gaps: list[float] = []
-        self.losses = 0
-        self._log = log
-        self._ends = threading.Event()
-        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
-
-    def __enter__(self) -> _WatchingPage:
-        """Begin to watch."""
-        self._thread.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Disconnect."""
-        self._ends.set()
-        self._thread.join()
-
-    async def _run(self) -> None:
-        async with aiohttp.ClientSession() as session:
-            while not self._ends.is_set():
-                lines = self._log.read_text(errors="replace").splitlines()
-                url = urlsplit([line for line in lines if line.startswith(PAGE_URL)][-1].removeprefix(PAGE_URL))
-                try:
-                    await self._watch(session, f"http://{url.netloc}", parse_qs(url.fragment)["token"][0])
-                except aiohttp.ClientError:
-                    await asyncio.sleep(0.2)
-
-    async def _watch(self, session: aiohttp.ClientSession, address: str, token: str) -> None:
-        async with session.ws_connect(f"{address}/socket?token={token}", origin=address) as socket:
-            await socket.send_json({"type": "hello", "token": token, "automated": True})
-            last = None
-            while not self._ends.is_set():
-                message = await socket.receive(timeout=60.0)
-                if message.type not in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY):
-                    self.losses += 1
-                    return
-                is_frame = message.type is aiohttp.WSMsgType.BINARY
-                if is_frame or json.loads(message.data)["type"] == "state":
-                    await socket.send_json({"type": "acknowledge", "kind": "frame" if is_frame else "state"})
-                    now = time.monotonic()
-                    self.gaps += [] if last is None or is_frame else [now - last]
-                    last = last if is_frame else now
 
 
 def _wait_until(is_there: Callable[[], bool], graph: OwnGraph) -> None:

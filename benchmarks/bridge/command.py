@@ -1,8 +1,8 @@
 """Time the coil bridge: how long until the duties of two simulated RoboClaw boards are zero.
 
 The boards are on pseudo-terminals. Measured after a commander fell silent and after kill -9 of commander,
-tracker and bridge; also how even the bridge's loop is, and what hostile messages can do. Meanwhile all cores
-are kept busy. Takes nine minutes.
+tracker and bridge; also how even the bridge's loop is. Meanwhile all cores are kept busy. Takes nine minutes.
+Hostile messages are those of `python -m benchmarks attack nodes`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +24,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.bridge.drive_watch import DriveWatch
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
-from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power.stage import PowerStage
 from magnetosuture_thread.setups import read_setup
@@ -46,41 +42,77 @@ START_TIMEOUT = 60.0  # s for processes to start and to be heard, on a busy mach
 REARM_AFTER = 10.0  # s without current, after which the bridge is armed again
 TIMEOUT = 30.0  # s for anything to happen
 KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
-FULL = 32767  # duty of the full supply
 SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
 
 
-@dataclass(frozen=True)
-class ZeroDelays:
-    """Times from an event to zero duty on all boards.
+def zero_delays(event: str, delays: Sequence[float], bound: float) -> dict[str, Any]:
+    """Return the times from an event to zero duty on all boards: median, p99 and greatest [s].
+
+    Args:
+        event: what happened.
+        delays: of each time that the coils were driven then [s]; at least one.
+        bound: what they should not exceed [s]; `beyond` counts those that do.
+    """
+    median, p99, greatest = np.percentile(delays, [50.0, 99.0, 100.0]).tolist()
+    beyond = int(np.sum(np.asarray(delays) > bound))
+    figures = {"event": event, "count": len(delays), "median": median, "p99": p99, "greatest": greatest}
+    return {**figures, "bound": bound, "beyond": beyond}
+
+
+class DriveWatch:
+    """Keeps when the coils of a power stage, all together, were driven and when not.
+
+    A board forgets what is long past: look again before it has changed its duties some thousand times.
+
+    Args:
+        stage: the boards.
 
     Attributes:
-        event: what happened.
-        count: how often the coils were driven then.
-        median: [s]
-        p99: [s]
-        greatest: [s]
-        bound: what they should not exceed [s].
-        beyond: how many do.
+        turns: when the coils were driven from then on, or not any more: (time [s], driven).
     """
 
-    event: str
-    count: int
-    median: float
-    p99: float
-    greatest: float
-    bound: float
-    beyond: int
+    def __init__(self, stage: PowerStage) -> None:
+        self._stage = stage
+        self._on = [False] * len(stage.boards)
+        self._seen = [-np.inf] * len(stage.boards)
+        self.turns: list[tuple[float, bool]] = []
 
-    @classmethod
-    def of(cls, event: str, delays: Sequence[float], bound: float) -> ZeroDelays:
-        """Return the percentiles of some delays [s], of at least one."""
-        found = np.array(delays)
-        median, p99, greatest = np.percentile(found, [50.0, 99.0, 100.0]).tolist()
-        return cls(event, len(found), median, p99, greatest, bound, int(np.sum(found > bound)))
+    @property
+    def driven(self) -> bool:
+        """Whether any coil was driven when we last looked."""
+        return bool(self.turns) and self.turns[-1][1]
+
+    def look(self) -> None:
+        """Take what has happened since we last looked."""
+        changes = []
+        for line in self._stage.lines:
+            line.advance()
+        for index, board in enumerate(self._stage.boards):
+            with next(line for line in self._stage.lines if board in line.boards).lock:
+                timeline = list(board.timeline)
+            changes += [(at, index, duties) for at, duties in timeline if at > self._seen[index]]
+            self._seen[index] = timeline[-1][0] if timeline else self._seen[index]
+        for at, index, duties in sorted(changes):
+            self._on[index] = any(duties)
+            if any(self._on) != self.driven:
+                self.turns.append((at, any(self._on)))
+
+    def to_zero(self, times: Sequence[float]) -> list[float]:
+        """Return, for each time that found the coils driven, how long it took until they were not [s].
+
+        Args:
+            times: [s]; those after which the coils have not been at zero yet are left out.
+        """
+        turned = np.array([at for at, _ in self.turns])
+        after = np.searchsorted(turned, times, side="right")
+        return [
+            self.turns[index][0] - time
+            for time, index in zip(times, after.tolist(), strict=True)
+            if 0 < index < len(self.turns) and self.turns[index - 1][1]
+        ]
 
 
 class BridgeBench:
@@ -105,7 +137,7 @@ class BridgeBench:
         self.restarts = 0
 
     def start(self, name: str, **parameters: float | str) -> None:
-        """Start the bridge, or a stand-in for a commander, a tracker or a fuzzer."""
+        """Start the bridge, or a stand-in for a commander or a tracker."""
         if name == "coil_bridge":
             self._nodes.start(name)
             self.arm()
@@ -148,32 +180,6 @@ class BridgeBench:
             self._progress((done + 1) / times)
             self.start(name)
         return delays
-
-    def fuzz(self, count: int) -> float:
-        """Publish hostile messages and see that the bridge works afterwards.
-
-        Returns:
-            The greatest current asked of a board meanwhile [A].
-
-        Raises:
-            GraphError: it does not.
-        """
-        for name in ("commander", "tracker"):
-            self._nodes.kill(name)
-        # While the bridge still counts those that were killed as speaking, it would refuse all without looking.
-        self.wait(lambda: not self._driven(), "zero")
-        time.sleep(2.0 * SILENCE_TIMEOUT)
-        self.watch.forget()
-        self.start("fuzzer", count=count)
-        self.wait(lambda: self._nodes.ended("fuzzer"), "the fuzzer to end", TIMEOUT + count / 200.0)
-        self._nodes.kill("fuzzer")  # whose work is done
-        self.watch.look()
-        greatest = self.watch.largest / FULL * SUPPLY / RESISTANCE
-        self.arm()
-        self.start("tracker")
-        self.start("commander")
-        self.drive()
-        return greatest
 
     def drive(self) -> None:
         """Wait until the coils have been driven for a while, and start all anew where they are not."""
@@ -232,7 +238,6 @@ class BridgeBench:
 def measure_bridge(
     trials: int,
     kills: int,
-    hostile: int,
     *,
     busy: bool = True,
     log: Log = print,
@@ -243,15 +248,14 @@ def measure_bridge(
     Args:
         trials: of a commander that falls silent.
         kills: of each process.
-        hostile: messages.
         log: called with a line for a person at each stage.
         progress: called with the share of a stage done, 0 to 1.
         busy: whether to keep all cores busy meanwhile; else boards have more time for an answer.
 
     Returns:
-        The figures: `delays` as of `ZeroDelays`; `loop`, by how much an interval of the loop differs from its period
-        (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`; `hostile` messages,
-        the `greatest_current` meanwhile and its limit `max_current` [A]; `restarts` as of `BridgeBench`.
+        The figures: `delays` as of `zero_delays`; `loop`, by how much an interval of the loop differs from its period
+        (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`;
+        `restarts` as of `BridgeBench`.
     """
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes.clients import CoilClient
@@ -263,11 +267,11 @@ def measure_bridge(
     )
 
     settings = read_setup(SETUP).coils
-    delays: list[ZeroDelays] = []
+    delays: list[dict[str, Any]] = []
 
     def add(event: str, found: list[float], bound: float) -> None:
-        delays.append(spread := ZeroDelays.of(event, found, bound))
-        log(f"  {event}: median {1e3 * spread.median:.1f}, maximum {1e3 * spread.greatest:.1f} ms")
+        delays.append(spread := zero_delays(event, found, bound))
+        log(f"  {event}: median {1e3 * spread['median']:.1f}, maximum {1e3 * spread['greatest']:.1f} ms")
 
     with tempfile.TemporaryDirectory() as name, reserved_domain() as domain:
         folder = Path(name)
@@ -297,14 +301,11 @@ def measure_bridge(
                 for victim in ("commander", "tracker", "coil_bridge"):
                     log(f"{kills} times kill -9 of the {victim}")
                     add(f"kill -9 of {victim}", bench.kills(victim, kills), KILL_BOUND)
-                log(f"{hostile} hostile messages")
-                greatest = bench.fuzz(hostile)
         finally:
             stage.close()
     return {
-        "delays": [asdict(each) for each in delays],
-        **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
-        **{"greatest_current": greatest, "max_current": settings.max_current, "restarts": bench.restarts},
+        "delays": delays,
+        **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "restarts": bench.restarts},
     }
 
 
@@ -326,7 +327,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     for name, default, what in (
         ("trials", 500, "a commander that falls silent"),
         ("kills", 20, "kill -9 of each process"),
-        ("hostile", 10_000, "hostile messages"),
     ):
         parser.add_argument(
             f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what} (default: {default})"
@@ -336,9 +336,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
     with progress(console, "bridge") as advance:
-        figures = measure_bridge(
-            options.trials, options.kills, options.hostile, log=make_log(console), progress=advance
-        )
+        figures = measure_bridge(options.trials, options.kills, log=make_log(console), progress=advance)
     console.print(bridge_table(figures))
     return figures, True
 
@@ -354,7 +352,5 @@ def bridge_table(figures: dict[str, Any]) -> Table:
         values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest", "bound"))
         table.add_row(each["event"], *values, f"{each['beyond']}/{each['count']}")
     table.add_row("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", "")
-    current, limit = f"{figures['greatest_current']:.2f} A", f"{figures['max_current']:.2f} A"
-    table.add_row(f"{figures['hostile']} hostile messages", "", "", current, limit, "alive")
     table.add_row("restarts after a kill", "", "", "", "", str(figures["restarts"]))
     return table

@@ -1,4 +1,4 @@
-"""A node that stands in for a commander, a tracker or a fuzzer of the coil bridge."""
+"""A node that stands in for a commander or a tracker of the coil bridge."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
@@ -18,17 +17,16 @@ from magnetosuture_thread.messages.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.run import run
 
-RATES = {"commander": 50.0, "tracker": 60.0, "fuzzer": 1000.0}  # Hz
+RATES = {"commander": 50.0, "tracker": 60.0}  # Hz
 SPEED = 0.001  # m/s; too slow for the bridge to judge whether a needle follows whose pose is always the same
 TAIL, HEADING = np.array([-0.0035, 0.0]), np.array([1.0, 0.0])
-ODD = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 
 
 class TrafficNode(Node):
-    """Publishes velocity commands, poses, or anything at all.
+    """Publishes velocity commands or poses.
 
-    Parameters: `kind`, commander, tracker or fuzzer; `burst` and `pause` [s], of a commander that falls silent again
-    and again, and prints the monotonic time of the last command before each silence; `count`, of a fuzzer.
+    Parameters: `kind`, commander or tracker; `burst` and `pause` [s], of a commander that falls silent again
+    and again, and prints the monotonic time of the last command before each silence.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -36,18 +34,14 @@ class TrafficNode(Node):
         self._kind = str(self.declare_parameter("kind", "commander").value)
         self._burst = float(self.declare_parameter("burst", 1e9).value)
         self._pause = float(self.declare_parameter("pause", 0.0).value)
-        self._count = int(self.declare_parameter("count", 10_000).value)
-        if self._kind != "tracker":
-            self._commands = topics.NEEDLE_COMMAND.publisher(self)
-        if self._kind != "commander":
-            self._poses = topics.NEEDLE_POSE.publisher(self)
+        topic = topics.NEEDLE_POSE if self._kind == "tracker" else topics.NEEDLE_COMMAND
+        self._publisher = topic.publisher(self)
         self._random = random.Random(7)
         self._began = time.monotonic()
         self._last: float | None = None
         self._direction = 0.0
-        act = {"commander": self._command, "tracker": self._track, "fuzzer": self._fuzz}
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0 / RATES[self._kind], act[self._kind], clock=steady)
+        act = self._track if self._kind == "tracker" else self._command
+        self.create_timer(1.0 / RATES[self._kind], act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _command(self) -> None:
         now = time.monotonic()
@@ -60,43 +54,10 @@ class TrafficNode(Node):
             self._began, self._direction = now, self._direction + 1.0
         velocity = SPEED * np.array([math.cos(self._direction), math.sin(self._direction)])
         self._last = time.monotonic()
-        self._commands.publish(packed_twist(self._stamp(), velocity))
+        self._publisher.publish(packed_twist(self._stamp(), velocity))
 
     def _track(self) -> None:
-        self._poses.publish(packed_pose(self._stamp(), TAIL, HEADING))
-
-    def _fuzz(self) -> None:
-        """Publish a command or a pose with something wrong in it, or nothing."""
-        if not self._count:
-            raise SystemExit
-        self._count -= 1
-        random, stamp = self._random, self._stamp()
-        if random.random() < 0.3:
-            stamp = Time(sec=random.choice((0, -5, 2**31 - 1, stamp.sec - 1, stamp.sec + 1)))
-        frame = random.choice(("dish",) * 8 + ("", "map", "dish" * 1000))
-        values = [random.choice(ODD) if random.random() < 0.3 else random.uniform(-0.02, 0.02) for _ in range(4)]
-        if random.random() < 0.5:
-            command = TwistStamped()
-            command.header.stamp, command.header.frame_id = stamp, frame
-            command.twist.linear.x, command.twist.linear.y = values[:2]
-            if random.random() < 0.2:
-                command.twist.linear.z, command.twist.angular.z = values[2:]
-            self._commands.publish(command)
-            return
-        pose = PoseWithCovarianceStamped()
-        pose.header.stamp, pose.header.frame_id = stamp, frame
-        position, q = pose.pose.pose.position, pose.pose.pose.orientation
-        # Most that is not odd is a needle that stays where it is: of others none would be believed, nothing driven.
-        position.x, position.y = values[:2]
-        angle = random.uniform(-math.pi, math.pi)
-        if random.random() < 0.9:
-            position.x, position.y = (
-                place + 5e-3 * value if abs(value) < 0.02 else value
-                for place, value in zip(TAIL.tolist(), values[:2], strict=True)
-            )
-            angle *= 1e-3
-        q.z, q.w = values[2:] if random.random() < 0.3 else (math.sin(0.5 * angle), math.cos(0.5 * angle))
-        self._poses.publish(pose)
+        self._publisher.publish(packed_pose(self._stamp(), TAIL, HEADING))
 
     def _stamp(self) -> Time:
         return self.get_clock().now().to_msg()

@@ -22,7 +22,7 @@ from benchmarks.estimator.measurements import (
     measure_cost,
 )
 from benchmarks.estimator.rendered import measure_rendered
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

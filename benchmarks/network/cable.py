@@ -1,7 +1,7 @@
 """Program: a cable between two TAP devices, which can be pulled, delay packets and lose them.
 
 Not every kernel can delay and lose packets by itself (netem). Commands come in lines on standard input, and each is
-answered by a line: `pull`, `plug`, `impair DELAY LOSS` (s, share), `traffic` (bytes one way and the other).
+answered by a line with the bytes that went either way: `pull`, `plug`, `impair DELAY LOSS` (s, share), `count`.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.cli.arguments import whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import make_log, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
 
@@ -55,7 +54,6 @@ PULL_DELAY = 1.0  # s that may go by before, at random
 PULLED_TIME = (0.3, 4.0)  # s for which the cable is out, at random
 STOP_EVERY = 10  # cuts of which in one the emergency stop is pressed at the rig while the cable is out
 STILL_TIME = 2.0  # s for which a stopped bridge must stay at zero after the cable is back
-TRAFFIC_TIME = 10.0  # s
 TIMEOUT = 60.0  # s for anything to happen ...
 START_TIMEOUT = 300.0  # ... but for the first start on a machine, which compiles
 
@@ -75,8 +73,6 @@ class CutReport:
         late: cuts after which the coils were driven for longer than the command's timeout, or again while it was out.
         stops: cuts in which the emergency stop was pressed.
         stops_kept: those of them that stayed at zero until a reset.
-        driven: share of time in which the coils are driven while the cable is in.
-        megabits: traffic from the rig to the desk and back, with camera frames for the operator's page [Mbit/s].
     """
 
     delay: float
@@ -86,8 +82,6 @@ class CutReport:
     late: int = 0
     stops: int = 0
     stops_kept: int = 0
-    driven: float = 0.0
-    megabits: tuple[float, float] = (0.0, 0.0)
 
     @property
     def passed(self) -> bool:
@@ -101,7 +95,7 @@ class CutReport:
             for name in ("zero", "resumed")
             for kind, of in (("median", np.median), ("maximum", np.max))
         }
-        names = ("delay", "loss", "late", "stops", "stops_kept", "driven", "megabits")
+        names = ("delay", "loss", "late", "stops", "stops_kept")
         return {"cuts": len(self.zero), **times, **{name: getattr(self, name) for name in names}}
 
 
@@ -193,7 +187,6 @@ class TwoHostBench:
         """Pull the cable at random moments."""
         self._hosts.impair(report.delay, report.loss)
         self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
-        report.driven, report.megabits = self._measure_traffic()
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
             progress((number + 1) / cuts)
@@ -225,17 +218,6 @@ class TwoHostBench:
         before = self._watch.driven
         self._watch.spin(duration)
         return self._watch.driven > before
-
-    def _measure_traffic(self) -> tuple[float, tuple[float, float]]:
-        watch, began, before = self._watch, time.monotonic(), self._hosts.traffic()
-        driven = steps = 0
-        while time.monotonic() - began < TRAFFIC_TIME:
-            watch.spin(0.05)
-            driven += time.time() - watch.driven < RECENT
-            steps += 1
-        elapsed = time.monotonic() - began
-        there, back = (8e-6 * (now - then) / elapsed for now, then in zip(self._hosts.traffic(), before, strict=True))
-        return driven / steps, (there, back)
 
 
 def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, progress: Progress) -> list[CutReport]:
@@ -318,7 +300,7 @@ def network_table(reports: list[CutReport]) -> Table:
     """Return the figures of each network as a table."""
     table = Table(title="Two hosts, simulated rig")
     zero = f"at zero within {COMMAND_TIMEOUT:g} s"
-    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept", "driven", "Mbit/s"):
+    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept"):
         table.add_column(heading)
     for report in reports:
         found = report.to_json()
@@ -328,7 +310,5 @@ def network_table(reports: list[CutReport]) -> Table:
             f"{found['zero_median']:.3f}, {found['zero_maximum']:.3f}",
             f"{found['resumed_median']:.2f}, {found['resumed_maximum']:.2f}",
             f"{report.stops_kept} of {report.stops}",
-            f"{report.driven:.0%}",
-            f"{report.megabits[0]:.1f}, {report.megabits[1]:.1f}",
         )
     return table

@@ -82,11 +82,6 @@ class TwoHosts:
         """
         self._execute(f"impair {delay} {loss}")
 
-    def traffic(self) -> tuple[int, int]:
-        """Return the bytes from the rig to the desk and back, so far."""
-        there, back = self._execute("traffic").split()
-        return int(there), int(back)
-
     def _execute(self, command: str) -> str:
         assert self._cable is not None
         return self._cable.execute(command)

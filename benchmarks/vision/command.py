@@ -17,8 +17,7 @@ from rich.table import Table
 from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.measurements import Row, frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
-from magnetosuture_thread.cli.arguments import count_argument, whole_number
-from magnetosuture_thread.cli.terminal import make_log, progress
+from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
 from magnetosuture_thread.errors import ConfigurationError
 
 FAMILIES = ", ".join(dict.fromkeys(name.partition("_")[0] for name in CLASSES))

@@ -93,18 +93,18 @@ class Objective:
         whole: bool = False,
     ) -> None:
         self.base, self.parameters = base, tuple(parameters)
-        self.which = tuple(range(len(replays.runs)) if which is None else which)
-        self._replays, self._residuals = replays, offset_residuals if whole else across_residuals
+        self._which = tuple(range(len(replays.runs)) if which is None else which)
+        self._replays, self._runs = replays, [replays.runs[index] for index in self._which]
+        self._residuals = offset_residuals if whole else across_residuals
         self._rough = base.formulation == "paper"
         self._units = np.array([parameter.counts(base) for parameter in parameters])
-        bounds = [parameter.fit_bounds(base) for parameter in parameters]
-        self.low, self.high = np.array([low for low, _ in bounds]), np.array([high for _, high in bounds])
+        self._low, self._high = np.array([parameter.fit_bounds(base) for parameter in parameters]).reshape(-1, 2).T
 
     def start(self) -> Array:
         """Return the numbers of the base, moved inside of their bounds."""
         x = np.array([parameter.to_fit(parameter.read(self.base)) for parameter in self.parameters])
-        margin = 0.01 * np.minimum(self._units, self.high - self.low)
-        return np.asarray(np.clip(x, self.low + margin, self.high - margin))
+        margin = 0.01 * np.minimum(self._units, self._high - self._low)
+        return np.asarray(np.clip(x, self._low + margin, self._high - margin))
 
     def settings(self, x: Array) -> ThreadModelSettings:
         """Return the settings of some numbers."""
@@ -114,27 +114,24 @@ class Objective:
             settings = parameter.write(settings, min(max(parameter.from_fit(number), low), high))
         return settings
 
-    def residuals(self, x: Array) -> list[Array]:
-        """Return the residuals of each run that counts."""
-        return self._many([x])[0]
+    def residuals(self, *points: Array) -> list[list[Array]]:
+        """Return the residuals of each run that counts, at each point."""
+        found, length = self._replays.of([self.settings(x) for x in points], self._which), self.base.thread_length
+        return [
+            [self._residuals(v, run, length) for v, run in zip(vertices, self._runs, strict=True)] for vertices in found
+        ]
 
     def jacobian(self, x: Array) -> list[Array]:
         """Return derivatives by difference quotients, away from the nearer bound; shape (K, n, P) of each run."""
         lengths = (ROUGH_STEP if self._rough else STEP) * self._units
-        steps = lengths * np.where(x + lengths <= self.high, 1.0, -1.0)
-        middle, *moved = self._many([x, *(x + step * row for step, row in zip(steps, np.eye(len(x)), strict=True))])
-        slopes = [np.empty((*part.shape, len(x))) for part in middle]
-        for column, (other, step) in enumerate(zip(moved, steps, strict=True)):
-            for slope, end, begin in zip(slopes, other, middle, strict=True):
-                slope[..., column] = (end - begin) / step
-        return slopes
-
-    def _many(self, points: Sequence[Array]) -> list[list[Array]]:
-        settings = [self.settings(x) for x in points]
-        found = self._replays.of(settings, self.which)
-        runs = [self._replays.runs[index] for index in self.which]
-        length = self.base.thread_length
-        return [[self._residuals(v, p, length) for v, p in zip(vertices, runs, strict=True)] for vertices in found]
+        steps = lengths * np.where(x + lengths <= self._high, 1.0, -1.0)
+        middle, *moved = self.residuals(x, *(x + np.diag(steps)))
+        return [
+            np.stack([(end[run] - begin) / step for end, step in zip(moved, steps, strict=True)], axis=-1)
+            if moved
+            else np.empty((*begin.shape, 0))
+            for run, begin in enumerate(middle)
+        ]
 
     def fit(self, start: Array | None = None, scale: float = np.inf) -> FitSolution:
         """Return the best numbers near a start.
@@ -151,64 +148,53 @@ class Objective:
         Source: nonlinear least squares by scipy, trust region reflective; J. A. Nelder, R. Mead, Computer Journal 7
         (1965).
         """
-        first = self.start() if start is None else np.clip(start, self.low, self.high)
-        if not self.parameters:  # as where only the attachment is asked for
-            return self._solution(first, 0.0, scale)
-        if self._rough:
-            return self._solution(*self._simplex(first), scale)
-        units = self._units
-
-        def flat(parts: list[Array], columns: int = 0) -> Array:
-            return np.concatenate([part.reshape((-1, columns) if columns else -1) for part in parts])
-
-        def residuals(y: Array) -> Array:
-            return flat(self.residuals(first + units * y))
-
-        def jacobian(y: Array) -> Array:
-            return np.asarray(flat(self.jacobian(first + units * y), len(first)) * units)
-
-        found = least_squares(
-            residuals,
-            np.zeros(len(first)),
-            jac=jacobian,
-            bounds=((self.low - first) / units - 1e-9, (self.high - first) / units + 1e-9),
-            ftol=NO_GAIN,
-            xtol=NO_STEP,
-            gtol=FLAT,
-            loss="linear" if np.isinf(scale) else "soft_l1",
-            f_scale=1.0 if np.isinf(scale) else scale,
-            max_nfev=MAX_STEPS,
-        )
-        x = np.clip(first + units * found.x, self.low, self.high)
-        return self._solution(x, float(found.cost), scale)
+        first = self.start() if start is None else np.clip(start, self._low, self._high)
+        x, cost = first, 0.0
+        if self._rough and self.parameters:
+            x, cost = self._simplex(first)
+        elif self.parameters:  # else only the attachment is asked for
+            units = self._units
+            found = least_squares(
+                lambda y: np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]]),
+                np.zeros(len(first)),
+                jac=lambda y: (
+                    units * np.concatenate([part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)])
+                ),
+                bounds=((self._low - first) / units - 1e-9, (self._high - first) / units + 1e-9),
+                ftol=NO_GAIN,
+                xtol=NO_STEP,
+                gtol=FLAT,
+                loss="linear" if np.isinf(scale) else "soft_l1",
+                f_scale=1.0 if np.isinf(scale) else scale,
+                max_nfev=MAX_STEPS,
+            )
+            x, cost = np.clip(first + units * found.x, self._low, self._high), float(found.cost)
+        residuals = self.residuals(x)[0]
+        return FitSolution(self.settings(x), self.parameters, x, residuals, self.jacobian(x), scale, cost)
 
     def _simplex(self, first: Array) -> tuple[Array, float]:
-        corners = np.vstack(
-            [first, first + np.diag(np.where(first + self._units <= self.high, 1.0, -1.0) * self._units)]
-        )
+        """Return where the mean over the runs of the prediction error is least, and the error [% of length]."""
+        low, high, units = self._low, self._high, self._units
+        corners = np.vstack([first, first + np.diag(np.where(first + units <= high, units, -units))])
+
+        def error(x: Array) -> float:
+            (vertices,), length = self._replays.of([self.settings(x)], self._which), self.base.thread_length
+            pairs = zip(vertices, self._runs, strict=True)
+            return float(np.mean([mean_error(v, run.targets, length) for v, run in pairs]))
+
         found = minimize(
-            self._error,
+            error,
             first,
             method="Nelder-Mead",
-            bounds=list(zip(self.low.tolist(), self.high.tolist(), strict=True)),
+            bounds=list(zip(low.tolist(), high.tolist(), strict=True)),
             options={
-                "initial_simplex": np.clip(corners, self.low, self.high),
+                "initial_simplex": np.clip(corners, low, high),
                 "maxfev": MAX_TRIED,
-                "xatol": NEAR_X * float(self._units.min()),
+                "xatol": NEAR_X * float(units.min()),
                 "fatol": NEAR_ERROR,
             },
         )
-        return np.clip(found.x, self.low, self.high), float(found.fun)
-
-    def _error(self, x: Array) -> float:
-        """Return the mean over the runs of the prediction error [% of length]."""
-        settings = self.settings(x)
-        runs = [self._replays.runs[index] for index in self.which]
-        pairs = zip(self._replays.of([settings], self.which)[0], runs, strict=True)
-        return float(np.mean([mean_error(v, p.targets, settings.thread_length) for v, p in pairs]))
-
-    def _solution(self, x: Array, cost: float, scale: float) -> FitSolution:
-        return FitSolution(self.settings(x), self.parameters, x, self.residuals(x), self.jacobian(x), scale, cost)
+        return np.clip(found.x, low, high), float(found.fun)
 
 
 def robust_scale(residuals: Sequence[Array]) -> float:
@@ -233,45 +219,36 @@ def initial_guesses(
         both: whether the attachment is asked for.
     """
     kinds = [kind.value for kind in Attachment] if both else [start.attachment]
-    bases = [replace(start, attachment=kind) for kind in kinds]
-    if start.formulation == "paper":
-        return [_best_on_grid(replays, start, parameters)]
-    if STIFFNESS_OVER_DRAG not in parameters:
+    bases, count = [replace(start, attachment=kind) for kind in kinds], len(replays.runs)
+    if start.formulation == "paper":  # whose error has several minima in kappa and W_stiff
+        tried = [start]
+        for parameter, values in ((DAMPING, DAMPINGS), (STIFFNESS_WEIGHT, WEIGHTS)):
+            if parameter in parameters:
+                tried = [parameter.write(settings, value) for settings in tried for value in values]
+        replays.begin_stage("starts", count * len(tried))
+        replays.of(tried)
+        found = [min(tried, key=replays.error)]
+    elif STIFFNESS_OVER_DRAG in parameters:
+        tried = []
+        for base in bases:
+            low, high = STIFFNESS_OVER_DRAG.bounds(base)
+            stiffnesses = np.clip(np.array(STARTS) * stiffness_over_drag(base), low, high).tolist()
+            tried += [with_stiffness_over_drag(base, stiffness) for stiffness in stiffnesses]
+        replays.begin_stage("starts", count * len(bases) * (len(STARTS) + MAX_STARTS * 8))
+        replays.of(tried)  # at once, so that all cores have work
+        errors = np.array([replays.error(settings) for settings in tried]).reshape(len(bases), -1)
+        found = []
+        for index in _not_much_worse(errors.min(axis=1).tolist(), POOR, MUCH):
+            objectives = [
+                Objective(replays, tried[index * len(STARTS) + place], [STIFFNESS_OVER_DRAG], whole=True)
+                for place in local_minima(errors[index].tolist())[:MAX_STARTS]
+            ]
+            found.append(min((objective.fit() for objective in objectives), key=lambda fit: fit.cost).settings)
+        found = [found[i] for i in _not_much_worse([replays.error(s) for s in found], WORSE_TIMES, WORSE_BY)]
+    else:
         return bases
-    count = len(replays.runs)
-    replays.begin_stage("starts", count * len(bases) * (len(STARTS) + MAX_STARTS * 8))
-    tried = [started for base in bases for started in _started(base)]
-    replays.of(tried)  # at once, so that all cores have work
-    errors = np.array([replays.error(settings) for settings in tried]).reshape(len(bases), -1)
-    found = []
-    for index in _not_much_worse(errors.min(axis=1).tolist(), POOR, MUCH):
-        objectives = [
-            Objective(replays, tried[index * len(STARTS) + place], [STIFFNESS_OVER_DRAG], whole=True)
-            for place in local_minima(errors[index].tolist())[:MAX_STARTS]
-        ]
-        found.append(min((objective.fit() for objective in objectives), key=lambda fit: fit.cost).settings)
     replays.end_stage(f"tried {len(tried)} starts")
-    return [found[i] for i in _not_much_worse([replays.error(s) for s in found], WORSE_TIMES, WORSE_BY)]
-
-
-def _best_on_grid(replays: Replays, start: ThreadModelSettings, parameters: Sequence[Parameter]) -> ThreadModelSettings:
-    """Return the best start of the formulation `paper`, whose error has several minima in kappa and W_stiff."""
-    tried = [start]
-    for parameter, values in ((DAMPING, DAMPINGS), (STIFFNESS_WEIGHT, WEIGHTS)):
-        if parameter in parameters:
-            tried = [parameter.write(settings, value) for settings in tried for value in values]
-    replays.begin_stage("starts", len(replays.runs) * len(tried))
-    replays.of(tried)
-    best = min(tried, key=replays.error)
-    replays.end_stage(f"tried {len(tried)} starts")
-    return best
-
-
-def _started(base: ThreadModelSettings) -> list[ThreadModelSettings]:
-    """Return settings with each of the stiffnesses to start from."""
-    low, high = STIFFNESS_OVER_DRAG.bounds(base)
-    middle = stiffness_over_drag(base)
-    return [with_stiffness_over_drag(base, float(np.clip(factor * middle, low, high))) for factor in STARTS]
+    return found
 
 
 def _not_much_worse(errors: Sequence[float], times: float, by: float) -> list[int]:

@@ -41,7 +41,7 @@ Source: cluster-robust covariance, K.-Y. Liang, S. L. Zeger, Biometrika 73 (1986
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -58,8 +58,7 @@ CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike 
 MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
 
 
-@dataclass(frozen=True)
-class Uncertainty:
+class Uncertainty(NamedTuple):
     """How well numbers are determined.
 
     Attributes:
@@ -81,22 +80,23 @@ def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], col
         runs: that it was fitted to.
         columns: of the numbers.
     """
-    count = len(columns)
     jacobian = [j[..., list(columns)] for j in solution.jacobian]
     flat = np.concatenate([j[run.known] for j, run in zip(jacobian, runs, strict=True)])
-    weights = np.concatenate([w[p.known] for w, p in zip(solution.weights, runs, strict=True)])
+    weights = np.concatenate([w[run.known] for w, run in zip(solution.weights, runs, strict=True)])
     size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), MIN_EFFECT)
-    scaled = flat / size
-    gram = scaled.T @ (weights[:, None] * scaled)
-    inverse = np.linalg.pinv(gram, rcond=1e-12, hermitian=True)
+    inverse = np.linalg.pinv((flat / size).T @ (weights[:, None] * flat / size), rcond=1e-12, hermitian=True)
     deviation = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
     correlation = np.clip(inverse / np.outer(deviation, deviation), -1.0, 1.0)
-    effect = np.array([_own_effect(flat, weights, index) for index in range(count)])
-    blocks, whole = _scores(solution, jacobian, runs, size)
-    half = _half(inverse, blocks) / size
+    effect = np.array([_own_effect(flat, weights, index) for index in range(len(columns))])
+    blocks, whole = [], []  # J' W r of each block of time, and of each run
+    for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
+        by_frame, block = np.einsum("knp,kn->kp", j / size, w * r), run.blocks
+        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
+        whole.append(by_frame.sum(axis=0))
+    half = _half(inverse, np.array(blocks))
     if len(runs) >= CLUSTERS:
-        half = np.maximum(half, _half(inverse, whole) / size)
-    return Uncertainty(half + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
+        half = np.maximum(half, _half(inverse, np.array(whole)))
+    return Uncertainty(half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
 
 
 def _half(inverse: Array, scores: Array) -> Array:
@@ -109,19 +109,6 @@ def _half(inverse: Array, scores: Array) -> Array:
     return np.asarray(stdtrit(count - 1, 0.975) * np.sqrt(variance))
 
 
-def _scores(
-    solution: FitSolution, jacobian: Sequence[Array], runs: Sequence[RecordedRun], size: Array
-) -> tuple[Array, Array]:
-    """Return J' W r of each block of time, and of each run."""
-    blocks, whole = [], []
-    for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
-        by_frame = np.einsum("knp,kn->kp", j / size, w * r)
-        block = run.blocks
-        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
-        whole.append(by_frame.sum(axis=0))
-    return np.array(blocks), np.array(whole)
-
-
 def _own_effect(flat: Array, weights: Array, index: int) -> float:
     """Return the mean size of a column of the Jacobian, less what the other columns make up for."""
     own, others = flat[:, index], np.delete(flat, index, axis=1)
@@ -132,8 +119,7 @@ def _own_effect(flat: Array, weights: Array, index: int) -> float:
     return float(np.abs(own).mean())
 
 
-@dataclass(frozen=True)
-class Identifiability:
+class Identifiability(NamedTuple):
     """Identifiability of one parameter, with its confidence interval.
 
     Attributes:
@@ -145,11 +131,6 @@ class Identifiability:
     reason: str
     half: float
     effect: float
-
-    @property
-    def identified(self) -> bool:
-        """Whether the data identify the parameter."""
-        return not self.reason
 
 
 def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:

@@ -99,13 +99,6 @@ class RecordedRun:
         return float(self.stamps[-1] - self.stamps[0]) * 1e-9
 
 
-def _initial_shape(observation: Observation, initial: InitialObservation) -> Points | None:
-    """Return the shape from which a leg starts, as a thread of the node does; None if it does not from this frame."""
-    if observation.observation is not None:
-        return initial.shape(observation.stamp, observation.observation)
-    return observation.measured if len(observation.measured) > 1 else None
-
-
 def read_run(
     name: str,
     observations: Iterable[Observation],
@@ -148,8 +141,10 @@ def read_run(
                 raise InvalidInputError(name, f"a time {back:.1f} s before the last", "one run, by time, in each bag")
             continue
         if last is None or stamp > last + GAP:
-            initial = _initial_shape(observation, start)
-            if initial is None or arc_lengths(initial)[-1] < enough:
+            # As a thread of the node starts; where it does not from this frame, there is no shape.
+            told = observation.observation
+            initial = observation.measured if told is None else start.shape(stamp, told)
+            if initial is None or len(initial) < 2 or arc_lengths(initial)[-1] < enough:
                 continue
             legs.append(len(poses))
             initials.append(initial)
@@ -158,16 +153,17 @@ def read_run(
         is_settled = stamp >= poses[legs[-1]][0] + round(SETTLING * 1e9)
         if is_settled and lengths[AGAINST.index(against)] >= enough:
             compared.append((len(poses) - 1, measured if against == "seen" else true, true))
-    problems = {
-        "shows no needle in any frame; is it another setup's?": not counts["needle"],
-        "shows no thread in any frame: nothing to start from or to compare with": not counts["seen"],
-        "never shows half of the thread or more: nothing to start from": not poses,
-        "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen": against == "truth"
-        and not counts["truth"],
-    }
-    for problem, is_there in problems.items():
-        if is_there:
-            raise BagError(name, problem)
+    problem = ""
+    if not counts["needle"]:
+        problem = "shows no needle in any frame; is it another setup's?"
+    elif not counts["seen"]:
+        problem = "shows no thread in any frame: nothing to start from or to compare with"
+    elif not poses:
+        problem = "never shows half of the thread or more: nothing to start from"
+    elif against == "truth" and not counts["truth"]:
+        problem = "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen"
+    if problem:
+        raise BagError(name, problem)
     ends = [*legs[1:], len(poses)]
     duration = sum(poses[end - 1][0] - poses[leg][0] for leg, end in zip(legs, ends, strict=True)) * 1e-9
     if duration < MIN_DURATION:
@@ -181,36 +177,34 @@ def read_run(
     stamps, tails, headings = zip(*poses, strict=True)
     frames, targets, truths = zip(*(compared[index] for index in chosen), strict=True)
     run = RecordedRun(
-        name,
-        np.array(stamps, dtype=np.int64),
-        np.array(tails),
-        np.array(headings),
-        tuple(legs),
-        tuple(initials),
-        np.array(frames, dtype=np.int64),
-        np.array(targets),
-        np.array(truths),
-        against,
-        simulated,
-        scene,
+        name=name,
+        stamps=np.array(stamps, dtype=np.int64),
+        tails=np.array(tails),
+        headings=np.array(headings),
+        legs=tuple(legs),
+        initials=tuple(initials),
+        frames=np.array(frames, dtype=np.int64),
+        targets=np.array(targets),
+        ground_truths=np.array(truths),
+        against=against,
+        simulated=simulated,
+        scene=scene,
     )
-    _check_motion(run, length)
+    moved = _moved(run) / length
+    if moved < STILL:
+        raise BagError(name, f"nothing moves: {moved:.1%} of the thread's length, expected {SLOW:.0%} and more")
+    if moved < SLOW:
+        words = f"needle and thread move by {moved:.1%} of the thread's length in {run.duration:.0f} s"
+        raise BagError(name, f"the needle is too slow: {words}, expected {SLOW:.0%} and more")
     return run
 
 
-def _check_motion(run: RecordedRun, length: float) -> None:
-    """Refuse a run in which the thread hardly moves; averages over a second leave the camera's noise out."""
+def _moved(run: RecordedRun) -> float:
+    """Return the diagonal of the box that the needle or a node moves in [m]; means over a second leave noise out."""
     parts = (run.times / SMOOTHED).astype(int)
-    tail = run.tails[run.frames][:, None]
-    nodes = np.concatenate([tail, run.targets], axis=1)
+    nodes = np.concatenate([run.tails[run.frames][:, None], run.targets], axis=1)
     blocks = (np.moveaxis(nodes[parts == part], 0, -1) for part in np.unique(parts))
     means = np.array([mean_over_nodes(block, np.isfinite(block)) for block in blocks])
-    known = np.isfinite(means[..., 0]).sum(axis=0) > 1
-    way = means[:, known]
+    way = means[:, np.isfinite(means[..., 0]).sum(axis=0) > 1]
     extent = np.nanmax(way, axis=0) - np.nanmin(way, axis=0)
-    moved = float(np.hypot(extent[:, 0], extent[:, 1]).max()) / length
-    if moved < STILL:
-        raise BagError(run.name, f"nothing moves: {moved:.1%} of the thread's length, expected {SLOW:.0%} and more")
-    if moved < SLOW:
-        words = f"needle and thread move by {moved:.1%} of the thread's length in {run.duration:.0f} s"
-        raise BagError(run.name, f"the needle is too slow: {words}, expected {SLOW:.0%} and more")
+    return float(np.hypot(extent[:, 0], extent[:, 1]).max())

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.errors import GraphError, InvalidInputError
-from magnetosuture_thread.evaluation.metrics import error_figures, mean_over_nodes, node_errors
+from magnetosuture_thread.evaluation.metrics import mean_over_nodes, node_errors
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import ThreadSession
@@ -22,7 +22,6 @@ from magnetosuture_thread.workers import WorkerDiedError, make_runner
 
 REMEMBERED = 16  # settings, with all that they predict; a Jacobian asks again for its middle
 SHARES = {"starts": 0.2, "fit": 0.4, "identified": 0.15, "held out": 0.25}  # of the time, by stage
-EASED = 0.8  # of a stage is gone through with the replays expected, the rest ever more slowly
 
 Task = tuple[int, ThreadModelSettings]
 RunTasks = Callable[[Sequence[Task]], list[Points]]
@@ -74,11 +73,9 @@ def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") 
     with make_runner(partial(_run_task, tuple(runs)), workers, scheduler) as runner:
 
         def run(tasks: Sequence[Task]) -> list[Points]:
-            results = dict[int, Points]()
-            for index, result in runner.run(tasks):
-                if isinstance(result, WorkerDiedError):
-                    raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
-                results[index] = result
+            results = dict(runner.run(tasks))
+            if any(isinstance(result, WorkerDiedError) for result in results.values()):
+                raise GraphError("a process that replayed a bag died; is there enough memory for --workers?")
             return [results[index] for index in range(len(tasks))]
 
         yield run
@@ -107,13 +104,12 @@ def across_residuals(vertices: Points, run: RecordedRun, length: float) -> Array
     Returns:
         Shape (K, n); 0 where the thread is not known, 1 where it is not predicted.
     """
-    along = np.empty_like(vertices)
-    along[:, 1:-1] = vertices[:, 2:] - vertices[:, :-2]
-    along[:, 0], along[:, -1] = vertices[:, 1] - vertices[:, 0], vertices[:, -1] - vertices[:, -2]
-    size = np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-12)
+    last = len(run.targets[0])
+    along = vertices[:, np.minimum(np.arange(1, last + 1) + 1, last)] - vertices[:, :-1]
     offset = vertices[:, 1:] - run.targets
-    crossed = along[:, 1:, 0] * offset[..., 1] - along[:, 1:, 1] * offset[..., 0]
-    return _filled(crossed / (size[:, 1:] * length), run.known)
+    size = np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-12)
+    crossed = along[..., 0] * offset[..., 1] - along[..., 1] * offset[..., 0]
+    return _filled(crossed / (size * length), run.known)
 
 
 def offset_residuals(vertices: Points, run: RecordedRun, length: float) -> Array:
@@ -136,19 +132,14 @@ def mean_across(vertices: Points, run: RecordedRun, length: float) -> float:
     return 100.0 * float(np.abs(across_residuals(vertices, run, length))[run.known].mean())
 
 
-def frame_errors(vertices: Points, targets: Points, length: float) -> Array:
-    """Return the prediction error of each frame, shape (K,) [% of length]; see `evaluation.metrics`.
+def mean_error(vertices: Points, targets: Points, length: float) -> float:
+    """Return the mean over the frames of the prediction error [% of length], see `evaluation.metrics`.
 
-    Not a number where nothing is known; a node that is not predicted counts as a length off.
+    A node that is not predicted counts as a length off; not a number if nothing is known.
     """
     found = node_errors(vertices, targets, length)
-    return mean_over_nodes(np.where(np.isfinite(found), found, 100.0), np.isfinite(targets[..., 0]))
-
-
-def mean_error(vertices: Points, targets: Points, length: float) -> float:
-    """Return the mean over the frames of the prediction error [% of length]; not a number if nothing is known."""
-    figures = error_figures(frame_errors(vertices, targets, length))
-    return figures["mean"] if figures is not None else math.nan
+    frames = mean_over_nodes(np.where(np.isfinite(found), found, 100.0), np.isfinite(targets[..., 0]))
+    return float(np.nanmean(frames)) if np.isfinite(frames).any() else math.nan
 
 
 @dataclass
@@ -168,12 +159,6 @@ class BestSettings:
     vertices: list[Points] = field(default_factory=list)
     first: list[Points] = field(default_factory=list)
     replays: int = 0
-
-    def offer(self, settings: ThreadModelSettings, error: float, vertices: list[Points]) -> None:
-        """Keep the better one."""
-        self.first = self.first or vertices
-        if error < self.error:
-            self.settings, self.error, self.vertices = settings, error, vertices
 
 
 class Replays:
@@ -195,8 +180,7 @@ class Replays:
         progress: Callable[[float], None] = lambda share: None,
         log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self.runs = tuple(runs)
-        self.best = best or BestSettings()
+        self.runs, self.best = tuple(runs), best or BestSettings()
         self._run_tasks = run_tasks or self._run_here
         self._progress, self._log = progress, log
         self._begin = self._width = 0.0
@@ -207,25 +191,29 @@ class Replays:
     def of(self, many: Sequence[ThreadModelSettings], which: Sequence[int] | None = None) -> list[list[Points]]:
         """Return the predicted nodes of each of some settings on some of the runs; all of them if None."""
         chosen = range(len(self.runs)) if which is None else which
-        tasks = list(dict.fromkeys((index, settings) for settings in many for index in chosen))
+        tasks = dict.fromkeys((index, settings) for settings in many for index in chosen)
         missing = [task for task in tasks if task not in self._known]
-        self._known |= zip(missing, self._run_tasks(missing), strict=True) if missing else ()
+        if missing:
+            self._known.update(zip(missing, self._run_tasks(missing), strict=True))
         result = [[self._known[index, settings] for index in chosen] for settings in many]
-        for task in list(self._known)[: max(0, len(self._known) - REMEMBERED * len(self.runs))]:
+        for task in list(self._known)[: -REMEMBERED * len(self.runs)]:
             del self._known[task]
         self.best.replays += len(missing)
         if len(chosen) == len(self.runs):
             for settings, vertices in zip(many, result, strict=True):
-                if settings not in self._errors:
-                    pairs = zip(vertices, self.runs, strict=True)
-                    self._errors[settings] = float(
-                        np.mean([mean_error(v, run.targets, settings.thread_length) for v, run in pairs])
-                    )
-                    self.best.offer(settings, self._errors[settings], vertices)
+                self._keep_best(settings, vertices)
         self._done += len(missing)
-        share = self._done / self._expected
-        self._progress(self._begin + self._width * (EASED * share if share < 1.0 else 1.0 - (1.0 - EASED) / share))
+        self._progress(self._begin + self._width * self._done / (self._done + self._expected))
         return result
+
+    def _keep_best(self, settings: ThreadModelSettings, vertices: list[Points]) -> None:
+        pairs, best = zip(vertices, self.runs, strict=True), self.best
+        if settings not in self._errors:
+            errors = [mean_error(v, run.targets, settings.thread_length) for v, run in pairs]
+            self._errors[settings] = float(np.mean(errors))
+        best.first = best.first or vertices
+        if self._errors[settings] < best.error:
+            best.settings, best.error, best.vertices = settings, self._errors[settings], vertices
 
     def error(self, settings: ThreadModelSettings) -> float:
         """Return the mean over the runs of the prediction error [% of length]."""

@@ -1,14 +1,17 @@
-"""The result of a calibration: estimates, attachment, and errors of each bag before and after."""
+"""The result of a calibration: estimates, errors of each bag, the parameter file, tables and text."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from rich.table import Table
 
+from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
 from magnetosuture_thread.calibration.residuals import mean_across, mean_error
 from magnetosuture_thread.evaluation.metrics import finite_or_none
@@ -17,6 +20,15 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 WORSE = 1.05  # times the error before, from which on a person should know
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
+WIDTH = 118
+# Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.
+GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction")
+UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
+STIFFNESS = (
+    "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
+    "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
+    "thread's own as far as these are true."
+)
 
 
 @dataclass(frozen=True)
@@ -114,19 +126,31 @@ class BagErrors:
         return f"{self.name}: {nodes}; across the thread, which is what was fitted, {across}: {end}"
 
 
-@dataclass(frozen=True)
-class BagFit:
+class BagFit(NamedTuple):
     """One bag before and after, for the picture.
 
     Attributes:
         run: the bag.
         before: predicted nodes with what the setup says, shape (K, n + 1, 2) [m].
         after: calibrated.
+        held_out: calibrated by the other bags; None if there are none.
     """
 
     run: RecordedRun
     before: Points
     after: Points
+    held_out: Points | None = None
+
+    def errors(self, length: float) -> BagErrors:
+        """Return the errors of the bag, of a thread of a length [m]."""
+        run = self.run
+        errors = [
+            math.nan if vertices is None else mean_error(vertices, targets, length)
+            for targets in (run.targets, run.ground_truths)
+            for vertices in self[1:]
+        ]
+        across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
+        return BagErrors(run.name, len(run.frames), *errors, *across, unverified=run.unverified)
 
 
 @dataclass(frozen=True)
@@ -135,7 +159,6 @@ class CalibrationResult:
 
     Attributes:
         settings: of the thread model, calibrated.
-        start: what the setup and the material say.
         against: `seen` or `truth`.
         estimates: of all numbers that were asked for.
         attachment: which fits better; None if it was not asked for.
@@ -146,7 +169,6 @@ class CalibrationResult:
     """
 
     settings: ThreadModelSettings
-    start: ThreadModelSettings
     against: str
     estimates: tuple[Estimate, ...]
     attachment: AttachmentDecision | None
@@ -159,32 +181,28 @@ class CalibrationResult:
     def of(
         cls,
         settings: ThreadModelSettings,
-        start: ThreadModelSettings,
         fits: Sequence[BagFit],
         estimates: tuple[Estimate, ...],
         attachment: AttachmentDecision | None,
         replays: int,
-        held_out: Sequence[Points | None] | None = None,
         finished: bool = True,
     ) -> CalibrationResult:
-        """Return the result of fits of some bags; `held_out` as in `bag_errors`."""
-        scores, simulated = bag_errors(fits, start.thread_length, held_out), tuple(fit.run.simulated for fit in fits)
-        against = fits[0].run.against
-        return cls(settings, start, against, estimates, attachment, scores, simulated, replays, finished)
+        """Return the result of fits of some bags."""
+        scores = tuple(fit.errors(settings.thread_length) for fit in fits)
+        simulated = tuple(fit.run.simulated for fit in fits)
+        return cls(settings, fits[0].run.against, estimates, attachment, scores, simulated, replays, finished)
 
     @property
     def warnings(self) -> list[str]:
         """Warnings for the user."""
         lines = []
         for estimate in self.estimates:
+            words = f"{estimate.name} cannot be identified in this data: {estimate.reason}"
             if estimate.status == STAND_IN:
-                lines.append(
-                    f"{estimate.name} cannot be identified in this data: {estimate.reason}; {estimate.value:.4g} "
-                    f"{estimate.unit}".rstrip()
-                    + " stands in, as it predicts better than what the setup says"
-                )
-            elif estimate.reason:
-                lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
+                value = f"{estimate.value:.4g} {estimate.unit}".rstrip()
+                words += f"; {value} stands in, as it predicts better than what the setup says"
+            if estimate.reason:
+                lines.append(words)
         if self.attachment is not None and self.attachment.reason:
             lines.append(f"the attachment cannot be told: {self.attachment.reason}")
         lines += [f"{score.name} is unverified: {score.unverified}" for score in self.scores if score.unverified]
@@ -216,24 +234,157 @@ def _plain(values: Any) -> dict[str, Any]:
     return {key: finite_or_none(value) for key, value in asdict(values).items()}
 
 
-def bag_errors(
-    fits: Sequence[BagFit], length: float, held_out: Sequence[Points | None] | None = None
-) -> tuple[BagErrors, ...]:
-    """Return the errors of all bags.
+def to_yaml(calibration: CalibrationResult) -> str:
+    """Return the text of the file, the same for the same calibration."""
+    lines = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"]
+    settings = calibration.settings
+    if settings.formulation != "rod":
+        lines.append(f"    formulation: {settings.formulation}")
+    for name in GIVEN:
+        value = getattr(settings, name)
+        if name != "diameter" or value:
+            lines.append(f"    {name}: {_written(value)}")
+    if settings.formulation == "rod":
+        lines += _attachment(calibration)
+    groups: dict[str, list[Estimate]] = {}
+    for estimate in calibration.estimates:
+        groups.setdefault(estimate.setting, []).append(estimate)
+    for name, estimates in groups.items():
+        lines += _entry(name, estimates, settings)
+    return "\n".join(lines) + "\n"
 
-    Args:
-        fits: each bag before and after.
-        length: of the thread [m].
-        held_out: predicted nodes of each, calibrated by the other bags.
-    """
-    scores = []
-    for fit, held in zip(fits, held_out or [None] * len(fits), strict=True):
-        run = fit.run
-        errors = [
-            math.nan if vertices is None else mean_error(vertices, targets, length)
-            for targets in (run.targets, run.ground_truths)
-            for vertices in (fit.before, fit.after, held)
-        ]
-        off = [mean_across(vertices, run, length) for vertices in (fit.before, fit.after)]
-        scores.append(BagErrors(run.name, len(run.frames), *errors, *off, unverified=run.unverified))
-    return tuple(scores)
+
+def _header(calibration: CalibrationResult) -> list[str]:
+    words = [
+        "A thread calibrated by `magnetosuture calibrate`, for the node thread_model: put the lines into the setup's "
+        "own section, or give the node both files, this one last."
+    ]
+    if not calibration.finished:
+        words.insert(0, "BEST SO FAR, NOT FINISHED: the calibration was interrupted. There are no intervals.")
+    for score, simulated in zip(calibration.scores, calibration.simulated, strict=True):
+        source = f"simulated: {simulated}" if simulated else "nothing in it says that it is simulated"
+        held = "" if math.isnan(score.held_out) else f", by the other bags {score.held_out:.3g}"
+        figures = f"{score.before:.3g} before, {score.after:.3g} after{held}"
+        words.append(
+            f"From {score.name} ({source}), {score.frames} frames: prediction error {figures} % of the length."
+        )
+        if score.unverified:
+            words.append(f"  UNVERIFIED: {score.unverified}.")
+        if not math.isnan(score.truth_after):
+            held = "" if math.isnan(score.truth_held_out) else f", by the other bags {score.truth_held_out:.3g}"
+            words.append(
+                f"  Against the ground truth: {score.truth_before:.3g} before, {score.truth_after:.3g} after{held} %."
+            )
+    compared = "the measured centreline" if calibration.against == "seen" else "the ground truth"
+    if calibration.finished:
+        words.append(f"Fitted to {compared}. Intervals are of 95 %.")
+    if calibration.settings.formulation == "rod" and any(
+        estimate.setting == "elastic_modulus" for estimate in calibration.estimates
+    ):
+        words.append(STIFFNESS)
+    return [line for text in words for line in _comment(text)]
+
+
+def _comment(text: str, indent: str = "") -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+
+
+def _attachment(calibration: CalibrationResult) -> list[str]:
+    verdict, value = calibration.attachment, calibration.settings.attachment
+    if verdict is None:
+        return [f"    {ATTACHMENT}: {value} # as in the setup"]
+    if verdict.reason:
+        return _comment(f"{ATTACHMENT} is left out, as this data cannot tell it: {verdict.reason}", "    ")
+    errors = ", ".join(f"{kind} {error:.3g} %" for kind, error in sorted(verdict.errors.items()))
+    return [f"    {ATTACHMENT}: {value}" + (f" # best fits: {errors}" if len(verdict.errors) > 1 else "")]
+
+
+def _entry(name: str, estimates: list[Estimate], settings: ThreadModelSettings) -> list[str]:
+    """Return the lines of one setting, with why it is left out or what stands in."""
+    lines = []
+    for estimate in estimates:
+        if estimate.reason:
+            what = "is left out" if estimate.status == FIXED else "is no measurement but what predicts best"
+            if estimate.status == FIXED and any(other.status != FIXED for other in estimates):
+                what = f"stays {estimate.start:.4g} {estimate.unit}"
+            lines += _comment(f"{estimate.name} {what}, as this data cannot tell it: {estimate.reason}", "    ")
+    if all(estimate.status == FIXED for estimate in estimates):
+        return lines
+    value = getattr(settings, name)
+    if name == OFFSET and not value:
+        value = (0.0, 0.0)
+    intervals = "; ".join(_interval(estimate) for estimate in estimates if estimate.status == IDENTIFIED)
+    note = " ".join(part for part in (UNITS.get(name, ""), "" if not intervals else f"[{intervals}]") if part)
+    if name == "elastic_modulus":
+        note = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s" + (f" [{intervals}]" if intervals else "")
+    return [*lines, f"    {name}: {_written(value)}" + (f" # {note}" if note else "")]
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.low:.3g} to {estimate.high:.3g}"
+
+
+def _written(value: Any) -> str:
+    """Return a value as ROS and any YAML reader take it: a float has its point, a list one kind."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_written(entry) for entry in value) + "]"
+    if not isinstance(value, float):
+        return str(value)
+    text = f"{value:.6g}"
+    mantissa, exponent, power = text.partition("e")
+    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power
+
+
+def parameter_table(found: Mapping[str, Any]) -> Table:
+    """Return a row for each number, as `Calibration.to_json` gives them."""
+    title = f"{found['material']}, formulation {found['formulation']}"
+    table = Table(title=title if found["finished"] else f"{title}: best so far, not finished")
+    table.caption = "? cannot be identified in this data"
+    for name in ("parameter", "value", "95 % interval", "setup"):
+        table.add_column(name, justify="left" if name == "parameter" else "right", no_wrap=True)
+    for row in found["parameters"]:
+        scale, unit = (1e3, "mm") if row["unit"] == "m" else (1.0, row["unit"])
+        interval = "-" if row["low"] is None else f"{scale * row['low']:.3g} to {scale * row['high']:.3g}"
+        value = f"{scale * row['value']:.4g}" + (" ?" if row["reason"] else "")
+        name = f"{row['name']} \\[{unit}]" if unit else row["name"]
+        table.add_row(name, value, interval, f"{scale * row['start']:.4g}")
+    attachment = found["attachment"]
+    if attachment is not None:
+        value = attachment["value"] + (" ?" if attachment["reason"] else "")
+        table.add_row("attachment", value, "-", attachment["start"])
+    return table
+
+
+def bag_table(found: Mapping[str, Any]) -> Table:
+    """Return a row for each bag: prediction errors before and after, and by the other bags."""
+    several, truth = len(found["bags"]) > 1, any(row["truth_after"] is not None for row in found["bags"])
+    fitted = "the measured thread" if found["against"] == "seen" else "ground truth"
+    table = Table(title=f"prediction error, fitted to {fitted}")
+    table.caption = "mean over time of the mean distance of the nodes, % of the length"
+    table.add_column("bag", overflow="fold", min_width=12)
+    table.add_column("frames", justify="right")
+    # On a line of its own, as eight columns must fit into a terminal's 80.
+    kinds = ["", *(["ground\ntruth\n"] if truth and found["against"] == "seen" else [])]
+    for kind in kinds:
+        for name in ("before", "after", *(["held out"] if several else [])):
+            table.add_column(f"{kind}{name}" if kind else name.replace(" ", "\n"), justify="right", no_wrap=True)
+    for row in found["bags"]:
+        cells = []
+        for kind in kinds:
+            keys = ("before", "after", *(["held_out"] if several else []))
+            cells += [_percent(row[("truth_" if kind else "") + key]) for key in keys]
+        table.add_row(row["name"], str(row["frames"]), *cells)
+    return table
+
+
+def calibration_lines(found: Mapping[str, Any]) -> list[str]:
+    """Return the lines that complement the tables."""
+    simulated = [row["name"] for row in found["bags"] if row["simulated"]]
+    lines = [f"warning: {warning}" for warning in found["warnings"]]
+    if simulated:
+        lines.append(f"simulated: {', '.join(simulated)}")
+    return lines
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None or math.isnan(value) else f"{value:.3f}"

@@ -106,8 +106,7 @@ def unfinished_result(
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
     fits = [BagFit(*parts) for parts in zip(runs, best.first, best.vertices, strict=True)]
-    result = CalibrationResult.of(found, settings, fits, estimates, attachment, best.replays, finished=False)
-    return result, fits
+    return CalibrationResult.of(found, fits, estimates, attachment, best.replays, finished=False), fits
 
 
 @dataclass
@@ -130,23 +129,22 @@ class _Search:
         settings, statuses = self._identified(solution, found)
         self.replays.end_stage("fitted what can be identified")
         fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-        held_out = None
+        held_out: list[Points | None] = [None] * count
         if count > 1:
             self.replays.begin_stage("held out", count * (count - 1) * 3 * (len(fitted) + 1))
             held_out = [self._held_out(settings, fitted, solution.scale, index) for index in range(count)]
             self.replays.end_stage("predicted each bag by the others")
         before, after = self.replays.of([self.start, settings])
-        fits = [BagFit(*parts) for parts in zip(runs, before, after, strict=True)]
+        fits = [BagFit(*parts) for parts in zip(runs, before, after, held_out, strict=True)]
         estimates = tuple(
             self._estimate(solution, index, each, status, settings)
             for index, (each, status) in enumerate(zip(found, statuses, strict=True))
         )
-        replays = self.replays.best.replays
-        return CalibrationResult.of(settings, self.start, fits, estimates, attachment, replays, held_out), fits
+        return CalibrationResult.of(settings, fits, estimates, attachment, self.replays.best.replays), fits
 
     def _fitted(self, objective: Objective) -> FitSolution:
         """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
-        scale = robust_scale(objective.residuals(objective.start()))
+        scale = robust_scale(objective.residuals(objective.start())[0])
         solution = objective.fit(scale=scale)
         narrower = robust_scale(solution.residuals)
         return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
@@ -182,7 +180,7 @@ class _Search:
     ) -> tuple[ThreadModelSettings, list[str]]:
         """Return the fit of what can be identified, and what became of each number."""
         statuses = [self._status(solution, index, each) for index, each in enumerate(found)]
-        if all(each.identified for each in found):
+        if not any(each.reason for each in found):
             return solution.settings, statuses
         spare = [index for index, status in enumerate(statuses) if status == FIXED]
         spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
@@ -199,7 +197,7 @@ class _Search:
 
     def _status(self, solution: FitSolution, index: int, each: Identifiability) -> str:
         """Return what becomes of a number at first: the setup's is kept unless the data contradict it."""
-        if each.identified:
+        if not each.reason:
             return IDENTIFIED
         parameter = self.parameters[index]
         off = abs(parameter.to_fit(parameter.read(self.start)) - float(solution.x[index]))

@@ -6,47 +6,33 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.campaign.loop import Measurement, Vector
 from magnetosuture_thread.coils.bridge import BridgeOutput
-from magnetosuture_thread.interface import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    CURRENTS,
-    ESTIMATED_THREAD,
-    FILTER_STATE,
-    GROUND_TRUTH_NEEDLE,
-    GROUND_TRUTH_PULL,
-    GROUND_TRUTH_THREAD,
-    MARGINS,
-    MEASURED_THREAD,
-    NEEDLE_COMMAND,
-    NEEDLE_POSE,
-    PREDICTED_THREAD,
-    SCENE,
-    THREAD_OBSERVATION,
-)
-from magnetosuture_thread.messages.outputs import (
+from magnetosuture_thread.messages.packing import (
     Outputs,
     camera_outputs,
     estimate_outputs,
     ground_truth_outputs,
+    packed_currents,
+    packed_filter_state,
+    packed_twist,
     pose_outputs,
     prediction_outputs,
     thread_outputs,
 )
-from magnetosuture_thread.messages.packing import packed_currents, packed_filter_state, packed_twist
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.rig import RigFrame
 from magnetosuture_thread.setups import Setup
 from magnetosuture_thread.thread_model.session import PredictionResult
 
-OF_CAMERA = (COMPRESSED_IMAGE, CAMERA_INFO)
-GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
-OF_TRACKER = (NEEDLE_POSE, THREAD_OBSERVATION, MEASURED_THREAD)
-OF_MODEL = (PREDICTED_THREAD, ESTIMATED_THREAD, MARGINS)
-OF_BRIDGE = (NEEDLE_COMMAND, CURRENTS, FILTER_STATE)
+OF_CAMERA = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO)
+GROUND_TRUTH = (interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL)
+OF_TRACKER = (interface.NEEDLE_POSE, interface.THREAD_OBSERVATION, interface.MEASURED_THREAD)
+OF_MODEL = (interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS)
+OF_BRIDGE = (interface.NEEDLE_COMMAND, interface.CURRENTS, interface.FILTER_STATE)
 
 
 class RunBag:
@@ -66,10 +52,10 @@ class RunBag:
     def __init__(self, folder: Path, setup: Setup, notes: Mapping[str, str], start: float, *, camera: bool) -> None:
         self._bag, self._rig, self._material = BagWriter(folder, notes), setup.rig, setup.model.material
         frames = OF_CAMERA if camera else ()
-        for channel in (SCENE, *frames, *GROUND_TRUTH, *OF_TRACKER, *OF_MODEL, *OF_BRIDGE):
+        for channel in (interface.SCENE, *frames, *GROUND_TRUTH, *OF_TRACKER, *OF_MODEL, *OF_BRIDGE):
             self._bag.add_topic(channel.recorded, channel.type_name)
         begin = _nanoseconds(start)
-        self._bag.write(SCENE.recorded, begin, packed_scene(begin, setup.scene))
+        self._bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
         self._view = setup.rig.view(setup.scene)
         self._command = 0  # stamp of the last [ns]
 
@@ -99,7 +85,7 @@ class RunBag:
             self._write(time, thread_outputs(stamp, observation, observation.from_tail))
         self._write(time, prediction_outputs(result, self._material))
         self._write(time, estimate_outputs(result))
-        self._bag.write(NEEDLE_COMMAND.recorded, time, packed_twist(time, commanded))
+        self._bag.write(interface.NEEDLE_COMMAND.recorded, time, packed_twist(time, commanded))
         self._command = time
 
     def on_bridge(self, now: float, output: BridgeOutput) -> None:
@@ -107,8 +93,8 @@ class RunBag:
         time = _nanoseconds(now)
         if not (output.publish and self._command):
             return
-        self._bag.write(CURRENTS.recorded, time, packed_currents(time, self._command, output))
-        self._bag.write(FILTER_STATE.recorded, time, packed_filter_state(self._command, output))
+        self._bag.write(interface.CURRENTS.recorded, time, packed_currents(time, self._command, output))
+        self._bag.write(interface.FILTER_STATE.recorded, time, packed_filter_state(self._command, output))
 
     def _write(self, time: int, outputs: Outputs) -> None:
         for channel, data in outputs:

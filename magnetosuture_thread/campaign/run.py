@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
 from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.executor import (
     ENDED,
@@ -27,7 +28,6 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
 from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.safety.packed_scene import measure, pack_scene
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
@@ -210,7 +210,7 @@ class RunExtremes:
         self, planner: NeedlePlanner, scene: Scene, limits: Sequence[ProcedureLimits], wrap: Wrap | None
     ) -> None:
         self._planner, self._wrap, self._scene, self._limits = planner, wrap, scene, limits
-        self._packed = pack_scene(scene)
+        self._packed = pack_obstacles(scene.obstacles, scene.dish.radius)
         self.figures = RunFigures()
         self.closest: RunInstant | None = None
         self._last: deque[RunInstant] = deque()

@@ -43,7 +43,8 @@ SATURATION_TOLERANCE = 0.05  # relative velocity error at a current limit, above
 GAIN_DEVIATION = 0.05  # of a calibrated coil
 MAX_CHANGE = 0.2  # of a gain
 DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
-DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and by which a thread turns it from the field
+DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
+TORQUE_TIME = 1.0  # s; in which the thread's torque on the needle changes, as a thread is led around a turn
 GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
 MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
 MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
@@ -302,35 +303,43 @@ class CoilAllocation:
 class CoilGainEstimator:
     """Estimates by which factor each coil's field differs from its calibration.
 
-    A needle in a viscous liquid lies along the field within hundredths of a second, so that with the unit vector n
-    across its chord, the currents I and the calibrated field b_i of one ampere in coil i,
+    The needle's magnetic moment m turns towards the field, against the liquid and the thread. With the unit vector n
+    across its chord, the currents I, the calibrated field b_i of one ampere in coil i, the turning drag c, the rate
+    omega at which the poses turn and the thread's torque T,
 
-        0 = n . sum_i g_i b_i I_i + noise,    of deviation DIRECTION_DEVIATION |B|
+        n . sum_i g_i b_i I_i = (c omega + T) / m + noise,    of deviation DIRECTION_DEVIATION |B|
 
-    which a Kalman filter with the gains g as its state, 1 with GAIN_DEVIATION at first, takes at each measured pose. A
-    factor on all gains does not show in the direction: their mean stays 1.
+    A Kalman filter takes this at each measured pose. Its state is the gains g, 1 with GAIN_DEVIATION at first, and
+    T / m, which is 0 with the deviation of the largest pull of a thread at the tail, and is forgotten in
+    TORQUE_TIME. A factor on all gains does not show in the direction: their mean stays 1.
 
     Source: the extended Kalman filter. Deviation: the gains are scaled to their mean after each measurement, their
     covariance is not. Pure: times come in, in seconds.
 
     Args:
         coils: their calibrated field.
-        needle: its kinematics.
+        needle: its mechanics.
+        max_torque: of the thread on the needle [N m].
     """
 
-    def __init__(self, coils: LoopCoils, needle: NeedleKinematics) -> None:
+    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, max_torque: float) -> None:
         self._coils, self._needle = coils, needle
         count = len(coils.names)
-        self.gains = np.ones(count)
-        self._covariance = GAIN_DEVIATION**2 * np.eye(count)
+        self._state = np.append(np.ones(count), 0.0)  # gains, and the field that balances the thread's torque [T]
+        self._torque_variance = (max_torque / needle.moment) ** 2
+        self._covariance = np.diag([GAIN_DEVIATION**2] * count + [self._torque_variance])
         self._applied: deque[tuple[float, Vector]] = deque()
-        self._last = -math.inf
+        self._last: tuple[float, Vector] | None = None  # stamp and chord's direction of the last pose
+
+    @property
+    def gains(self) -> Vector:
+        """The factors, shape (m,)."""
+        return self._state[:-1]
 
     def apply(self, now: float, currents: Vector) -> None:
         """Register the currents from a time of the stamps' clock on, shape (m,) [A]."""
         if self._applied and now < self._applied[-1][0]:  # time was set back
             self._applied.clear()
-            self._last = min(self._last, now)
         self._applied.append((now, currents))
 
     def stop(self) -> None:
@@ -345,25 +354,55 @@ class CoilGainEstimator:
             heading: unit vector at the tail, shape (2,).
             stamp: when it was measured [s].
         """
-        while len(self._applied) > 1 and self._applied[1][0] <= stamp:
-            self._applied.popleft()
-        if not self._applied or self._applied[0][0] > stamp or not self._applied[0][1].any():
-            return
         e = self._needle.chord_direction(heading)
+        last, self._last = self._last, (stamp, e)
+        if last is None or stamp <= last[0]:
+            return
+        interval = stamp - last[0]
+        self._predict(interval)
+        currents = self._mean_currents(last[0], stamp)
+        if currents is None:
+            return
         chord = self._needle.chord * e
-        fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * self._applied[0][1]
-        across = fields[1] * e[0] - fields[0] * e[1]
-        deviation = DIRECTION_DEVIATION * float(np.linalg.norm(fields @ self.gains))
-        self._covariance += DRIFT_DEVIATION**2 * min(1.0, max(0.0, stamp - self._last)) * np.eye(len(across))
-        self._last = stamp
-        spread = self._covariance @ across
-        variance = float(across @ spread) + deviation**2
-        residual = -float(across @ self.gains)
+        fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * currents
+        row = np.append(fields[1] * e[0] - fields[0] * e[1], -1.0)
+        turned = math.atan2(last[1][0] * e[1] - last[1][1] * e[0], float(last[1] @ e))
+        turning = self._needle.turning_drag / self._needle.moment / interval  # field for one radian in the interval
+        deviation = math.hypot(
+            DIRECTION_DEVIATION * float(np.linalg.norm(fields @ self.gains)), HEADING_ERROR * turning
+        )
+        spread = self._covariance @ row
+        variance = float(row @ spread) + deviation**2
+        residual = turning * turned - float(row @ self._state)
         if residual**2 > GATE**2 * variance:
             return
-        gains = self.gains + spread * (residual / variance)
-        self.gains = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
+        self._state = self._state + spread * (residual / variance)
+        gains = self.gains
+        self._state[:-1] = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
         self._covariance -= np.outer(spread, spread) / variance
+
+    def _mean_currents(self, start: float, end: float) -> Vector | None:
+        """Return the mean currents between two times [A]; None where some are zero or not known."""
+        while len(self._applied) > 1 and self._applied[1][0] <= start:
+            self._applied.popleft()
+        if not self._applied or self._applied[0][0] > start:
+            return None
+        total, since = np.zeros(len(self.gains)), start
+        for k, (_, currents) in enumerate(self._applied):
+            until = min(end, self._applied[k + 1][0]) if k + 1 < len(self._applied) else end
+            if until > since and not currents.any():
+                return None
+            total, since = total + max(0.0, until - since) * currents, max(since, until)
+        return total / (end - start)
+
+    def _predict(self, interval: float) -> None:
+        """Let the gains drift and the thread's torque be forgotten over an interval [s]."""
+        kept = math.exp(-interval / TORQUE_TIME)
+        self._state[-1] *= kept
+        self._covariance[-1] *= kept
+        self._covariance[:, -1] *= kept
+        self._covariance[-1, -1] += (1.0 - kept**2) * self._torque_variance
+        self._covariance[:-1, :-1] += DRIFT_DEVIATION**2 * min(1.0, interval) * np.eye(len(self.gains))
 
 
 class CertifiedAllocation:

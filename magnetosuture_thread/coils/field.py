@@ -17,7 +17,7 @@ from magnetosuture_thread.errors import ConfigurationError
 Vector = NDArray[np.float64]
 
 MIN_MEAN, MAX_MEANS = 1e-8, 40  # of c_n over a_n, whose next one is its square; and how many
-AXIS_TOLERANCE = 1e-4  # of the radius; closer to the axis the closed form is 0 / 0
+AXIS_TOLERANCE = 1e-5  # of the radius; closer to the axis the closed form is 0 / 0
 MIN_FIELD_PER_CURRENT = 1e-6  # T/A; a weaker coil has no effect
 
 
@@ -135,7 +135,9 @@ def loop_fields(along: Vector, aside: Vector, distance: Vector, radius: Vector, 
 
 
 @compiled
-def _fields(x: float, y: float, axes: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+def fields_per_current(
+    x: float, y: float, axes: NDArray[np.float64], numbers: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the field at a point for one ampere in each coil, shape (2, m).
 
     Args:
@@ -170,4 +172,4 @@ class LoopCoils:
 
     def per_current(self, point: Vector) -> NDArray[np.float64]:
         """Return the field at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
-        return np.asarray(_fields(float(point[0]), float(point[1]), self._axes, self._numbers))
+        return np.asarray(fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers))

@@ -12,7 +12,6 @@ import secrets
 from collections import Counter
 from urllib.parse import quote, urlsplit
 
-TOKEN_BYTES = 18
 DEFAULT_PORTS = {"http": 80, "https": 443}  # by scheme
 
 
@@ -52,7 +51,7 @@ def _numeric(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 def new_token() -> str:
     """Return a random token that needs no escaping in a URL."""
-    return secrets.token_urlsafe(TOKEN_BYTES)
+    return secrets.token_urlsafe(18)
 
 
 def same_token(given: object, token: str) -> bool:

@@ -9,35 +9,127 @@ import struct
 from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 from aiohttp import WSMsgType, web
 
 from magnetosuture_thread.console.access import same_token
 from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
-from magnetosuture_thread.console.graph import Graph, Host
 from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController, Velocity
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 
 HELLO_TIMEOUT = 5.0  # after the connection [s]
-SEND_TIMEOUT = 2.0  # after which a page that does not receive is disconnected [s]
-MAX_LATE_TIME = 1.0  # after which a page whose messages are all late must reconnect [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
 MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without the token is disconnected
-MAX_RECEIPT_CHARS = 100
-MAX_EXCESS_MESSAGES = 2000  # beyond that rate, in total, after which the connection is closed
 MAX_PENDING_REQUESTS = 4  # of one page, besides those of `UNLEASED`
 MAX_UNACKNOWLEDGED = 2  # states in flight, and frames
-MAX_REPLIES = 64
-FRAME_HEADER = struct.Struct(">Q")  # number of a camera frame, before its bytes
-EMERGENCY_STOP = ClientMessage("bridge_action", {"action": "stop"})
 # Allowed for every page with the token, with or without control.
 UNLEASED = ("stop", "disarm", "pause procedure", "abort procedure")
-WITHOUT_STOP = ("record", "arm")  # requests that end no jog
 
 Message = str | bytes
 Reply = Callable[[str, str], None]
+
+
+class Graph(Protocol):
+    """Interface to a running graph. All calls come from the thread of one asyncio loop.
+
+    `state` returns, in SI units and plain JSON types, where every part is None until its first message:
+
+        {
+          "time": float,                   # the graph's time [s]
+          "needle_length": float, "needle_curvature": float,   # of the console's settings
+          "scene": {"version": str, "dish_diameter": m, "dish_depth": m,
+                    "shapes": [{"name": str, "kind": "tissue|instrument|wall", "label": [x, y],   # position of its name
+                                "disc": [x, y, r]}   # or, in place of the disc,
+                               | {..., "outline": [[x, y], ...], "holes": [[[x, y], ...], ...]}]} | None,
+          "needle": {"tail": [x, y], "heading": rad, "age": s} | None,
+          "camera": {"age": s} | None,     # of the latest image
+          "tracker": {"state": "tracked|lost|searching", "reason": str, "confidence": float,
+                      "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None, "age": s} | None,
+          "measured": [[x, y], ...],       # the measured centreline, may be empty
+          "predicted": {"vertices": [[x, y], ...], "residual": float, "step_time": s, "status": str, "age": s} | None,
+          "estimated": {"vertices": [[x, y], ...], "deviation": [m, ...],   # of each vertex across the thread
+                        "prediction_only": bool, "unmeasured_for": s, "hidden": share,
+                        "disturbances": [{"position": [x, y], "direction": [x, y], "force": N, "text": str}, ...],
+                        "age": s} | None,
+          "forecast": {"horizon": s,        # while the present command is held
+                       "ghosts": [{"time": s, "vertices": [[x, y], ...]}, ...],   # the thread, last at the horizon
+                       "events": [str],     # what happens when
+                       "problem": str,      # why it ends early, empty if it does not
+                       "age": s} | None,
+          "margins": {"valid": bool, "of": "estimate|prediction|nothing", "reason": str,
+                      "clearance": [float | None, ...],   # of each node, minimum over wall and shapes; None: none near
+                      "least": {"connectivity": m, "compression": m, "obstacle": m, ...},   # of the kinds present
+                      "bound": m | None,   # least of the 99 % bounds of all clearances
+                      "contact": [node, ...],
+                      "friction": {"state": "unknown|free|pulled|resting", "nodes": [int], "slowdown": float}} | None,
+          "filter": {"source": "operator|needle|", "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],
+                     "slowdown": float, "active": [str], "overridden": str, "reason": str, "age": s} | None,
+          "bridge": {"state": "unconfigured|inactive|active|fault", "armed": bool, "emergency_stopped": bool,
+                     "reasons": [str], "commanded": [vx, vy], "filtered": [vx, vy], "applied": [vx, vy],
+                     "saturated": bool, "driver": str, "driver_ready": bool, "driver_warnings": [str], "current": [A],
+                     "measured_current": [A], "refused": int, "age": s} | None,
+          "procedure": {"state": "idle|ready|running|paused|done|failed", "name": str, "goals": [str], "goal": int,
+                        "goals_met": int, "progress": share, "reason": str, "resumes": bool, "hold_to_run": bool,
+                        "clearance": m | None} | None,   # None where no needle planner runs
+          "plan": [[x, y], ...],           # where the middle of the needle is to go, may be empty
+          "procedures": [str],             # names of those whose shapes the scene has
+          "nodes": {name: {"level": "ok|warn|error|silent", "message": str, "values": {str: str}, "age": s}},
+        }
+    """
+
+    def publish_velocity(self, velocity: tuple[float, float]) -> None:
+        """Publish an operator velocity command, stamped now.
+
+        Args:
+            velocity: of the needle's tip in the dish plane [m/s].
+        """
+
+    async def execute_action(self, action: str) -> str:
+        """Execute arm, disarm, stop or reset; return an empty text, or the reason of a refusal."""
+
+    def publish_hold(self) -> None:
+        """Publish that the page is held, so that a procedure may go on."""
+
+    async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
+        """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
+
+    def state(self) -> dict[str, Any]:
+        """Return the present state as a new dictionary; fast enough for 30 calls a second."""
+
+    def frame(self) -> tuple[int, bytes] | None:
+        """Return number and JPEG or PNG bytes of the latest camera frame; the number increases."""
+
+
+class Host(Protocol):
+    """Interface to the host of the graph, which may offer setups, pause and recording.
+
+    `state` returns
+
+        {"mode": "simulated|graph|replay", "setup": str, "setups": [str], "can_pause": bool, "paused": bool,
+         "can_record": bool,
+         "recording": str,   # the path, empty if nothing is recorded
+         "busy": str,        # operation in progress, empty if none
+         "simulated": bool}
+    """
+
+    def state(self) -> dict[str, Any]:
+        """Return what is running and which requests are possible."""
+
+    async def select_setup(self, setup: str) -> str:
+        """Run another setup; return an empty text, or the reason of a refusal."""
+
+    async def set_paused(self, paused: bool) -> str:
+        """Pause or resume time; return an empty text, or the reason of a refusal."""
+
+    async def set_recording(self, recording: bool, operator: str) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal.
+
+        Args:
+            recording: whether to start.
+            operator: who commands the page that has control, "an operator" or "a script"; noted in the recording.
+        """
 
 
 class Outbox:
@@ -48,7 +140,7 @@ class Outbox:
     """
 
     def __init__(self) -> None:
-        self._replies: deque[str] = deque(maxlen=MAX_REPLIES)
+        self._replies: deque[str] = deque(maxlen=64)
         self._latest: dict[str, Message] = {}
         self._in_flight = {"state": 0, "frame": 0}
 
@@ -88,7 +180,7 @@ def encode_state(graph: dict[str, Any], host: dict[str, Any], lease: dict[str, A
 
 def encode_frame(number: int, image: bytes) -> bytes:
     """Encode a camera frame: its number in 8 bytes, big endian, then the image."""
-    return FRAME_HEADER.pack(number) + image
+    return struct.pack(">Q", number) + image
 
 
 def _finite(value: Any) -> Any:
@@ -129,7 +221,7 @@ class RequestHandler:
             raise InvalidInputError(name, "a page without control", "one with control: take control first")
         if not unleased and list(self._pending.values()).count(client) >= MAX_PENDING_REQUESTS:
             raise InvalidInputError(name, f"{MAX_PENDING_REQUESTS} pending requests", "a reply to one of them first")
-        if name not in WITHOUT_STOP:
+        if name not in ("record", "arm"):  # which end no jog
             self._jog.stop()
         task = asyncio.create_task(self._execute(message, operator, reply))
         self._pending[task] = client
@@ -281,7 +373,7 @@ class Client:
         try:
             exceeded = self._count_message(now)
             parsed = self._read(kind, data)
-            if exceeded and parsed != EMERGENCY_STOP:
+            if exceeded and parsed.request != "stop":
                 raise InvalidInputError("messages", f"{self._message_count} in a second", f"at most {MAX_MESSAGE_RATE}")
             if parsed.type == "acknowledge":
                 self._outbox.acknowledge(parsed.values["kind"])
@@ -291,12 +383,12 @@ class Client:
         except InvalidInputError as error:
             self._jog.interrupt(self.number)
             self._reply("error", text=str(error))
-            if self._excess > MAX_EXCESS_MESSAGES:
+            if self._excess > 2000:  # in total
                 await self._socket.close(code=1008, message=b"too many messages")
 
     async def _on_watcher_message(self, kind: WSMsgType, data: Any) -> None:
         """Handle a message of a page without the token: receipts count, all else is not even parsed."""
-        text = data[:MAX_RECEIPT_CHARS] if kind is WSMsgType.TEXT else ""
+        text = data[:100] if kind is WSMsgType.TEXT else ""
         if '"acknowledge"' in text and self._outbox.acknowledge("frame" if '"frame"' in text else "state"):
             self._wake.set()
             return
@@ -336,7 +428,7 @@ class Client:
                 self._reply("error", text="jog: this page does not have control; take control first")
             return
         self._jog.interrupt(self.number)
-        if now - self._last_in_time > MAX_LATE_TIME:
+        if now - self._last_in_time > 1.0:  # s; it must reconnect
             await self._socket.close(code=1008, message=b"all messages are late")
 
     def _in_time(self, sent: float, now: float) -> bool:
@@ -367,7 +459,7 @@ class Client:
                 await self._wake.wait()
                 self._wake.clear()
                 while (message := self._outbox.next()) is not None:
-                    await asyncio.wait_for(self._send(message), SEND_TIMEOUT)
+                    await asyncio.wait_for(self._send(message), 2.0)  # s; else it does not receive
         except (asyncio.TimeoutError, ConnectionError):
             self._abort()
 

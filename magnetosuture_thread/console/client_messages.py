@@ -4,14 +4,49 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 
 MAX_MESSAGE_CHARS = 4096
-MAX_SHOWN_CHARS = 60  # of an invalid value in the error
+
+Field = tuple[type, Quantity]
+_TEXT, _SWITCH, _NUMBER = (str, Quantity("")), (bool, Quantity("")), (float, Quantity(""))
+
+
+def _one_of(*choices: str) -> Field:
+    return str, Quantity("", choices=choices)
+
+
+# What each type of message holds. `sent` is the time of sending by the page's clock [s]. In a greeting, `token` is
+# empty for a page that only watches, and `automated` tells whether a script drives the browser, null for no browser.
+# `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
+FIELDS: dict[str, dict[str, Field]] = {
+    "hello": {"token": _TEXT, "automated": _SWITCH},
+    "jog": {
+        "speed": (float, Quantity("", "m/s", minimum=0.0)),
+        "direction": (tuple, Quantity("", multiple=2)),
+        "sent": _NUMBER,
+    },
+    "end_jog": {},
+    "acknowledge": {"kind": _one_of("state", "frame")},
+    "visibility": {"visible": _SWITCH},
+    "acquire_control": {},
+    "release_control": {},
+    "bridge_action": {"action": _one_of("arm", "disarm", "stop", "reset")},
+    "select_setup": {"setup": _TEXT},
+    "pause": {"paused": _SWITCH},
+    "record": {"recording": _SWITCH},
+    "procedure": {
+        "action": _one_of("plan", "resume", "pause", "abort"),
+        "procedure": _TEXT,
+        "hold_to_run": _SWITCH,
+    },
+    "hold": {"sent": _NUMBER},
+}
 
 
 @dataclass(frozen=True)
@@ -50,19 +85,31 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     kind = fields.pop("type", None)
     if not isinstance(kind, str) or kind not in FIELDS:
         raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
-    values = {name: read(name, fields.get(name)) for name, read in FIELDS[kind].items()}
+    values = {name: _checked(name, fields.get(name), *about) for name, about in FIELDS[kind].items()}
     if kind == "jog":
-        (x, y), speed = values.pop("direction"), values.pop("speed")
-        largest = max(abs(x), abs(y), 1.0)  # avoids overflow of the squares
-        x, y = x / largest, y / largest
+        direction, speed = values.pop("direction"), values.pop("speed")
+        if len(direction) != 2:
+            raise _refusal("direction", list(direction), "a list of two numbers")
+        largest = max(abs(direction[0]), abs(direction[1]), 1.0)  # avoids overflow of the squares
+        x, y = direction[0] / largest, direction[1] / largest
         factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
         values["velocity"] = (x * factor, y * factor)
     return ClientMessage(kind, values)
 
 
+def _checked(name: str, value: Any, kind: type, about: Quantity) -> Any:
+    if name == "automated" and value is None:
+        return None
+    try:
+        return about.checked(name, value, kind)
+    except ConfigurationError as error:
+        raise _refusal(name, value, error.expectation) from None
+
+
 def _refusal(name: str, value: object, expectation: str) -> InvalidInputError:
-    shown = value if isinstance(value, str) else repr(value)
-    shown = shown if len(shown) <= MAX_SHOWN_CHARS else shown[:MAX_SHOWN_CHARS] + "…"
+    """Return the error of a value, shown in ASCII and shortened: a whole number may have thousands of digits."""
+    shown = value if isinstance(value, str) else type(value).__name__ if isinstance(value, int) else repr(value)
+    shown = shown if len(shown) <= 60 else shown[:60] + "…"
     return InvalidInputError(f"message.{name}", shown.encode("ascii", "backslashreplace").decode(), expectation)
 
 
@@ -80,71 +127,3 @@ def _object(text: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InvalidInputError("message", f"a {type(content).__name__}", "a JSON object")
     return content
-
-
-def _of_type(kind: type, expectation: str) -> Callable[[str, Any], Any]:
-    def read(name: str, value: Any) -> Any:
-        if not isinstance(value, kind):
-            raise _refusal(name, value, expectation)
-        return value
-
-    return read
-
-
-def _choice(*choices: Any) -> Callable[[str, Any], Any]:
-    def read(name: str, value: Any) -> Any:
-        if not any(value is choice or (isinstance(value, str) and value == choice) for choice in choices):
-            raise _refusal(name, value, "one of " + ", ".join(json.dumps(choice).strip('"') for choice in choices))
-        return value
-
-    return read
-
-
-def _finite(name: str, value: Any) -> float:
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        try:
-            number = float(value)
-        except OverflowError:  # an integer beyond the range of floats
-            number = math.inf
-        if math.isfinite(number):
-            return number
-    raise _refusal(name, type(value).__name__ if isinstance(value, int) else value, "a finite number")
-
-
-def _speed(name: str, value: Any) -> float:
-    speed = _finite(name, value)
-    if speed < 0.0:
-        raise _refusal(name, speed, "at least 0 m/s")
-    return speed
-
-
-def _direction(name: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise _refusal(name, value, "a list of two numbers")
-    return _finite(name, value[0]), _finite(name, value[1])
-
-
-_text, _switch = _of_type(str, "a text"), _of_type(bool, "true or false")
-
-# What each type of message holds. `sent` is the time of sending by the page's clock [s]. In a greeting, `token` is
-# empty for a page that only watches, and `automated` tells whether a script drives the browser, null for no browser.
-# `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
-FIELDS: dict[str, dict[str, Callable[[str, Any], Any]]] = {
-    "hello": {"token": _text, "automated": _choice(True, False, None)},
-    "jog": {"speed": _speed, "direction": _direction, "sent": _finite},
-    "end_jog": {},
-    "acknowledge": {"kind": _choice("state", "frame")},
-    "visibility": {"visible": _switch},
-    "acquire_control": {},
-    "release_control": {},
-    "bridge_action": {"action": _choice("arm", "disarm", "stop", "reset")},
-    "select_setup": {"setup": _text},
-    "pause": {"paused": _switch},
-    "record": {"recording": _switch},
-    "procedure": {
-        "action": _choice("plan", "resume", "pause", "abort"),
-        "procedure": _text,
-        "hold_to_run": _switch,
-    },
-    "hold": {"sent": _finite},
-}

@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 Velocity = tuple[float, float]
 ZERO_VELOCITY: Velocity = (0.0, 0.0)
-DRIFT_RATE = 1e-4  # at which the minimum delay is forgotten [s/s]; above the drift between two clocks
 CLIENT_TIMEOUT = 3.0  # [s] without a message, after which a page is gone; it acknowledges every state
 
 
@@ -154,7 +153,8 @@ class DelayEstimator:
             sent: by the page's monotonic clock [s].
             arrival: by the server's monotonic clock [s].
         """
-        drift = DRIFT_RATE * max(0.0, arrival - self._arrival)
+        # The minimum is forgotten by 1e-4 s/s, which is above the drift between two clocks.
+        drift = 1e-4 * max(0.0, arrival - self._arrival)
         self._min_offset, self._arrival = min(self._min_offset + drift, arrival - sent), arrival
         return arrival - sent - self._min_offset
 

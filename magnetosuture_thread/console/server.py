@@ -23,8 +23,7 @@ from magnetosuture_thread.console.access import (
     same_token,
     server_origin,
 )
-from magnetosuture_thread.console.client import Client, RequestHandler, encode_frame, encode_state
-from magnetosuture_thread.console.graph import Graph, Host
+from magnetosuture_thread.console.client import Client, Graph, Host, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError
@@ -32,11 +31,7 @@ from magnetosuture_thread.errors import ConfigurationError
 MAX_CLIENTS = 16  # with the token
 MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they take no place of the others
 MAX_NEW_WATCHERS = 20  # from one address in a second
-MAX_REQUESTS = 100  # without the token, from one address in a second; those beyond wait for the next second
-MAX_MESSAGE_BYTES = 65536  # beyond, the connection is closed before the whole message is read
-FRAME_POLL_PERIOD = 0.005  # of the check for a new camera frame [s]
 HEARTBEAT_PERIOD = 5.0  # a page that does not answer a ping within half of this is disconnected [s]
-CONTENT_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -128,7 +123,7 @@ class ConsoleServer:
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
         if not same_token(request.query.get("token"), self._token):
             now = asyncio.get_running_loop().time()
-            if self._request_rate.count(request.remote or "", now) > MAX_REQUESTS:
+            if self._request_rate.count(request.remote or "", now) > 100:  # those beyond wait for the next second
                 await asyncio.sleep(1.0 - now % 1.0)
         settings, host = self._settings, request.headers.get("Host", "")
         refusal = host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
@@ -158,9 +153,7 @@ class ConsoleServer:
         if full:
             return _answer(503, full)
         # Pings are left to the client, which counts them.
-        socket = web.WebSocketResponse(
-            compress=False, autoping=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=MAX_MESSAGE_BYTES
-        )
+        socket = web.WebSocketResponse(compress=False, autoping=False, heartbeat=HEARTBEAT_PERIOD, max_msg_size=1 << 16)
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
@@ -202,7 +195,7 @@ class ConsoleServer:
             if frame is not None and frame[0] != self._frame_number:
                 self._frame_number, self._frame = frame[0], encode_frame(*frame)
                 self._send_all("frame", self._frame)
-            await asyncio.sleep(FRAME_POLL_PERIOD)
+            await asyncio.sleep(0.005)
 
     def _send_all(self, kind: str, message: str | bytes) -> None:
         for client in self._clients.values():
@@ -298,9 +291,10 @@ class _Server(web.Server):
 
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Return MIME type and content of the page's files by the path of their URL; `/` is the page itself."""
+    types = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
     result = {}
     for entry in files("magnetosuture_thread.console").joinpath("page").iterdir():
-        kind = CONTENT_TYPES.get(entry.name[entry.name.rfind(".") :])
+        kind = types.get(entry.name[entry.name.rfind(".") :])
         if kind is not None:
             result[f"/{entry.name}"] = kind, entry.read_bytes()
     result["/"] = result.pop("/index.html")

@@ -11,9 +11,6 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.shared_parameters import shared_parameter
 
-MIN_COMMANDS_PER_TIMEOUT = 2.0
-MIN_TOKEN_LENGTH = 16  # characters
-
 
 @dataclass(frozen=True)
 class ConsoleSettings(Configuration):
@@ -59,11 +56,11 @@ class ConsoleSettings(Configuration):
                 f"{self.GROUP}.token", self.token, f"a token, as {self.address} can be reached from other machines"
             )
         plain = self.token.isascii() and self.token.isprintable() and " " not in self.token
-        if self.token and not (plain and len(self.token) >= MIN_TOKEN_LENGTH):
+        if self.token and not (plain and len(self.token) >= 16):
             raise ConfigurationError(
                 f"{self.GROUP}.token",
                 "…",
-                f"at least {MIN_TOKEN_LENGTH} printable ASCII characters without a space, or none",
+                "at least 16 printable ASCII characters without a space, or none",
             )
         if self.private_key and not self.certificate:
             raise ConfigurationError(f"{self.GROUP}.private_key", self.private_key, "none without a certificate")
@@ -72,10 +69,9 @@ class ConsoleSettings(Configuration):
             raise ConfigurationError(f"{self.GROUP}.origin", self.origin, expectation)
         if self.speed > self.max_speed:
             raise ConfigurationError(f"{self.GROUP}.speed", self.speed, f"at most max_speed, {self.max_speed:g} m/s")
-        if self.rate * self.hold_timeout < MIN_COMMANDS_PER_TIMEOUT:
+        if self.rate * self.hold_timeout < 2.0:
             raise ConfigurationError(
                 f"{self.GROUP}.rate",
                 self.rate,
-                f"at least {MIN_COMMANDS_PER_TIMEOUT / self.hold_timeout:g} Hz, "
-                f"{MIN_COMMANDS_PER_TIMEOUT:g} commands in a hold_timeout",
+                f"at least {2.0 / self.hold_timeout:g} Hz, 2 commands in a hold_timeout",
             )

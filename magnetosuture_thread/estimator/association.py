@@ -19,6 +19,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
+Obstacles = tuple[Workspace, float]
 
 MAX_PIECES = 64  # of an observation
 MAX_POINTS = 4  # of a piece, for each segment that it could cover; of more, every so many is taken
@@ -134,6 +135,15 @@ def read_piece(
 
 
 @compiled
+def points_at_nodes(nodes: Points, arcs: Vector) -> Points:
+    """Return the thread's points at arc lengths [D], those beyond an end at that end, shape (m, 2)."""
+    at, result = np.arange(len(nodes)) * 1.0, np.empty((len(arcs), 2))
+    for a in range(2):
+        result[:, a] = np.interp(arcs, at, nodes[:, a])
+    return result
+
+
+@compiled
 def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, cap: float) -> float:
     """Return the mean squared distance of points from the thread at their arc lengths, each at most `cap`.
 
@@ -144,15 +154,8 @@ def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, ca
         start: arc length of the first [D].
         cap: [D^2]
     """
-    total, last = 0.0, len(nodes) - 1
-    for p in range(len(points)):
-        at = min(max(start + arcs[p], 0.0), float(last))
-        i = min(int(at), last - 1)
-        part = at - i
-        dx = (1.0 - part) * nodes[i, 0] + part * nodes[i + 1, 0] - points[p, 0]
-        dy = (1.0 - part) * nodes[i, 1] + part * nodes[i + 1, 1] - points[p, 1]
-        total += min(dx * dx + dy * dy, cap)
-    return total / len(points)
+    off = points_at_nodes(nodes, start + arcs) - points
+    return np.minimum(off[:, 0] ** 2 + off[:, 1] ** 2, cap).mean()
 
 
 @compiled
@@ -269,10 +272,6 @@ class PlacedPiece(NamedTuple):
     free_end: bool
     square: float
 
-    def projected(self, nodes: Points) -> tuple[Vector, Vector, int]:
-        """Return what `project` makes of its points on a thread."""
-        return project(nodes, self.points, self.arcs, self.start, self.slack)
-
 
 def place_pieces(
     observation: ThreadObservation, nodes: Points, variance: Vector, unit: float
@@ -352,7 +351,7 @@ def _place(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float) -> 
 
 def _problem_of(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
     """Return why a piece of unknown arc length cannot be of this thread, or nothing."""
-    place, innovation, _ = piece.projected(nodes)
+    place, innovation, _ = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
     on = np.isfinite(place)
     if on.sum() < max(MIN_POINTS, 0.5 * len(place)):
         return "a piece lies beyond the thread's ends"
@@ -384,49 +383,37 @@ class MeasuredPoints(NamedTuple):
     end: tuple[float, float] = (0.0, math.inf)
 
 
-class AssociationInput(NamedTuple):
-    """The predicted thread that points are associated with.
+def measured_points(
+    placed: list[PlacedPiece], nodes: Points, end_variance: float, scale: float, unit: float, obstacles: Obstacles
+) -> tuple[MeasuredPoints | None, list[str]]:
+    """Return the points of all pieces on the thread, None if there is none, and why points are refused.
 
-    Attributes:
-        nodes: shape (n + 1, 2) [D].
+    Args:
+        placed: the pieces.
+        nodes: of the predicted thread, shape (n + 1, 2) [D].
         end_variance: of the last node [D^2].
-        unit: D [m].
-        workspace: the obstacles.
-        margin: how deep the way from a point to the thread must lead into one to be refused [m].
         scale: factor on the points' variance.
+        unit: D [m].
+        obstacles: and how deep the way from a point to the thread must lead into one to be refused [m].
     """
-
-    nodes: Points
-    end_variance: float
-    unit: float
-    workspace: Workspace
-    margin: float
-    scale: float
-
-
-def measured_points(placed: list[PlacedPiece], given: AssociationInput) -> tuple[MeasuredPoints | None, list[str]]:
-    """Return the points of all pieces on the thread, None if there is none, and why points are refused."""
-    nodes, unit, workspace = given.nodes, given.unit, given.workspace
-    found, problems = [], []
+    (workspace, margin), found, problems = obstacles, [], []
     for piece in placed:
-        place, innovation, count = piece.projected(nodes)
+        place, innovation, count = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
         good = np.isfinite(place)
         far = np.flatnonzero(good & (np.abs(innovation) > 0.5)) if len(workspace.shapes) else ()
         if len(far):
-            at = np.minimum(place[far].astype(np.int64), len(nodes) - 2)
-            part = (place[far] - at)[:, None]
-            start = ((1.0 - part) * nodes[at] + part * nodes[at + 1]) * unit
+            start = points_at_nodes(nodes, place[far]) * unit
             for share in (0.25, 0.5, 0.75):  # of the way from the thread to the point
                 near = workspace.near(start + share * (piece.points[far] * unit - start))
-                good[far[near.node[near.distance < -given.margin]]] = False
+                good[far[near.node[near.distance < -margin]]] = False
             if (refused := count - int(good.sum())) > 0:
                 problems.append(f"{refused} points lie beyond an obstacle")
         if good.any():
-            found.append([each[good] for each in (place, innovation, given.scale * piece.variance, piece.share)])
+            found.append([each[good] for each in (place, innovation, scale * piece.variance, piece.share)])
     if not found:
         return None, problems
     place, innovation, variance, shares = (np.concatenate(each) for each in zip(*found, strict=True))
-    end = _free_end(placed, nodes, given.end_variance)
+    end = _free_end(placed, nodes, end_variance)
     return MeasuredPoints(place, innovation, variance, shares, np.ones(len(place)), end), problems
 
 

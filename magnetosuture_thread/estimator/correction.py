@@ -20,7 +20,6 @@ viscous liquid. Deviation: [Forghani2025] has no estimate, its program runs open
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -33,10 +32,11 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.formulations import RodFormulation
+from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.rod_step import STRAIN_TOLERANCE, RodProperties, segment_rows
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, program_of
+from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
-from magnetosuture_thread.thread.step_buffers import CONTACTS_PER_NODE, StepBuffers, program_of
 
 Vector = NDArray[np.float64]
 
@@ -370,21 +370,6 @@ def correct(
     return CORRECTED, solves, off, largest, scale
 
 
-@dataclass(frozen=True)
-class CorrectionResult:
-    """Result of a correction; where it moved the thread is in the corrector's `work`.
-
-    Attributes:
-        solves: number of programs solved.
-        residual: the largest of the last solve.
-        problem: why the thread is not corrected; empty where the program was solved and the constraints hold.
-    """
-
-    solves: int
-    residual: float
-    problem: str
-
-
 class Sensitivity(NamedTuple):
     """What a correction makes of the derivative of the nodes by a parameter, and what its residuals say of that.
 
@@ -411,28 +396,32 @@ class Corrector:
         formulation: its own.
 
     Attributes:
-        work: the last correction.
+        work: the last correction; where it moved the thread is in it.
+        solves: number of its programs.
+        residual: the largest of its last solve.
     """
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
         nodes = predictor.thread.segments + 1
         self._formulation, self.work = formulation, CorrectionBuffers.of(nodes)
         self.work.known[[0, *predictor.fixed_nodes]] = True
+        self.solves, self.residual = 0, 0.0
         self._last: tuple[Prior, MeasuredPoints, float]
 
-    def solve(self, prior: Prior, points: MeasuredPoints) -> CorrectionResult:
-        """Solve the program about a predicted thread; the weights of the points are written."""
-        formulation = self._formulation
-        code, solves, off, residual, scale = correct(
-            formulation.rod, formulation.workspace.data, self.work, prior, points
-        )
+    def solve(self, prior: Prior, points: MeasuredPoints) -> str:
+        """Solve the program about a predicted thread; the weights of the points are written.
+
+        Returns:
+            Why the thread is not corrected; empty where the program was solved and the constraints hold.
+        """
+        rod, workspace = self._formulation.rod, self._formulation.workspace.data
+        code, self.solves, off, self.residual, scale = correct(rod, workspace, self.work, prior, points)
         self._last = (prior, points, scale)
-        problem = ""
         if code == NO_ROOM:
-            problem = f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
-        elif code != CORRECTED or off > 1.0:
-            problem = f"the correction was not solved: residual {residual:.1e}, off by {off:.1g}"
-        return CorrectionResult(solves, residual, problem)
+            return f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
+        if code != CORRECTED or off > 1.0:
+            return f"the correction was not solved: residual {self.residual:.1e}, off by {off:.1g}"
+        return ""
 
     def sensitivity(self, derivative: Points) -> Sensitivity:
         """Return what the last correction makes of a derivative of the predicted nodes by a parameter.

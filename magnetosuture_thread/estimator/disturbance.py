@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -247,10 +246,6 @@ class DisturbanceTest:
         self._untouched = np.full(nodes, np.inf)  # time since a contact pushed each node [s]
         self._since, self._significance = math.nan, 0.0
         self._gap = False
-
-    def copied(self) -> DisturbanceTest:
-        """Return a copy."""
-        return copy.copy(self)
 
     def decay(self, interval: float, in_contact: NDArray[np.bool_]) -> None:
         """Let time pass.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +17,23 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.estimator.association import (
     MIN_DEVIATION,
     POINT_CORRELATION,
-    AssociationInput,
     MeasuredPoints,
     PlacedPiece,
     measured_points,
     place_pieces,
 )
-from magnetosuture_thread.estimator.correction import CorrectionResult, Corrector, Prior
+from magnetosuture_thread.estimator.correction import Corrector, Prior
 from magnetosuture_thread.estimator.disturbance import DisturbanceTest
 from magnetosuture_thread.estimator.estimate import FilterState, ThreadEstimate
-from magnetosuture_thread.estimator.noise import Innovations, NoiseModel, at_nodes, propagate_errors, weigh
+from magnetosuture_thread.estimator.noise import (
+    Innovations,
+    NoiseModel,
+    at_nodes,
+    learn,
+    propagate_errors,
+    take_correction,
+    weigh,
+)
 from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
 from magnetosuture_thread.thread.formulations import RodFormulation, ThreadState
@@ -69,15 +77,6 @@ class EstimatorOptions:
             raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
 
 
-class _Correction(NamedTuple):
-    """What came of a frame's points; see `ThreadEstimate`."""
-
-    result: CorrectionResult
-    innovations: Innovations
-    points: int
-    hidden: float = 1.0
-
-
 class ThreadEstimator:
     """Estimates a thread from the needle's poses and what the camera measures of the thread.
 
@@ -113,7 +112,7 @@ class ThreadEstimator:
     def _forgotten(self) -> FilterState:
         self._stiffness.reset()
         errors = np.zeros((2, self.thread.segments + 1))
-        return FilterState(errors, NoiseModel(), DisturbanceTest(self.thread))
+        return FilterState(errors, NoiseModel.new(), DisturbanceTest(self.thread))
 
     @property
     def started(self) -> bool:
@@ -214,7 +213,7 @@ class ThreadEstimator:
         if self._stiffness.state.active:
             weigh(points, self._now.errors[0])
             noise = at_nodes(self._now.noise.raised, self.thread.segments + 1)
-            if not self._corrector.solve(self._prior(state, pose, noise), points).problem:
+            if not self._corrector.solve(self._prior(state, pose, noise), points):
                 state = self._stiffness.learn(self._corrector, state, pose.stamp)
                 again, refused = self._points_of(placed, state)
                 points = again or points
@@ -222,9 +221,8 @@ class ThreadEstimator:
 
     def _points_of(self, placed: list[PlacedPiece], state: ThreadState) -> tuple[MeasuredPoints | None, list[str]]:
         now, nodes = self._now, state.positions / self._unit
-        margin, workspace = 0.5 * self.thread.diameter, self._formulation.workspace
-        given = AssociationInput(nodes, float(now.errors[0, -1]), self._unit, workspace, margin, now.noise.scale)
-        return measured_points(placed, given)
+        obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
+        return measured_points(placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles)
 
     def _prior(self, state: ThreadState, pose: NeedlePose, noise: Vector) -> Prior:
         """Return the prior of a correction; noise as intensity at each node [m^2/s]."""
@@ -262,7 +260,7 @@ class ThreadEstimator:
         # Whether it lies outside of obstacles is not known before it is corrected.
         now.gross, now.unknown, now.converged = 0, False, False
         now.errors = self._errors_of(end, LAID_DEVIATION**2 * float(np.median(piece.variance)))
-        now.noise, now.test = NoiseModel(), DisturbanceTest(self.thread)
+        now.noise, now.test = NoiseModel.new(), DisturbanceTest(self.thread)
         self._stiffness.restart()
         return laid
 
@@ -272,12 +270,14 @@ class ThreadEstimator:
         now, unit, work = self._now, self._unit, self._corrector.work
         measured = math.isfinite(now.measured_at)
         elapsed = pose.stamp - now.measured_at if measured else 0.0
-        innovations, now.errors = now.noise.learn(points, now.errors, unit, elapsed, 2.0 * self._length)
+        learned = learn(now.noise, points, now.errors, unit, elapsed, 2.0 * self._length)
+        now.noise, mean, variance, now.errors = learned
+        innovations = Innovations(mean, variance)
         prior = self._prior(state, pose, at_nodes(now.noise.raised, self.thread.segments + 1))
-        result = self._corrector.solve(prior, points)
-        if result.problem:
-            return self._estimate([*problems, result.problem], _Correction(result, innovations, len(points.place)))
-        now.errors, hidden = now.noise.take_correction(points, work, np.array([now.errors[0], prior.density]), unit)
+        if problem := self._corrector.solve(prior, points):
+            return self._estimate([*problems, problem], innovations, len(points.place))
+        now.errors, applied, hidden = take_correction(points, work.normals, work.moved, work.covariance, prior.density)
+        now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
         self._stiffness.correct(self._corrector, float(now.errors[0].mean()))
         if measured:  # else there is no earlier time to compare with
             # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
@@ -290,15 +290,22 @@ class ThreadEstimator:
         self.predictor.pose = pose
         self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
         now.converged, now.unknown, now.measured_at = True, False, pose.stamp
-        return self._estimate(problems, _Correction(result, innovations, len(points.place), hidden))
+        return self._estimate(problems, innovations, len(points.place), hidden)
 
-    def _estimate(self, problems: Sequence[str], correction: _Correction | None = None) -> ThreadEstimate:
+    def _estimate(
+        self,
+        problems: Sequence[str],
+        innovations: Innovations | None = None,
+        points: int = 0,
+        hidden: float | None = None,
+    ) -> ThreadEstimate:
+        """Return the estimate; `hidden` is None where the thread was not corrected."""
         now, pose, state = self._now, self.predictor.pose, self.predictor.state
         assert now.prediction is not None
         assert pose is not None
         assert state is not None
         formulation, positions = self._formulation, state.positions
-        corrected = correction is not None and not correction.result.problem
+        corrected = hidden is not None
         # Where innovations are larger than expected, so are the errors that are left.
         scale = self._unit**2 * max(now.noise.ratio, 1.0)
         if corrected:
@@ -321,11 +328,11 @@ class ThreadEstimator:
             corrected=corrected,
             unmeasured_for=pose.stamp - now.measured_at,
             converged=now.converged,
-            residual=correction.result.residual if correction is not None and corrected else 0.0,
-            solves=correction.result.solves if correction is not None and corrected else 0,
-            points=correction.points if correction is not None else 0,
-            hidden=correction.hidden if correction is not None else 1.0,
-            innovations=correction.innovations if correction is not None else None,
+            residual=self._corrector.residual if corrected else 0.0,
+            solves=self._corrector.solves if corrected else 0,
+            points=points,
+            hidden=1.0 if hidden is None else hidden,
+            innovations=innovations,
             noise=now.noise.intensity,
             disturbances=now.test.found(pose.stamp, positions),
             problems=tuple(problems),
@@ -339,8 +346,7 @@ class ThreadEstimator:
         """Return everything that the next step depends on."""
         return replace(
             self._now,
-            noise=self._now.noise.copied(),
-            test=self._now.test.copied(),
+            test=copy(self._now.test),
             pose=self.predictor.pose,
             thread=self.predictor.state,
             warm_start=self._formulation.warm_start(),
@@ -351,7 +357,7 @@ class ThreadEstimator:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
         assert kept.warm_start is not None
         assert kept.learned is not None
-        self._now = replace(kept, noise=kept.noise.copied(), test=kept.test.copied())
+        self._now = replace(kept, test=copy(kept.test))
         self.predictor.pose, self.predictor.state = kept.pose, kept.thread
         self._formulation.restore(kept.warm_start)
         self._stiffness.restore(kept.learned)

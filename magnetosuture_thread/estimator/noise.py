@@ -15,7 +15,6 @@ the second is 2 l times the first where nothing was measured.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.estimator.association import MeasuredPoints
-from magnetosuture_thread.estimator.correction import CorrectionBuffers, robust_weights
+from magnetosuture_thread.estimator.correction import robust_weights
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -85,6 +84,44 @@ class WindowSums(NamedTuple):
     independent: Vector
 
 
+class NoiseModel(NamedTuple):
+    """What is learned of process noise and measurement noise over a run.
+
+    Attributes:
+        error: e of each filter, shape (w, g) [m].
+        variance: of it, shape (w, g) [m^2].
+        likelihood: of each intensity, rows sum to 1, shape (w, g).
+        intensity: geometric mean of the intensities in each window, shape (w,) [m^2/s].
+        raised: the same at the last measurement, with what must have come at once, shape (w,) [m^2/s].
+        scale: of the points' variance over what the camera says.
+        ratio: of squared innovations over what is expected.
+        learned_for: since the first measurement [s].
+        sums: of the windows of the last frame.
+        last_mean: nu of the last frame, nan where nothing was measured, shape (w,) [m].
+        last_variance: r of the last frame as the camera says, shape (w,) [m^2].
+    """
+
+    error: Points
+    variance: Points
+    likelihood: Points
+    intensity: Vector
+    raised: Vector
+    scale: float
+    ratio: float
+    learned_for: float
+    sums: WindowSums
+    last_mean: Vector
+    last_variance: Vector
+
+    @classmethod
+    def new(cls) -> NoiseModel:
+        """Return the model before anything is measured."""
+        prior = np.exp(-np.abs(np.log10(GRID / QUIET)))
+        nothing, quiet, filters = np.full(WINDOWS, np.nan), np.full(WINDOWS, QUIET), np.zeros((WINDOWS, len(GRID)))
+        likelihood, sums = np.tile(prior / prior.sum(), (WINDOWS, 1)), WindowSums(*[nothing] * 4)
+        return cls(filters, filters, likelihood, quiet, quiet, 1.0, 1.0, 0.0, sums, nothing, nothing)
+
+
 @compiled
 def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
     """Write the robust weights of the points against the prior; return the sums of the windows.
@@ -142,142 +179,82 @@ def propagate_errors(positions: Points, before: Points, unit: float, added: Vect
     return result
 
 
-class NoiseModel:
-    """What is learned of process noise and measurement noise over a run.
+@compiled
+def learn(
+    noise: NoiseModel, points: MeasuredPoints, errors: Points, unit: float, elapsed: float, factor: float
+) -> tuple[NoiseModel, Vector, Vector, Points]:
+    """Test the innovations of a frame, learn from them, and let the prior grow where the noise rose.
 
-    Arrays are replaced and never written to, so that a shallow copy keeps a state.
+    Args:
+        noise: learned before.
+        points: of the frame; the robust weights against the prior that has grown are written.
+        errors: variance and density of the prior, shape (2, n + 1) [D^2].
+        unit: D [m].
+        elapsed: since the last measurement [s].
+        factor: of the density over the variance.
 
-    Attributes:
-        error: e of each filter, shape (w, g) [m].
-        variance: of it, shape (w, g) [m^2].
-        likelihood: of each intensity, rows sum to 1, shape (w, g).
-        intensity: geometric mean of the intensities in each window, shape (w,) [m^2/s].
-        raised: the same at the last measurement, with what must have come at once, shape (w,) [m^2/s].
-        scale: of the points' variance over what the camera says.
-        ratio: of squared innovations over what is expected.
-        sums: of the windows of the last frame.
+    Returns:
+        What is learned now; the mean innovation of each window, nan where nothing is measured, shape (w,) [m]; the
+        variance that is expected of it [m^2]; and the errors that have grown.
     """
-
-    def __init__(self) -> None:
-        prior = np.exp(-np.abs(np.log10(GRID / QUIET)))
-        self.error = self.variance = np.zeros((WINDOWS, len(GRID)))
-        self.likelihood = np.tile(prior / prior.sum(), (WINDOWS, 1))
-        self.intensity = self.raised = np.full(WINDOWS, QUIET)
-        self.scale = self.ratio = 1.0
-        self.sums = WindowSums(*np.full((4, WINDOWS), np.nan))
-        self._learned_for = 0.0  # s
-        self._last_mean = self._last_variance = np.full(WINDOWS, np.nan)  # of the frame before, as the camera says
-
-    def copied(self) -> NoiseModel:
-        """Return a copy."""
-        return copy.copy(self)
-
-    def learn(
-        self, points: MeasuredPoints, errors: Points, unit: float, elapsed: float, factor: float
-    ) -> tuple[Innovations, Points]:
-        """Test the innovations of a frame, learn from them, and let the prior grow where the noise rose.
-
-        Args:
-            points: of the frame; the robust weights against the prior that has grown are written.
-            errors: variance and density of the prior, shape (2, n + 1) [D^2].
-            unit: D [m].
-            elapsed: since the last measurement [s].
-            factor: of the density over the variance.
-
-        Returns:
-            The innovations, and the errors that have grown.
-        """
-        sums = weigh(points, errors[0])
-        mean, own = sums.mean * unit, sums.own * unit**2
-        ratio, expected = self._match(mean, own, sums.known * unit**2, elapsed)
-        before, settled = self.intensity, self._learned_for >= NOISE_TIME
-        state = self.error, self.variance, self.likelihood, self.intensity
-        self.error, self.variance, self.likelihood, self.intensity = learn(*state, mean, own, elapsed)
-        interval = max(elapsed, MIN_INTERVAL)
-        state = self.error, self.variance, self.likelihood, self.intensity
-        self.raised = raised_intensity(*state, np.isfinite(mean), interval, settled)
-        nodes = errors.shape[1]
-        extra = at_nodes(np.maximum(before, self.raised), nodes) - at_nodes(before, nodes)
-        extra[0] = 0.0
-        errors = errors + np.array([[1.0], [factor]]) * extra * (interval / unit**2)
-        self.sums = weigh(points, errors[0])
-        if self._learned_for == 0.0:
-            # Of the first step after a start no noise was known: it is tested with the noise that it shows.
-            ratio, expected = self.ratio, self.ratio * (self.sums.own + self.sums.known) * unit**2
-        self.ratio = ratio
-        self._learned_for += elapsed
-        return Innovations(mean, expected), errors
-
-    def _match(self, mean: Vector, own: Vector, known: Vector, elapsed: float) -> tuple[float, Vector]:
-        """Match what is expected of innovations to those of a frame.
-
-            E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
-            E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames do not
-
-        Args:
-            mean: nu of each window, nan where nothing is measured, shape (w,) [m].
-            own: r, inf where nothing is measured [m^2].
-            known: p [m^2].
-            elapsed: since the last measurement [s].
-
-        Returns:
-            The new ratio, and what was expected with the ratio before, shape (w,) [m^2].
-        """
-        expected, ratio, camera = self.ratio * (own + known), self.ratio, own / self.scale
-        seen = np.isfinite(mean)
-        if seen.any():
-            off = min(float((mean[seen] ** 2 / expected[seen]).mean()), MAX_SQUARE) - 1.0
-            ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * off))
-        both = seen & np.isfinite(self._last_mean)
-        if both.any():
-            change = (mean - self._last_mean)[both] ** 2 / (camera + self._last_variance)[both]
-            share = min(elapsed / (min(self._learned_for, SCALE_TIME) + LEARNING_PRIOR), 1.0)
-            self.scale += share * (float(np.minimum(change, MAX_SCALE).mean()) - self.scale)
-            self.scale = min(max(self.scale, MIN_SCALE), MAX_SCALE)
-        self._last_mean, self._last_variance = mean, camera
-        return ratio, expected
-
-    def take_correction(
-        self, points: MeasuredPoints, work: CorrectionBuffers, errors: Points, unit: float
-    ) -> tuple[Points, float]:
-        """Take over a correction: the information gained, what is left of the variance, and what is no error any more.
-
-        Args:
-            points: the points, with their robust weights.
-            work: of the correction.
-            errors: variance and density before, shape (2, n + 1) [D^2].
-            unit: D [m].
-
-        Returns:
-            Variance and density after, shape (2, n + 1) [D^2], and the part of the thread that no point shows.
-        """
-        left, applied, hidden = take_correction(points, work.normals, work.moved, work.covariance, errors[1])
-        self.error = self.error - unit * applied[:, None]
-        return left, hidden
+    sums = weigh(points, errors[0])
+    mean, own, known = sums.mean * unit, sums.own * unit**2, sums.known * unit**2
+    seen, camera, expected = np.isfinite(mean), own / noise.scale, noise.ratio * (own + known)
+    ratio, scale = _matched(noise, mean, camera, expected, elapsed)
+    error, variance, likelihood, intensity = learn_intensity(noise, mean, own, elapsed)
+    interval, settled = max(elapsed, MIN_INTERVAL), noise.learned_for >= NOISE_TIME
+    raised = raised_intensity(error, variance, likelihood, intensity, seen, interval, settled)
+    nodes = errors.shape[1]
+    extra = at_nodes(np.maximum(noise.intensity, raised), nodes) - at_nodes(noise.intensity, nodes)
+    extra[0] = 0.0
+    grown = errors.copy()
+    grown[0] += extra * (interval / unit**2)
+    grown[1] += factor * extra * (interval / unit**2)
+    sums = weigh(points, grown[0])
+    if noise.learned_for == 0.0:
+        # Of the first step after a start no noise was known: it is tested with the noise that it shows.
+        ratio, expected = noise.ratio, noise.ratio * (sums.own + sums.known) * unit**2
+    learned_for = noise.learned_for + elapsed
+    model = NoiseModel(error, variance, likelihood, intensity, raised, scale, ratio, learned_for, sums, mean, camera)
+    return model, mean, expected, grown
 
 
 @compiled
-def learn(
-    error: Points, variance: Points, likelihood: Points, intensity: Vector, mean: Vector, own: Vector, elapsed: float
+def _matched(noise: NoiseModel, mean: Vector, camera: Vector, expected: Vector, elapsed: float) -> tuple[float, float]:
+    """Return ratio and scale matched to the innovations of a frame.
+
+    E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
+    E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames do not
+    """
+    square, change, windows, both, ratio, scale = 0.0, 0.0, 0, 0, noise.ratio, noise.scale
+    for w in np.flatnonzero(np.isfinite(mean)):
+        square, windows = square + mean[w] ** 2 / expected[w], windows + 1
+        if np.isfinite(noise.last_mean[w]):
+            apart = (mean[w] - noise.last_mean[w]) ** 2 / (camera[w] + noise.last_variance[w])
+            change, both = change + min(apart, MAX_SCALE), both + 1
+    if windows > 0:
+        ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square / windows, MAX_SQUARE) - 1.0))
+    if both > 0:
+        share = min(elapsed / (min(noise.learned_for, SCALE_TIME) + LEARNING_PRIOR), 1.0)
+        scale = min(max(scale + share * (change / both - scale), MIN_SCALE), MAX_SCALE)
+    return ratio, scale
+
+
+@compiled
+def learn_intensity(
+    noise: NoiseModel, mean: Vector, own: Vector, elapsed: float
 ) -> tuple[Points, Points, Points, Vector]:
-    """Return the filters and intensities of all windows after a frame.
+    """Return error, variance and likelihood of the filters, and the intensities, after a frame.
 
     Args:
-        error: see `NoiseModel`, as are the following, which are returned.
-        variance: of the errors.
-        likelihood: of each intensity.
-        intensity: of each window.
+        noise: before it.
         mean: nu of each window, shape (w,) [m].
         own: r of each, inf where nothing is measured, shape (w,) [m^2].
         elapsed: since the last measurement [s].
     """
     keep, switched = np.exp(-elapsed / NOISE_TIME), min(1.0, SWITCHING * elapsed)
-    error, variance, likelihood, intensity = (
-        error.copy(),
-        variance + GRID * elapsed,
-        likelihood.copy(),
-        intensity.copy(),
-    )
+    error, variance = noise.error.copy(), noise.variance + GRID * elapsed
+    likelihood, intensity = noise.likelihood.copy(), noise.intensity.copy()
     for w in np.flatnonzero(np.isfinite(own)):
         prior, off = variance[w].copy(), mean[w] - error[w]
         expected = prior + own[w]
@@ -305,9 +282,9 @@ def raised_intensity(
 
     Args:
         error: see `NoiseModel`, as are the following.
-        variance: of the errors.
-        likelihood: of each intensity.
-        intensity: of each window.
+        variance: see there.
+        likelihood: see there.
+        intensity: see there.
         seen: windows in which something is measured, shape (w,).
         interval: since the last measurement [s].
         settled: whether the filters no longer show the error of the first shape.

@@ -497,20 +497,6 @@ class EstimationFigures:
     disturbance_count: int = 0
     learned: tuple[SlowParameter, ...] = ()
 
-    @classmethod
-    def of(
-        cls, series: TimeSeries, disturbances: DisturbanceLog, learned: tuple[SlowParameter, ...] = ()
-    ) -> EstimationFigures:
-        """Return the figures of a run."""
-        return cls(
-            int(np.nansum(series.column("corrected"))),
-            Consistency.of(series),
-            HiddenShares.of(series),
-            tuple(disturbances.events),
-            disturbances.count,
-            learned,
-        )
-
     @property
     def estimated(self) -> bool:
         """Whether the thread was estimated at all."""
@@ -692,7 +678,14 @@ class RunMetrics:
     @property
     def estimation(self) -> EstimationFigures:
         """What the run tells of its estimate beside the errors."""
-        return EstimationFigures.of(self.series, self.disturbances, self.learned)
+        return EstimationFigures(
+            int(np.nansum(self.series.column("corrected"))),
+            Consistency.of(self.series),
+            HiddenShares.of(self.series),
+            tuple(self.disturbances.events),
+            self.disturbances.count,
+            self.learned,
+        )
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""

@@ -319,7 +319,7 @@ def plot_scene(path: Path, scene: Scene, name: str) -> None:
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
-    draw_dish(axes, scene, 0.12)
+    draw_empty_dish(axes, scene, 0.12)
     axes.plot([0.0], [0.0], "+", color=FAINT, markersize=9.0, markeredgewidth=0.8, zorder=1)
     ground = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
     text: dict[str, Any] = {"bbox": ground, "ha": "center", "fontsize": 9.5, "color": INK, "parse_math": False}
@@ -339,7 +339,7 @@ def _draw_scene(axes: Axes, scene: Scene) -> None:
         axes.legend(handles=faces, loc="lower right", fontsize=9, frameon=False, labelcolor=INK)
 
 
-def draw_dish(axes: Axes, scene: Scene, border: float) -> None:
+def draw_empty_dish(axes: Axes, scene: Scene, border: float) -> None:
     """Draw an empty dish in millimetres, without axes, with a border around it as a share of its radius."""
     radius = 1e3 * scene.dish.radius
     axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#f4f1ec", edgecolor="#8f877b", linewidth=2.0, zorder=0))

@@ -1,7 +1,14 @@
 """Forecast: where needle and thread will be while a command is held."""
 
-from magnetosuture_thread.forecast.forecast import Forecast, ForecastContact, ForecastMargin, ForecastStart
-from magnetosuture_thread.forecast.forecaster import NeedleDrag, ThreadForecaster, make_forecaster
+from magnetosuture_thread.forecast.forecaster import (
+    Forecast,
+    ForecastContact,
+    ForecastMargin,
+    ForecastStart,
+    NeedleDrag,
+    ThreadForecaster,
+    make_forecaster,
+)
 
 __all__ = [
     "Forecast",

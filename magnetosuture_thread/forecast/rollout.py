@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted_without_gil
+from magnetosuture_thread.compiled import compiled, compiled_uncounted, compiled_uncounted_without_gil
 from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distance
@@ -22,8 +22,17 @@ from magnetosuture_thread.safety.motion import (
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.banded import SolverBuffers
 from magnetosuture_thread.thread.forces import write_forces
-from magnetosuture_thread.thread.program import Indices, Mask, Table, Vector
-from magnetosuture_thread.thread.rod_step import (
+from magnetosuture_thread.thread.program import (
+    ABOUT,
+    BEFORE,
+    ContactBuffers,
+    Indices,
+    Mask,
+    RodBuffers,
+    Table,
+    Vector,
+)
+from magnetosuture_thread.thread.rod import (
     ENDED,
     NO_ROOM,
     StepInput,
@@ -31,7 +40,6 @@ from magnetosuture_thread.thread.rod_step import (
     copy_points,
     solve_step,
 )
-from magnetosuture_thread.thread.step_buffers import ContactBuffers, StepBuffers
 
 OBSTACLE_MARGIN, WALL_MARGIN, CONNECTIVITY_MARGIN, COMPRESSION_MARGIN, NEEDLE_MARGIN = range(5)
 """Columns of the margins that are recorded."""
@@ -133,7 +141,7 @@ class RolloutBuffers(NamedTuple):
         close: number of shapes that each node is close to, shape (n + 1,).
     """
 
-    step: StepBuffers
+    step: RodBuffers
     solver: SolverBuffers
     contacts: ContactBuffers
     ends: Table
@@ -196,7 +204,7 @@ class RolloutRecord(NamedTuple):
         )
 
 
-@compiled_inner
+@compiled_uncounted
 def follow_needle(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float
 ) -> tuple[int, bool]:
@@ -232,14 +240,15 @@ def follow_needle(
             return done.code, False
         for i in range(len(state.positions)):
             for a in range(2):
-                state.positions[i, a] = step.about[i, a] * rod.unit
-                state.velocities[i, a] = (step.about[i, a] - step.before[i, a]) * (rod.unit / duration)
+                moved = step.motion[ABOUT, i, a] - step.motion[BEFORE, i, a]
+                state.positions[i, a] = step.motion[ABOUT, i, a] * rod.unit
+                state.velocities[i, a] = moved * (rod.unit / duration)
         state.last[2] = duration
         converged = converged and done.off <= 1.0
     return ENDED, converged
 
 
-@compiled_inner
+@compiled_uncounted
 def record_margins(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -253,7 +262,7 @@ def record_margins(
     rod, positions, to = model.step.rod, state.positions, buffers.contacts
     nodes, count = len(positions), 0
     margin, node, shape = record.margin[k], record.node[k], record.shape[k]
-    if len(model.around.frames) > 1 or model.around.wall_radius < np.inf:
+    if len(model.around.order) > 0 or model.around.wall_radius < np.inf:
         count = find_contacts(positions, model.around, to.node, to.obstacle, to.distance, to.normal, to.nearest)
     if count < 0:
         return False
@@ -278,9 +287,10 @@ def record_margins(
         record.contact[k, 0], record.contact[k, 1] = shape[nearest], node[nearest]
     for i in range(nodes):
         record.rubbed[k, i] = close[i] >= 2
-    chords = buffers.step.chords  # of where the thread is: of the last linearisation, that showed that it is there
+    # Chords of where the thread is: of the last linearisation, that showed that it is there.
+    chords = buffers.step.program.chords
     if k == 0:
-        mechanics.chord_lengths(buffers.step.about, state.pose[2:], rod.clamped, chords)
+        mechanics.chord_lengths(buffers.step.motion[ABOUT], state.pose[2:], rod.clamped, chords)
     for i in range(nodes - 1):
         length = math.hypot(positions[i + 1, 0] - positions[i, 0], positions[i + 1, 1] - positions[i, 1])
         for kind in (CONNECTIVITY_MARGIN, COMPRESSION_MARGIN):
@@ -290,7 +300,7 @@ def record_margins(
     return True
 
 
-@compiled_inner
+@compiled_uncounted
 def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) -> float:
     """Return the factor on the needle's speed of the friction law at an instant."""
     count, fastest = 0, 0.0
@@ -301,7 +311,7 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
     return float(model.friction.beta**count) if count > 0 and fastest > model.friction.stuck_speed else 1.0
 
 
-@compiled_inner
+@compiled_uncounted
 def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded: float, pull: Vector) -> None:
     """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
 
@@ -331,7 +341,7 @@ def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded
         added[k] = max(-limit, min(limit, added[k]))
 
 
-@compiled_inner
+@compiled_uncounted
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -343,12 +353,12 @@ def record_thread(
     if k == 0:
         for i in range(len(state.positions)):
             for a in range(2):
-                step.about[i, a] = state.positions[i, a] / rod.unit
+                step.motion[ABOUT, i, a] = state.positions[i, a] / rod.unit
     if k > 0 and interval > 0.0:
         scale = (rod.drag_across + rod.mass_per_length / interval) * rod.unit**2
         heading, tension = state.pose[2:], buffers.tension
         internal, load, velocities = step.internal, step.tail_load, state.velocities
-        write_forces(rod, step.about, velocities, heading, internal, load, scale, tension, record.pull[k])
+        write_forces(rod, step.motion[ABOUT], velocities, heading, internal, load, scale, tension, record.pull[k])
         record.tension[k] = tension[0]
         for i in range(len(tension)):
             record.tension[k] = max(record.tension[k], tension[i])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,47 +55,28 @@ def needle_chord(length: float, curvature: float) -> tuple[float, NDArray[np.flo
     return length * float(np.sinc(half / np.pi)), np.array([[c, -s], [s, c]])
 
 
-@dataclass(frozen=True)
-class NeedlePoints:
-    """Sample points on a needle's body, in the frame of its tail with its heading along x.
+def needle_points(length: float, curvature: float, spacing: float) -> tuple[Points, Points]:
+    """Return points along a needle, an odd number, and how they move as it turns, in the frame of its tail.
 
     Driven along its chord and turned about the chord's middle, the needle moves a point by
 
         v_p = (v . e) e + (v . n) turning_p,    turning_p = perp(p - middle) / (chord / 2)
 
-    with the tip's velocity v, the unit vector e along the chord, and n to its left.
-
-    Attributes:
-        points: p, shape (m, 2) [m].
-        turning: shape (m, 2).
-        chord: e, shape (2,).
-    """
-
-    points: Points
-    turning: Points
-    chord: NDArray[np.float64]
-
-    def turned(self, heading: Points) -> tuple[Points, Points, NDArray[np.float64]]:
-        """Return points, turning and chord for a needle with a heading, a unit vector of shape (2,)."""
-        c, s = float(heading[0]), float(heading[1])
-        turn = np.array([[c, s], [-s, c]])  # of rows
-        return self.points @ turn, self.turning @ turn, self.chord @ turn
-
-
-def needle_points(length: float, curvature: float, spacing: float) -> NeedlePoints:
-    """Return points along a needle, an odd number, so that its middle is among them.
+    with the tip's velocity v, the unit vector e along the chord, and n to its left. Its middle is among the points.
 
     Args:
         length: of the arc [m].
         curvature: positive to the left [1/m].
         spacing: of the points at the most [m].
+
+    Returns:
+        p, shape (m, 2) [m], with the heading at the tail along x; and turning, shape (m, 2).
     """
     pieces = 2 * math.ceil(0.5 * length / spacing - 1e-9)
     points, _ = needle_axis(np.zeros(2), 0.0, length, curvature, np.linspace(0.0, 1.0, pieces + 1))
     chord, turned = needle_chord(length, curvature)
-    along = turned @ np.array([1.0, 0.0])
-    apart = (points - 0.5 * chord * along) / (0.5 * chord)
-    return NeedlePoints(points, np.column_stack([-apart[:, 1], apart[:, 0]]), along)
+    apart = (points - 0.5 * chord * turned[:, 0]) / (0.5 * chord)
+    return points, np.column_stack([-apart[:, 1], apart[:, 0]])
 
 
 def check_needle(group: str, length: float, curvature: float) -> None:

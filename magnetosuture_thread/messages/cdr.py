@@ -12,20 +12,10 @@ from numpy.typing import ArrayLike
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import DISH_FRAME
 
-BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian; positions count from behind it
-LITTLE_ENDIAN = b"\0\1"  # what plain CDR begins with, as every ROS 2 machine of today writes it
-_BIG_ENDIAN = b"\0\0"
-_STAMP, _LENGTH, _FRAME = 4, 12, 16  # where the stamp begins, the length of the frame's name, and the name
-_FORMS = {LITTLE_ENDIAN: struct.Struct("<iII"), _BIG_ENDIAN: struct.Struct(">iII")}
-_NAME = DISH_FRAME.encode() + b"\0"
-_DISH = {
-    LITTLE_ENDIAN: len(_NAME).to_bytes(4, "little") + _NAME,
-    _BIG_ENDIAN: len(_NAME).to_bytes(4, "big") + _NAME,
-}
-DISH_END = _FRAME + len(_NAME)  # where a header in the dish frame ends
-_STAMPS = (struct.Struct(">4xiI"), struct.Struct("<4xiI"))  # by the byte order
+BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian, as every ROS 2 machine of today writes it
+_DISH = struct.pack("<I", len(DISH_FRAME) + 1) + DISH_FRAME.encode() + b"\0"
+DISH_END = len(BEGIN) + 8 + len(_DISH)  # where a header in the dish frame ends, behind its stamp
 _TIME, _COUNT = struct.Struct("<iI"), struct.Struct("<I")
-_NUMBERS = {"bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 
 Stamp = Any  # nanoseconds as int, or a time message of any library
 
@@ -48,7 +38,7 @@ def pack(layout: str, *values: Any) -> bytes:
             data += number.pack(value)
         elif kind == "header":
             _put_time(data, value)
-            data += _DISH[LITTLE_ENDIAN]
+            data += _DISH
         elif kind == "text":
             _put_text(data, value)
         elif kind == "time":
@@ -68,15 +58,16 @@ def pack(layout: str, *values: Any) -> bytes:
 def _fields(layout: str) -> tuple[tuple[str, Any, int], ...]:
     """Return for each field what it is, its format or type, and its size [bytes]."""
     fields: list[tuple[str, Any, int]] = []
+    formats = {"bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
     for word in layout.split():
         name, bracket, count = word.partition("[")
-        if name not in _NUMBERS:
+        if name not in formats:
             fields.append((name, np.dtype("<f8"), 8))
         elif not bracket:
-            number = struct.Struct("<" + _NUMBERS[name])
+            number = struct.Struct("<" + formats[name])
             fields.append(("number", number, number.size))
         else:
-            dtype = np.dtype("<" + _NUMBERS[name])
+            dtype = np.dtype("<" + formats[name])
             fields.append(("array" if count != "]" else "sequence", dtype, dtype.itemsize))
     return tuple(fields)
 
@@ -105,9 +96,9 @@ def _put_numbers(data: bytearray, kind: str, dtype: np.dtype[Any], values: Array
 
 def header_stamp(data: bytes) -> int | None:
     """Return the stamp of CDR bytes that begin with a header [ns]; None if there are too few."""
-    if len(data) < _LENGTH:
+    if len(data) < 12:
         return None
-    whole, rest = _STAMPS[data[1] & 1].unpack_from(data)
+    whole, rest = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, len(BEGIN))
     return int(whole) * 1_000_000_000 + int(rest)
 
 
@@ -121,21 +112,21 @@ def stamp_and_frame(topic: str, data: bytes) -> tuple[int, str]:
     Raises:
         BagError: no header can be read there.
     """
-    form = _FORMS.get(data[:2])
-    if form is not None and len(data) >= _FRAME:
-        seconds, nanoseconds, length = form.unpack_from(data, _STAMP)
-        frame = data[_FRAME : _FRAME + length]
+    stamp, orders = header_stamp(data), {BEGIN[:2]: "<I", b"\0\0": ">I"}
+    if stamp is not None and data[:2] in orders and len(data) >= 16:
+        (length,) = struct.unpack_from(orders[data[:2]], data, 12)
+        frame = data[16 : 16 + length]
         if 0 < length == len(frame) and frame.endswith(b"\0"):
             try:
-                return seconds * 10**9 + nanoseconds, frame[:-1].decode()
+                return stamp, frame[:-1].decode()
             except UnicodeDecodeError:
                 pass
     raise BagError(topic, "a message has no header that can be read")
 
 
 def is_in_dish_frame(data: bytes) -> bool:
-    """Return whether a message that begins with a header is in the dish frame, as `stamp_and_frame` would say."""
-    return data[_LENGTH:DISH_END] == _DISH.get(data[:2])
+    """Return whether a message that begins with a header is in the dish frame, and written as our machines write it."""
+    return data[:2] == BEGIN[:2] and data[12:DISH_END] == _DISH
 
 
 def aligned(at: int, to: int) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -23,26 +24,34 @@ from magnetosuture_thread.thread.prediction import Prediction
 if TYPE_CHECKING:
     from magnetosuture_thread.forecast import Forecast
 
-# As in Marker.msg.
-ARROW, CYLINDER, LINE_STRIP, SPHERE_LIST, TEXT, TRIANGLE_LIST = 0, 3, 4, 7, 9, 11
-ADD, DELETE_ALL = 0, 3
-
-ARROW_LENGTH = 2.5e-3  # m; of a disturbance's arrow, whose head is where it acts
-TEXT_HEIGHT, LINE_HEIGHT = 8e-4, 1e-3  # m
+ADD, LINE_STRIP = 0, 4  # as in Marker.msg; the other types below
 LIFETIME = 500_000_000  # ns of a text, an arrow or a forecast; poses come far more often
-SEGMENT_BARRIERS = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
 GHOSTS = 3  # instants of a forecast
-GHOST_WIDTH = 1.5e-4  # m
-THICKNESS = 1e-3  # m; of a disc's cylinder
-RIM_POINTS = 180
-NAME_SIZE = 0.025  # of the dish's diameter
 
 Colour = tuple[float, ...]
 Place = Sequence[float] | NDArray[np.float64]
-INK, RED = (0.1, 0.13, 0.16), (0.78, 0.06, 0.18)
-TEAL, MAGENTA, VIOLET = (0.0, 0.6, 0.65), (0.71, 0.09, 0.62), (0.45, 0.3, 0.75)
-NAME_INK, RIM = (0.13, 0.19, 0.24), (0.45, 0.5, 0.55)
-KINDS = {"tissue": (0.85, 0.65, 0.6), "instrument": (0.55, 0.6, 0.66), "wall": (0.45, 0.42, 0.38)}
+COLOURS: dict[str, Colour] = {
+    "ink": (0.1, 0.13, 0.16),
+    "alarm": (0.78, 0.06, 0.18),
+    "deviation": (0.0, 0.6, 0.65),
+    "predicted": (0.71, 0.09, 0.62),
+    "forecast": (0.45, 0.3, 0.75),
+    "rim": (0.45, 0.5, 0.55),
+    "tissue": (0.85, 0.65, 0.6),
+    "instrument": (0.55, 0.6, 0.66),
+    "wall": (0.45, 0.42, 0.38),
+}
+
+
+class MarkerType(IntEnum):
+    """As in Marker.msg."""
+
+    ARROW = 0
+    CYLINDER = 3
+    LINE_STRIP = 4
+    SPHERE_LIST = 7
+    TEXT_VIEW_FACING = 9
+    TRIANGLE_LIST = 11
 
 
 class Marker(NamedTuple):
@@ -115,37 +124,45 @@ def packed_thread_markers(
     colour, nodes = friction_colour(friction), thread.positions
     markers = [
         Marker("thread", 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
-        Marker("thread", 1, SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
+        Marker("thread", 1, MarkerType.SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
     ]
-    shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in SEGMENT_BARRIERS]
+    of_segments = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
+    shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in of_segments]
     for number, minimum in enumerate(shown):
         clearance = minimum.minimum_clearance
         x, y = nodes[minimum.node[0]]
-        place = (x, y + (number + 1) * LINE_HEIGHT)  # several may be closest at the same node
+        place = (x, y + (number + 1) * 1e-3)  # several may be closest at the same node
         caption = f"{minimum.barrier} {1e3 * clearance:.2f} mm"
-        markers.append(_text("margins", number, RED if clearance <= 0.0 else INK, place, caption))
+        markers.append(_text("margins", number, COLOURS["alarm" if clearance <= 0.0 else "ink"], place, caption))
     if estimate is not None:
         markers += _estimate_markers(prediction, estimate, 0.4 * width)
     return packed_markers(stamp, markers)
 
 
 def _text(namespace: str, number: int, colour: Colour, place: Place, caption: str) -> Marker:
-    size = (0.0, 0.0, TEXT_HEIGHT)
-    return Marker(namespace, number, TEXT, size, colour, place=place, caption=caption, lifetime=LIFETIME)
+    size = (0.0, 0.0, 8e-4)
+    return Marker(
+        namespace, number, MarkerType.TEXT_VIEW_FACING, size, colour, place=place, caption=caption, lifetime=LIFETIME
+    )
 
 
 def _estimate_markers(prediction: Prediction | None, estimate: ThreadEstimate, width: float) -> list[Marker]:
     band = deviation_band(estimate)
-    markers = [Marker("deviation", 0, TRIANGLE_LIST, (1.0, 1.0, 1.0), TEAL, 0.35, points=band)]
+    markers = [
+        Marker("deviation", 0, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), COLOURS["deviation"], 0.35, points=band)
+    ]
     if prediction is not None:
         line = prediction.positions
-        markers.append(Marker("predicted", 0, LINE_STRIP, (width, 0.0, 0.0), MAGENTA, 0.9, points=line))
+        markers.append(Marker("predicted", 0, LINE_STRIP, (width, 0.0, 0.0), COLOURS["predicted"], 0.9, points=line))
     for number, found in enumerate(estimate.disturbances):
-        arrow = np.array([found.position - ARROW_LENGTH * found.direction, found.position])
+        length = 2.5e-3  # m; the head is where it acts
+        arrow = np.array([found.position - length * found.direction, found.position])
         sizes, name = (width, 4.0 * width, 4.0 * width), "disturbances"
-        markers.append(Marker(name, 2 * number, ARROW, sizes, RED, points=arrow, lifetime=LIFETIME))
-        place = found.position - 1.3 * ARROW_LENGTH * found.direction
-        markers.append(_text(name, 2 * number + 1, RED, place, str(found)))
+        markers.append(
+            Marker(name, 2 * number, MarkerType.ARROW, sizes, COLOURS["alarm"], points=arrow, lifetime=LIFETIME)
+        )
+        place = found.position - 1.3 * length * found.direction
+        markers.append(_text(name, 2 * number + 1, COLOURS["alarm"], place, str(found)))
     return markers
 
 
@@ -168,15 +185,24 @@ def packed_forecast_markers(stamp: Stamp, forecast: Forecast) -> bytes:
     """
     markers = []
     for number, instant in enumerate(forecast_instants(forecast, GHOSTS + 1)[1:]):
-        line, opacity, size = forecast.vertices[instant], 0.8 - 0.2 * number, (GHOST_WIDTH, 0.0, 0.0)
-        ghost = Marker("forecast", number, LINE_STRIP, size, VIOLET, opacity, points=line, lifetime=LIFETIME)
+        line, opacity, size = forecast.vertices[instant], 0.8 - 0.2 * number, (1.5e-4, 0.0, 0.0)
+        ghost = Marker(
+            "forecast",
+            number,
+            MarkerType.LINE_STRIP,
+            size,
+            COLOURS["forecast"],
+            opacity,
+            points=line,
+            lifetime=LIFETIME,
+        )
         markers.append(ghost)
     contact, caption = forecast.first_contact, forecast_text(forecast)
     if caption:
         place = forecast.tails[-1]
         if contact is not None:
             place = forecast.vertices[int(np.searchsorted(forecast.times, contact.time)), contact.node]
-        markers.append(_text("forecast", GHOSTS, RED, place, caption))
+        markers.append(_text("forecast", GHOSTS, COLOURS["alarm"], place, caption))
     return packed_markers(stamp, markers)
 
 
@@ -212,20 +238,23 @@ def packed_scene_markers(stamp: Stamp, scene: Scene) -> bytes:
 
     A disc is a flat cylinder, a polygon the triangles that it is cut into.
     """
-    diameter = scene.dish.diameter
-    angles = np.linspace(0.0, 2.0 * math.pi, RIM_POINTS + 1)
+    diameter, thickness = scene.dish.diameter, 1e-3  # m; the latter of a disc's cylinder
+    angles = np.linspace(0.0, 2.0 * math.pi, 181)
     rim = scene.dish.radius * np.column_stack([np.cos(angles), np.sin(angles)])
-    nothing = Marker("", 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, action=DELETE_ALL)
-    markers = [nothing, Marker("dish", 0, LINE_STRIP, (0.005 * diameter, 0.0, 0.0), RIM, 0.8, points=rim)]
+    delete_all = Marker("", 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, action=3)
+    markers = [delete_all, Marker("dish", 0, LINE_STRIP, (0.005 * diameter, 0.0, 0.0), COLOURS["rim"], 0.8, points=rim)]
     for index, shape in enumerate(scene.shapes):
-        geometry, colour = shape.geometry, KINDS[shape.kind]
+        geometry, colour = shape.geometry, COLOURS[shape.kind]
         if isinstance(geometry, Disc):
-            scale = (2.0 * geometry.radius, 2.0 * geometry.radius, THICKNESS)
-            markers.append(Marker("shapes", index, CYLINDER, scale, colour, 0.8, place=geometry.centre))
+            scale = (2.0 * geometry.radius, 2.0 * geometry.radius, thickness)
+            markers.append(Marker("shapes", index, MarkerType.CYLINDER, scale, colour, 0.8, place=geometry.centre))
         else:
-            cut = triangulate(geometry)
-            corners = cut.vertices[cut.triangles].reshape(-1, 2)
-            markers.append(Marker("shapes", index, TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners))
-        place, size = (*shape.label_point, THICKNESS), (0.0, 0.0, NAME_SIZE * diameter)
-        markers.append(Marker("names", index, TEXT, size, NAME_INK, place=place, caption=shape.name))
+            corners = triangulate(geometry).reshape(-1, 2)
+            markers.append(
+                Marker("shapes", index, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners)
+            )
+        place, size = (*shape.label_point, thickness), (0.0, 0.0, 0.025 * diameter)
+        markers.append(
+            Marker("names", index, MarkerType.TEXT_VIEW_FACING, size, COLOURS["ink"], place=place, caption=shape.name)
+        )
     return packed_markers(stamp, markers)

@@ -6,6 +6,7 @@ Each layout has the fields of the message's definition in their order; stamps ar
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import CAMERA_FRAME
+from magnetosuture_thread.interface import (
+    CAMERA_FRAME,
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    ESTIMATED_THREAD,
+    GROUND_TRUTH_NEEDLE,
+    GROUND_TRUTH_PULL,
+    GROUND_TRUTH_THREAD,
+    MARGINS,
+    MEASURED_THREAD,
+    NEEDLE_POSE,
+    PREDICTED_THREAD,
+    THREAD_OBSERVATION,
+    Channel,
+)
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, Stamp, aligned, pack
 from magnetosuture_thread.thread.margins import FrictionState, Margins
 from magnetosuture_thread.thread.prediction import Prediction
@@ -26,17 +41,14 @@ if TYPE_CHECKING:
     from magnetosuture_thread.coils.drivers import DriverState
     from magnetosuture_thread.estimator import ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
+    from magnetosuture_thread.rig.rig import RigFrame
+    from magnetosuture_thread.thread_model.session import PredictionResult
     from magnetosuture_thread.vision.look import Track
 
 Vector = NDArray[np.float64]
+Outputs = Iterator[tuple[Channel, bytes]]
 
 IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
-STATES = {"SEARCHING": 0, "TRACKED": 1, "LOST": 2}  # as in TrackerState.msg
-UNCONFIGURED, CONDITIONS = 0, {"INACTIVE": 1, "ACTIVE": 2, "FAULT": 3}  # as in CoilBridgeState.msg
-CONTACT_UNKNOWN, CONTACT_FREE, IN_CONTACT = 0, 1, 2  # as in SafetyMargins.msg
-OF_NOTHING, OF_PREDICTION, OF_ESTIMATE = 0, 1, 2
-MAX_PROBLEMS = 8  # of a frame that are published
-MAX_INSTANTS = 11  # of a forecast: the start, and ten after it
 
 
 def packed_header(stamp: Stamp) -> bytes:
@@ -131,10 +143,11 @@ def packed_tracker_state(stamp: Stamp, track: Track, processing_time: float = 0.
         processing_time: wall-clock time it took [s]; offline it is no property of a frame, and 0.
     """
     confidence, curvature, view = 0.0, 0.0, track.view
+    state = ("SEARCHING", "TRACKED", "LOST").index(track.state.name)  # as in TrackerState.msg
     if track.state.name == "TRACKED":
         confidence, curvature = track.confidence, track.curvature
     placed = ((), 0.0, 0.0) if view is None else (view.centre_px, view.metres_per_pixel, view.rotation)
-    measured = (STATES[track.state.name], track.reason, confidence, curvature, processing_time)
+    measured = (state, track.reason, confidence, curvature, processing_time)
     layout = "header uint8 text float64 float64 float64 float64[] float64 float64"
     return pack(layout, stamp, *measured, *placed)
 
@@ -149,12 +162,6 @@ def packed_observation(stamp: Stamp, observation: ThreadObservation) -> bytes:
     layout += ["bool uint32", *["points"] * len(observation.hidden)]
     values += [bool(observation.complete), len(observation.hidden), *observation.hidden]
     return pack(" ".join(layout), *values)
-
-
-_PREDICTION = (
-    "header text text text points float64[] float64[] uint32[] points float64[4] uint8[] float64[] "
-    "text text float64 float64 uint32 float64"
-)
 
 
 def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, step_time: float = 0.0) -> bytes:
@@ -176,7 +183,8 @@ def packed_prediction(stamp: Stamp, prediction: Prediction, material: str, *, st
             states, use = forces.friction_states, forces.friction_use
     nodes = np.flatnonzero(contact.any(axis=1))
     return pack(
-        _PREDICTION,
+        "header text text text points float64[] float64[] uint32[] points float64[4] uint8[] float64[] "
+        "text text float64 float64 uint32 float64",
         *(stamp, prediction.formulation, prediction.scene_version, material),
         *(prediction.positions, prediction.strain, tension),
         *(nodes, contact[nodes], pull, states, use),
@@ -203,13 +211,8 @@ def packed_estimate(stamp: Stamp, estimate: ThreadEstimate) -> bytes:
         *(stamp, estimate.prediction.scene_version, estimate.positions, estimate.deviation),
         *(np.ravel(estimate.covariance), not estimate.corrected, estimate.unmeasured_for, estimate.hidden),
         *(estimate.points, square, degrees, len(estimate.disturbances), *disturbances),
-        *(estimate.problems[:MAX_PROBLEMS], estimate.converged, estimate.residual),
+        *(estimate.problems[:8], estimate.converged, estimate.residual),
     )
-
-
-_MARGINS = "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
-_MINIMUM = "text uint32 int32 float64 float64 float64 "
-_CONTACT_AND_FRICTION = "uint8 uint32[] uint8 uint32[] float64"
 
 
 def packed_margins(
@@ -224,10 +227,12 @@ def packed_margins(
         scene_version: of the scene in force where there are none.
         of_estimate: whether they are of the estimated thread; else of the predicted one.
     """
+    rows_layout = "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
+    contact_layout = "uint8 uint32[] uint8 uint32[] float64"
+    # The numbers of contact states and sources are those of SafetyMargins.msg.
     if margins is None:
-        head = (stamp, scene_version, False, reason, OF_NOTHING, ())
-        nothing = (CONTACT_UNKNOWN, (), FrictionState.UNKNOWN, (), 1.0)
-        return pack(_MARGINS + _CONTACT_AND_FRICTION, *head, *[()] * 6, 0, *nothing)
+        nothing = (0, (), FrictionState.UNKNOWN, (), 1.0)
+        return pack(rows_layout + contact_layout, stamp, scene_version, False, reason, 0, (), *[()] * 6, 0, *nothing)
     barriers, minima, friction = margins.barriers, margins.minima, margins.friction
     columns: list[ArrayLike] = [np.repeat(np.arange(len(barriers)), [len(barrier) for barrier in barriers])]
     for name in ("node", "obstacle", "value", "clearance", "bound"):
@@ -235,20 +240,13 @@ def packed_margins(
     rows: list[Any] = []
     for row in minima:
         rows += [row.barrier, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0]]
-    source = OF_ESTIMATE if of_estimate else OF_PREDICTION
     return pack(
-        _MARGINS + _MINIMUM * len(minima) + _CONTACT_AND_FRICTION,
-        *(stamp, margins.scene_version, True, "", source, [barrier.barrier for barrier in barriers]),
+        rows_layout + "text uint32 int32 float64 float64 float64 " * len(minima) + contact_layout,
+        *(stamp, margins.scene_version, True, "", 1 + of_estimate, [barrier.barrier for barrier in barriers]),
         *(*columns, len(minima), *rows),
-        *(IN_CONTACT if margins.in_contact else CONTACT_FREE, margins.in_contact),
+        *(2 if margins.in_contact else 1, margins.in_contact),
         *(friction.state, friction.nodes, friction.slowdown),
     )
-
-
-_FORECAST = (
-    "header text float64[3] float64 bool text float64[] points points points texts float64[] float64[] uint32[] texts "
-    "float64 text uint32 float64 uint32[] float64 texts float64 float64"
-)
 
 
 def packed_forecast(stamp: Stamp, forecast: Forecast) -> bytes:
@@ -258,11 +256,12 @@ def packed_forecast(stamp: Stamp, forecast: Forecast) -> bytes:
         stamp: of the needle's pose at the start.
         forecast: of a command that is held.
     """
-    shown, contact, minima = forecast_instants(forecast, MAX_INSTANTS), forecast.first_contact, forecast.minima
+    shown, contact, minima = forecast_instants(forecast, 11), forecast.first_contact, forecast.minima
     command = forecast.commanded[0] if len(forecast.times) > 1 else (0.0, 0.0)
     margins = list(minima.values())
     return pack(
-        _FORECAST,
+        "header text float64[3] float64 bool text float64[] points points points texts float64[] float64[] uint32[] "
+        "texts float64 text uint32 float64 uint32[] float64 texts float64 float64",
         *(stamp, forecast.scene_version, (*command, 0.0), forecast.horizon, forecast.converged, forecast.problem),
         *(forecast.times[shown], forecast.tails[shown], forecast.headings[shown]),
         *(forecast.vertices[shown].reshape(-1, 2), list(minima)),
@@ -326,11 +325,68 @@ def packed_bridge_state(stamp: Stamp, system: CoilSystem, driver: DriverState, r
         velocities, drift, reasons = _velocities(output), output.drift, output.reasons
         currents, saturated = output.allocation.currents, output.allocation.saturated
     closed = output is None and not latch.latched_reason
+    # As in CoilBridgeState.msg.
+    state = 0 if closed else ("UNCONFIGURED", "INACTIVE", "ACTIVE", "FAULT").index(latch.state.name)
     layout = "header uint8 bool bool text texts float64[9] float64 bool text bool texts float64[] float64[] float64[] "
     return pack(
         layout + "uint32",
-        *(stamp, UNCONFIGURED if closed else CONDITIONS[latch.state.name], latch.armed, latch.emergency),
+        *(stamp, state, latch.armed, latch.emergency),
         *("" if system.bridge is None else system.bridge.scene_version, reasons, velocities, drift, saturated),
         *(system.driver_name, driver.ready, driver.warnings, currents),
         *(() if driver.currents is None else driver.currents, driver.voltages, refused),
     )
+
+
+# What rig, tracker and model publish of a frame: by nodes, and into bags that are written without a graph.
+
+
+def camera_outputs(
+    stamp: Stamp, jpeg: NDArray[np.uint8], size: tuple[int, int], view: DishView, height: float
+) -> Outputs:
+    """Give a frame and the intrinsics of a camera at a height above the dish [m]; size is width and height."""
+    yield COMPRESSED_IMAGE, packed_compressed_image(stamp, jpeg)
+    yield CAMERA_INFO, packed_camera_info(stamp, size, view, height)
+
+
+def ground_truth_outputs(stamp: Stamp, frame: RigFrame) -> Outputs:
+    """Give where needle and thread of a simulation are, and how the thread pulls."""
+    yield GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
+    yield GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
+    yield GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)
+
+
+def thread_outputs(stamp: Stamp, observation: ThreadObservation, centreline: Points | None) -> Outputs:
+    """Give what a frame shows of the thread; the centreline from the tail on has the shape (m, 2) [m]."""
+    yield THREAD_OBSERVATION, packed_observation(stamp, observation)
+    if centreline is not None and len(centreline):
+        yield MEASURED_THREAD, packed_path(stamp, centreline)
+
+
+def pose_outputs(
+    stamp: Stamp, tail: NDArray[np.float64], heading: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> Outputs:
+    """Give the needle's pose; see `packed_pose`."""
+    yield NEEDLE_POSE, packed_pose(stamp, tail, heading, covariance)
+
+
+def prediction_outputs(result: PredictionResult, material: str, step_time: float = 0.0) -> Outputs:
+    """Give the prediction of a pose, if there is one, with the time that it took [s]."""
+    if result.prediction is not None:
+        yield PREDICTED_THREAD, packed_prediction(result.stamp, result.prediction, material, step_time=step_time)
+
+
+def estimate_outputs(result: PredictionResult) -> Outputs:
+    """Give the estimate of a pose, if there is one, and the margins or why there are none."""
+    if result.estimate is not None:
+        yield ESTIMATED_THREAD, packed_estimate(result.stamp, result.estimate)
+    if result.estimate is not None or not result.late:
+        yield (
+            MARGINS,
+            packed_margins(
+                result.stamp,
+                result.margins,
+                "" if result.margins else result.reason,
+                result.scene_version,
+                of_estimate=result.estimate is not None,
+            ),
+        )

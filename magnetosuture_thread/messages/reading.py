@@ -1,7 +1,4 @@
-"""Reads messages of any library, and the headers, poses and paths among CDR bytes, many times faster than decoded.
-
-Of bytes, what is not laid out as these readers expect is left to whoever decodes all messages.
-"""
+"""Reads messages of any library, and paths among CDR bytes, many times faster than decoded."""
 
 from __future__ import annotations
 
@@ -25,18 +22,13 @@ from magnetosuture_thread.interface import (
     NEEDLE_POSE,
     THREAD_OBSERVATION,
 )
-from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, LITTLE_ENDIAN, aligned, header_stamp, is_in_dish_frame
+from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, header_stamp, is_in_dish_frame
 from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
-_COVARIANT_POSE = struct.Struct("<43d")  # position, quaternion and covariance
-_VARIANCES = [7 * k for k in IN_PLANE]  # among its 36 numbers
-_COUNT = struct.Struct("<I")
-_POSE_AT = aligned(DISH_END, 8)
 MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
-MAX_HEADING_DEVIATION = 1.0  # rad; beyond, it is unknown which end of the needle is the tail
 _STAMP = f"{NEEDLE_POSE.name}.header.stamp"
 _ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
 
@@ -77,17 +69,24 @@ def needle_pose(message: Any) -> NeedlePose:
     Raises:
         InvalidInputError: wrong frame, no stamp, no unit quaternion, or a heading that is unknown by its covariance.
     """
-    require_dish_frame(message.header.frame_id, NEEDLE_POSE.name)
+    tail, heading, deviation = _plane_pose(message, NEEDLE_POSE.name)
     stamp = message.header.stamp
     checked_nanoseconds(stamp, _STAMP)  # the prediction could not be stamped by another
+    variance = float(message.pose.covariance[-1])
+    if variance > 1.0:  # rad^2; beyond, it is unknown which end of the needle is the tail
+        expected = "a standard deviation of at most 1 rad: the heading is unknown"
+        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
+    return NeedlePose(seconds(stamp), tail, heading, deviation)
+
+
+def _plane_pose(message: Any, field: str) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
+    """Return tail, heading and their standard deviations of a PoseWithCovarianceStamped."""
+    require_dish_frame(message.header.frame_id, field)
     position, q = message.pose.pose.position, message.pose.pose.orientation
     heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
-    variance = float(message.pose.covariance[-1])
-    if variance > MAX_HEADING_DEVIATION**2:
-        expected = f"a standard deviation of at most {MAX_HEADING_DEVIATION:g} rad: the heading is unknown"
-        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
-    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
-    return NeedlePose(seconds(stamp), np.array([position.x, position.y]), heading, deviation)
+    # x, y and the turn about z among the 36 numbers of the covariance.
+    deviation = pose_deviation([message.pose.covariance[7 * k] for k in IN_PLANE])
+    return np.array([position.x, position.y]), heading, deviation
 
 
 def check_pose_age(stamp: float, now: float, max_age: float) -> None:
@@ -316,17 +315,7 @@ def read_pose(
         BagError: it cannot be decoded.
         InvalidInputError: it is of another frame, or its orientation is none.
     """
-    data = record.data
-    if _is_plain(data) and len(data) >= _POSE_AT + _COVARIANT_POSE.size:
-        x, y, _, qx, qy, qz, qw, *covariance = _COVARIANT_POSE.unpack_from(data, _POSE_AT)
-        heading = heading_from_quaternion(qx, qy, qz, qw, _ORIENTATION)
-        return np.array([x, y]), heading, pose_deviation([covariance[k] for k in _VARIANCES])
-    message = record.decode()
-    require_dish_frame(message.header.frame_id, record.topic)
-    position, q = message.pose.pose.position, message.pose.pose.orientation
-    heading = heading_from_quaternion(q.x, q.y, q.z, q.w, _ORIENTATION)
-    deviation = pose_deviation([message.pose.covariance[k] for k in _VARIANCES])
-    return np.array([position.x, position.y]), heading, deviation
+    return _plane_pose(record.decode(), record.topic)
 
 
 def read_path(record: SerializedMessage) -> Points:
@@ -367,17 +356,12 @@ def read_observation(record: SerializedMessage) -> ThreadObservation:
 
 def _plain_path(data: bytes) -> Points | None:
     """Return a path whose poses all are in the dish frame, as ours are, so that they lie at equal distances."""
-    if not _is_plain(data) or len(data) < PATH_AT:
+    if not is_in_dish_frame(data) or len(data) < PATH_AT:
         return None
-    (count,) = _COUNT.unpack_from(data, PATH_AT - _COUNT.size)
+    (count,) = struct.unpack_from("<I", data, PATH_AT - 4)
     if len(data) < PATH_AT + count * PATH_POSES.itemsize:
         return None
     poses = np.frombuffer(data, PATH_POSES, count, PATH_AT)
     if poses["frame"].tobytes() != data[len(BEGIN) + 8 : DISH_END] * count:
         return None
     return np.column_stack([poses["x"], poses["y"]])
-
-
-def _is_plain(data: bytes) -> bool:
-    """Return whether a message is in the dish frame, and written as our machines write it."""
-    return data[:2] == LITTLE_ENDIAN and is_in_dish_frame(data)

@@ -1,16 +1,21 @@
-"""Clients of a running graph: of its coil bridge, and of its needle planner."""
+"""Who is in a graph without an executor: messages are queued in the middleware, and polled.
+
+Waiting for hundreds of messages a second in rclpy would cost as much as the nodes that send them. The middleware keeps
+the latest messages and their time of arrival.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
@@ -18,24 +23,28 @@ from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 from typing_extensions import Self
 
+from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, EXECUTE_PROCEDURE, RESET
+from magnetosuture_thread.interface import ALL_NODES, ARM, DIAGNOSTICS, EMERGENCY_STOP, EXECUTE_PROCEDURE, RESET
+from magnetosuture_thread.messages.reading import clock_nanoseconds
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.coil_bridge import JITTER_KEYS, SCHEDULING
-from magnetosuture_thread.nodes.diagnostics import read_status
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode
+from magnetosuture_thread.nodes.node import JITTER_KEYS, MAX_REASON_CHARS, SCHEDULING, GuardedNode, read_status
 from magnetosuture_thread.texts import shortened
 
-TIMEOUT = 10.0  # s for the bridge to be found and to answer
+TIMEOUT = 10.0  # s for a service to be found and to answer
+RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
+POLL_PERIOD = 0.005  # s between two looks at what has come
 DISCOVERY_TIME = 1.0  # s after a node is found, for it to have discovered this client
-CALL_PERIOD = 0.5  # s without an answer, after which a service is called again
-SETTLE_TIME = 0.15  # s after an answer, for the bridge to publish its new state
 GOAL_PERIOD = 2.0  # s after which a procedure that could not begin is sent again
-MAX_CALLBACKS = 20  # of one poll
+RECORDED_DEPTH = 1000  # messages of a recorded topic that may wait before any is lost
 
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
@@ -43,61 +52,221 @@ TRANSITIONS = {
     "deactivate": Transition.TRANSITION_DEACTIVATE,
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
-_BRIDGE_STATES = {
-    CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
-    CoilBridgeState.STATE_INACTIVE: "inactive",
-    CoilBridgeState.STATE_ACTIVE: "active",
-    CoilBridgeState.STATE_FAULT: "fault",
-}
 DONE = "done"
-_PROCEDURE_STATES = {
-    ProcedureState.STATE_READY: "planned",
-    ProcedureState.STATE_RUNNING: "running",
-    ProcedureState.STATE_PAUSED: "paused",
-    ProcedureState.STATE_DONE: DONE,
-    ProcedureState.STATE_FAILED: "failed",
-}
 
 
-class _Client:
-    """A node in a context of its own, on the ROS domain of the environment, whose callbacks run when it says.
+@contextmanager
+def joined(
+    *, name: str = "console", domain: int | None = None, namespace: str = "", simulated_clock: bool = False
+) -> Iterator[GuardedNode]:
+    """Create a node in a graph, in a context of its own.
 
     Args:
         name: of the node.
-        namespace: of the node.
+        domain: the graph's ROS domain; the one that the environment names if None.
+        namespace: of the graph, where it is in one.
+        simulated_clock: whether its time is that of /clock.
+    """
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, args=[], signal_handler_options=SignalHandlerOptions.NO)
+    # rclpy's own service of types is answered by an executor only.
+    parameters = [
+        Parameter("start_type_description_service", value=False),
+        Parameter("use_sim_time", value=simulated_clock),
+    ]
+    options: dict[str, Any] = {"parameter_overrides": parameters, "start_parameter_services": False}
+    node = GuardedNode(name, context=context, namespace=namespace, **options)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+class Inbox:
+    """Queue of the messages of a topic since the last poll.
+
+    Args:
+        node: that subscribes.
+        topic: to subscribe.
+        depth: of the queue; beyond it, the oldest messages are lost.
+        reliable: whether every publisher is reliable, whatever the topic's own quality of service.
     """
 
-    def __init__(self, name: str, namespace: str = "") -> None:
-        self._name, self._namespace = name, namespace
-        self._context = Context()
+    def __init__(self, node: Node, topic: topics.Topic, depth: int, *, reliable: bool = False) -> None:
+        self.topic = topic
+        own = ReliabilityPolicy.RELIABLE if reliable else topic.qos.reliability or ReliabilityPolicy.RELIABLE
+        quality = QoSProfile(depth=depth, reliability=own, durability=topic.qos.durability)
+        self._node, self._depth = node, depth
+        self._subscription = node.create_subscription(topic.message, topic.name, _never, quality, raw=True)
 
-    def __enter__(self) -> Self:
-        """Join the graph."""
-        rclpy.init(context=self._context, args=[])
-        options = {"context": self._context, "namespace": self._namespace, "start_parameter_services": False}
-        self._node = GuardedNode(self._name, **options)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._join()
-        return self
+    def messages(self) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """Yield the queued messages, no more than the queue holds: CDR bytes, and what the middleware says of each.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        In a flood there would always be one more.
+        """
+        subscription = self._subscription
+        with subscription.handle:
+            for _ in range(self._depth):
+                found = subscription.handle.take_message(subscription.msg_type, True)
+                if found is None:
+                    return
+                yield bytes(found[0]), found[1]
+
+    def take(self) -> Iterator[tuple[bytes, int]]:
+        """Yield the queued messages: CDR bytes, and time of arrival [ns]."""
+        for data, info in self.messages():
+            yield data, info["received_timestamp"]
+
+    def read(self) -> Iterator[tuple[Any, int]]:
+        """Yield the queued messages, and their time of arrival [ns]; invalid ones are skipped."""
+        for data, arrived in self.take():
+            with suppress(InvalidInputError):
+                yield self.topic.decode(data), arrived
+
+    @property
+    def has_publisher(self) -> bool:
+        """Whether a publisher of the topic has been found."""
+        return bool(self._subscription.get_publisher_count())
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+
+class Latest:
+    """Content of the latest message of a topic.
+
+    Args:
+        node: that subscribes.
+        topic: to subscribe.
+        read: converts a message; where it fails, the previous value stays.
+        period: minimum between two messages that are read [s].
+        max_bytes: of a message that is read; the topic's own bound if None.
+
+    Attributes:
+        value: content of the latest message that was read; None before the first.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: topics.Topic,
+        read: Callable[[Any], Any] = lambda message: message,
+        period: float = 0.0,
+        *,
+        max_bytes: int | None = None,
     ) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self._leave()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._inbox = Inbox(node, topic, 1)
+        self._max_bytes = topic.max_bytes if max_bytes is None else max_bytes
+        self._read = read
+        self._period = period
+        self._next_read = 0.0
+        self._arrived = 0
+        self.value: Any = None
 
-    def _join(self) -> None:
-        """Make what is needed to talk to the graph."""
+    def poll(self) -> bool:
+        """Read the latest message, if there is one; return whether there is a new value."""
+        now = time.monotonic()
+        waiting = list(self._inbox.take()) if now >= self._next_read else []
+        if not waiting or len(waiting[-1][0]) > self._max_bytes:
+            return False
+        data, arrived = waiting[-1]
+        try:
+            self.value = self._read(self._inbox.topic.decode(data))
+        except Exception:  # whatever is wrong with a message, who asks goes on with the one before
+            return False
+        self._arrived, self._next_read = arrived, now + self._period
+        return True
 
-    def _leave(self) -> None:
-        """Destroy what the node does not."""
+    @property
+    def age(self) -> float:
+        """Return the age of the message [s]."""
+        return max(0.0, time.time() - self._arrived * 1e-9)
+
+    def aged(self) -> dict[str, Any] | None:
+        """Return a copy of the latest content, with its age."""
+        return None if self.value is None else {**self.value, "age": self.age}
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._inbox.close()
 
 
-class CoilClient(_Client):
+def _never(data: bytes) -> None:
+    """Stand in for a callback: no executor calls any."""
+
+
+class Services:
+    """Clients of services, created at once so that the emergency stop is discovered before it is needed.
+
+    Args:
+        node: that calls.
+        kinds: type of each service, by its name.
+    """
+
+    def __init__(self, node: Node, kinds: Mapping[str, Any]) -> None:
+        self._clients = {name: node.create_client(kind, name) for name, kind in kinds.items()}
+        self._answers: dict[str, dict[int, Any]] = {name: {} for name in kinds}
+
+    def ready(self, name: str) -> bool:
+        """Return whether a service is available."""
+        return bool(self._clients[name].service_is_ready())
+
+    async def call(
+        self,
+        name: str,
+        request: Any,
+        *,
+        timeout: float = TIMEOUT,
+        retry_period: float = RETRY_PERIOD,
+        is_wanted: Callable[[], bool] = lambda: True,
+    ) -> Any:
+        """Return the answer of a service; None where it is not wanted any more.
+
+        A service that may be called repeatedly is, so that a lost answer blocks nothing.
+
+        Args:
+            name: of the service.
+            request: to it.
+            timeout: for it to be found and to answer [s].
+            retry_period: without an answer, after which it is called again [s].
+            is_wanted: whether to go on waiting.
+
+        Raises:
+            GraphError: it was not found, or did not answer in time.
+        """
+        client, answers = self._clients[name], self._answers[name]
+        calls: list[int] = []
+        deadline, retry_at = time.monotonic() + timeout, 0.0
+        while (now := time.monotonic()) < deadline:
+            if not is_wanted():
+                return None
+            with client.handle:
+                if now >= retry_at and client.service_is_ready():
+                    calls.append(client.handle.send_request(request))
+                    retry_at = now + retry_period
+            await asyncio.sleep(POLL_PERIOD)
+            with client.handle:  # take the answers to all calls
+                while (found := client.handle.take_response(client.srv_type.Response))[0] is not None:
+                    answers[found[0].request_id.sequence_number] = found[1]
+            for answer in [answers.pop(number) for number in calls if number in answers]:
+                return answer
+        raise GraphError(
+            f"{name} did not answer within {timeout:g} s" if calls else f"no service {name} within {timeout:g} s"
+        )
+
+
+def answer_requests(node: Node) -> None:
+    """Answer what waits at a node's services."""
+    for service in node.services:
+        with service.handle:
+            request, header = service.handle.service_take_request(service.srv_type.Request)
+            if header is not None:
+                service.send_response(service.callback(request, service.srv_type.Response()), header)
+
+
+class CoilClient:
     """Client of the coil bridge on the ROS domain of the environment.
 
     Args:
@@ -105,14 +274,21 @@ class CoilClient(_Client):
     """
 
     def __init__(self, namespace: str = "") -> None:
-        super().__init__("coil_client", namespace)
-        self._state: CoilBridgeState | None = None
-        self._values: dict[str, str] = {}
+        self._namespace, self._stack = namespace, ExitStack()
 
-    def _join(self) -> None:
-        self._bridge = f"{self._node.get_namespace()}/coil_bridge".lstrip("/")
-        topics.BRIDGE_STATE.subscribe(self._node, self._on_state)
-        topics.DIAGNOSTICS.subscribe(self._node, self._on_diagnostics)
+    def __enter__(self) -> Self:
+        """Join the graph."""
+        node = self._stack.enter_context(joined(name="coil_client", namespace=self._namespace))
+        switches = {ARM: SetBool, EMERGENCY_STOP: Trigger, RESET: Trigger}
+        self._services = Services(node, {**switches, "coil_bridge/change_state": ChangeState})
+        self._state = Latest(node, topics.BRIDGE_STATE)
+        self._reports = Inbox(node, topics.DIAGNOSTICS, 10)
+        self._bridge = f"{node.get_namespace()}/coil_bridge".lstrip("/")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the graph."""
+        self._stack.close()
 
     def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
@@ -124,19 +300,22 @@ class CoilClient(_Client):
             GraphError: no bridge was found, or it rejects the command.
         """
         if action in TRANSITIONS:
-            transition = Transition(id=TRANSITIONS[action])
-            answer = self._call(ChangeState, "coil_bridge/change_state", ChangeState.Request(transition=transition))
-            message = f"the bridge rejected {action}: not possible in its state, or see its log"
-        elif action in ("arm", "disarm"):
-            answer = self._call(SetBool, ARM, SetBool.Request(data=action == "arm"))
-            message = answer.message
+            # Called once, so the bridge must have discovered this client too, or its answer is lost.
+            self._wait_for_state()
+            time.sleep(DISCOVERY_TIME)
+            request = ChangeState.Request(transition=Transition(id=TRANSITIONS[action]))
+            if not self._call("coil_bridge/change_state", request, retry_period=math.inf).success:
+                raise GraphError(f"the bridge rejected {action}: not possible in its state, or see its log")
+            message = ""
         else:
-            answer = self._call(Trigger, {"stop": EMERGENCY_STOP, "reset": RESET}[action], Trigger.Request())
-            message = answer.message
-        if not answer.success:
-            raise GraphError(shortened(message, MAX_REASON_CHARS))
-        self._spin(lambda: False, SETTLE_TIME)
-        return "" if action in TRANSITIONS else shortened(message, MAX_REASON_CHARS)
+            name = {"stop": EMERGENCY_STOP, "reset": RESET}.get(action, ARM)
+            request = SetBool.Request(data=action == "arm") if name == ARM else Trigger.Request()
+            answer = self._call(name, request)
+            message = shortened(answer.message, MAX_REASON_CHARS)
+            if not answer.success:
+                raise GraphError(message)
+        time.sleep(0.15)  # for the bridge to publish its new state
+        return message
 
     def state(self) -> dict[str, Any]:
         """Return the state of the bridge as text for display.
@@ -144,12 +323,15 @@ class CoilClient(_Client):
         Raises:
             GraphError: no state was received.
         """
-        self._spin(lambda: self._state is not None, TIMEOUT)
-        state = self._state
-        if state is None:
-            raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
+        state = self._wait_for_state()
+        texts = {
+            CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
+            CoilBridgeState.STATE_INACTIVE: "inactive",
+            CoilBridgeState.STATE_ACTIVE: "active",
+            CoilBridgeState.STATE_FAULT: "fault",
+        }
         return {
-            "state": _BRIDGE_STATES[state.state] + (", armed" if state.armed else ""),
+            "state": texts[state.state] + (", armed" if state.armed else ""),
             "currents are zero because": _listed(state.reasons) or "they are not: a command is followed",
             "velocity commanded [mm/s]": _millimetres(state.commanded),
             "velocity filtered [mm/s]": _millimetres(state.filtered),
@@ -171,44 +353,30 @@ class CoilClient(_Client):
         Raises:
             GraphError: no diagnostics were received.
         """
-        self._values = {}
-        self._spin(lambda: SCHEDULING in self._values, TIMEOUT)
-        if SCHEDULING not in self._values:
-            raise GraphError(f"no coil_bridge diagnostics received within {TIMEOUT:g} s")
-        median, p99, maximum = (float(self._values[name]) for name in JITTER_KEYS)
-        return (median, p99, maximum), self._values[SCHEDULING]
-
-    def _call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self._node.create_client(kind, name)
-        self._spin(client.service_is_ready, TIMEOUT)
-        if not client.service_is_ready():
-            raise GraphError(f"no coil_bridge found within {TIMEOUT:g} s on this ROS domain (service {name})")
         deadline = time.monotonic() + TIMEOUT
-        is_transition = kind is ChangeState
-        if is_transition:
-            # The bridge must have discovered this client too, or its answer is lost.
-            self._spin(lambda: self._state is not None, TIMEOUT)
-            self._spin(lambda: False, DISCOVERY_TIME)
         while time.monotonic() < deadline:
-            # The services may be called repeatedly: a lost answer blocks nothing.
-            future = client.call_async(request)
-            self._spin(future.done, TIMEOUT if is_transition else CALL_PERIOD)
-            if future.done():
-                return future.result()
-        raise GraphError(f"coil_bridge did not answer within {TIMEOUT:g} s (service {name})")
+            for report, _ in self._reports.read():
+                for status in report.status:
+                    values = read_status(status)[1] if status.name.startswith(f"{self._bridge}:") else {}
+                    if SCHEDULING in values:
+                        median, p99, maximum = (float(values[name]) for name in JITTER_KEYS)
+                        return (median, p99, maximum), values[SCHEDULING]
+            time.sleep(POLL_PERIOD)
+        raise GraphError(f"no coil_bridge diagnostics received within {TIMEOUT:g} s")
 
-    def _spin(self, until: Callable[[], bool], timeout: float) -> None:
-        deadline = time.monotonic() + timeout
-        while not until() and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.02)
+    def _wait_for_state(self) -> CoilBridgeState:
+        deadline = time.monotonic() + TIMEOUT
+        while not self._state.poll() and self._state.value is None:
+            if time.monotonic() > deadline:
+                raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
+            time.sleep(POLL_PERIOD)
+        return self._state.value
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name.startswith(f"{self._bridge}:"):
-                _, self._values = read_status(status)
-
-    def _on_state(self, message: CoilBridgeState) -> None:
-        self._state = message
+    def _call(self, name: str, request: Any, **options: Any) -> Any:
+        try:
+            return asyncio.run(self._services.call(name, request, timeout=TIMEOUT, **options))
+        except GraphError as error:
+            raise GraphError(f"no coil_bridge on this ROS domain: {error}") from None
 
 
 def _millimetres(vector: Any) -> str:
@@ -242,7 +410,7 @@ class ProcedureReport:
     clearance: float = math.nan
 
 
-class ProcedureClient(_Client):
+class ProcedureClient:
     """Client of the needle planner on the ROS domain of the environment; nothing happens but in `poll`.
 
     Args:
@@ -255,7 +423,7 @@ class ProcedureClient(_Client):
     """
 
     def __init__(self, procedure: str) -> None:
-        super().__init__("procedure_client")
+        self._stack = ExitStack()
         self._request = ExecuteProcedure.Goal(procedure=procedure)
         self._send_at: float | None = None  # None until the planner is found
         self._sent: Future | None = None
@@ -264,15 +432,23 @@ class ProcedureClient(_Client):
         self.result: ProcedureReport | None = None
         self.refusal = ""
 
-    def _join(self) -> None:
-        self._client = ActionClient(self._node, ExecuteProcedure, EXECUTE_PROCEDURE)
+    def __enter__(self) -> Self:
+        """Join the graph."""
+        node = self._stack.enter_context(joined(name="procedure_client"))
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
+        self._stack.callback(self._client.destroy)
+        self._stack.callback(self._executor.shutdown)
+        return self
 
-    def _leave(self) -> None:
-        self._client.destroy()
+    def __exit__(self, *error: object) -> None:
+        """Leave the graph."""
+        self._stack.close()
 
     def poll(self) -> None:
         """Send the goal once the planner is there, and take what has come."""
-        for _ in range(MAX_CALLBACKS):
+        for _ in range(20):
             self._executor.spin_once(timeout_sec=0.0)
         now = time.monotonic()
         if self._send_at is None:
@@ -289,13 +465,85 @@ class ProcedureClient(_Client):
 
     def _on_feedback(self, message: Any) -> None:
         status = message.feedback.status
-        state = _PROCEDURE_STATES.get(status.state, "unknown")
-        self.status = ProcedureReport(state, status.reason, status.goals_met, status.progress, status.clearance)
+        figures = status.goals_met, status.progress, status.clearance
+        self.status = ProcedureReport(_procedure_state(status.state), status.reason, *figures)
 
     def _end(self, result: ExecuteProcedure.Result, now: float) -> None:
         if self.status is not None or result.state == ProcedureState.STATE_DONE:
-            self.result = ProcedureReport(
-                _PROCEDURE_STATES.get(result.state, "unknown"), result.reason, result.goals_met
-            )
+            self.result = ProcedureReport(_procedure_state(result.state), result.reason, result.goals_met)
             return
         self.refusal, self._sent, self._ended, self._send_at = result.reason, None, None, now + GOAL_PERIOD
+
+
+def _procedure_state(state: int) -> str:
+    names = {
+        ProcedureState.STATE_READY: "planned",
+        ProcedureState.STATE_RUNNING: "running",
+        ProcedureState.STATE_PAUSED: "paused",
+        ProcedureState.STATE_DONE: DONE,
+        ProcedureState.STATE_FAILED: "failed",
+    }
+    return names.get(state, "unknown")
+
+
+class Recorder:
+    """A node that records the serialised messages of some topics.
+
+    Args:
+        domain: the graph's ROS domain.
+        taken: topics to take.
+        simulated_clock: whether the time is that of /clock.
+        receive: called with topic, time of arrival [ns] and CDR bytes of every message.
+
+    Attributes:
+        taken: messages of each topic so far, by its name with a leading slash.
+        status_texts: of each node of this package, message and values of its last status.
+    """
+
+    def __init__(
+        self,
+        domain: int,
+        taken: Sequence[topics.Topic],
+        *,
+        simulated_clock: bool,
+        receive: Callable[[str, int, bytes], None],
+    ) -> None:
+        self._receive = receive
+        self._now = 0 if simulated_clock else None
+        self.taken: Counter[str] = Counter()
+        self.status_texts: dict[str, tuple[str, dict[str, str]]] = {}
+        self._stack = ExitStack()
+        node = self._stack.enter_context(joined(name="recorder", domain=domain))
+        followed = (topics.CLOCK, *taken) if simulated_clock else taken
+        self._inboxes = [Inbox(node, topic, RECORDED_DEPTH) for topic in followed]
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._stack.close()
+
+    def silent(self) -> list[str]:
+        """Return the topics without a publisher."""
+        return [inbox.topic.name for inbox in self._inboxes if not inbox.has_publisher]
+
+    def spin(self, duration: float) -> None:
+        """Receive messages for a time [s]."""
+        end = time.monotonic() + duration
+        while time.monotonic() < end:
+            for inbox in self._inboxes:
+                for data, arrived in inbox.take():
+                    self._take(inbox.topic, data, arrived)
+            time.sleep(POLL_PERIOD)
+
+    def _take(self, topic: topics.Topic, data: bytes, arrived: int) -> None:
+        if topic is topics.CLOCK:
+            with suppress(InvalidInputError):  # no time at all
+                self._now = clock_nanoseconds(topic.decode(data))
+            return
+        self.taken[topic.channel.recorded] += 1
+        self._receive(topic.channel.recorded, arrived if self._now is None else self._now, data)
+        if topic.channel is DIAGNOSTICS:
+            with suppress(InvalidInputError):
+                for status in topic.decode(data).status:
+                    name = status.name.split(":")[0]
+                    if name in ALL_NODES:
+                        self.status_texts[name] = read_status(status)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -37,14 +36,11 @@ from magnetosuture_thread.messages.packing import (
 )
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.run import raise_priority, run
+from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.run import raise_priority
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
-FAULT_PREFIX = "fault: "
-SCHEDULING = "scheduling"
-JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
 # Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
 AGE_KEY = "minimum age of {topic} [ms]"
 AGED_TOPICS = (*INPUTS.values(), topics.NEEDLE_POSE.name)
@@ -68,15 +64,25 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._watchdog: Timer | None = None
-        self._report = CoilReport(self, self.system, self._steady)
+        self._refused = 0
+        self._last_state: object = None
+        self._last_log = ""
+        self._setpoints = topics.NEEDLE_SETPOINT.publisher(self)
+        self._currents = topics.CURRENTS.publisher(self)
+        self._states = topics.BRIDGE_STATE.publisher(self)
+        self._filter = topics.FILTER_STATE.publisher(self)
+        self._rig = topics.RIG_CURRENTS.publisher(self)
+        self.create_timer(STATE_PERIOD, lambda: self._publish_state(force=True), clock=self._steady)
+        # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
+        self._log(self.system.closed, self.system.driver_state)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
-        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self._scene = SceneFollower(self, self.on_scene)
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
-        self.create_service(SetBool, ARM, lambda asked, answer: _respond(answer, lambda: self.arm(asked.data)))
-        self.create_service(Trigger, EMERGENCY_STOP, lambda _, answer: _respond(answer, self.stop))
-        self.create_service(Trigger, RESET, lambda _, answer: _respond(answer, self.reset))
+        self.create_service(SetBool, ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
+        self.create_service(Trigger, EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
+        self.create_service(Trigger, RESET, lambda _, answer: _done(answer, self.reset()))
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
@@ -87,7 +93,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self.system.recall(stop_record(self))
         self.system.remember()
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
-        driver = make_driver(settings, len(bridge.coils), self._report.send_to_rig, self._report.count_rigs)
+        driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)
         self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
 
@@ -108,10 +114,10 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         ends = self.is_shutting_down or self.has_ended
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
         if ends:
-            self._report.report_unless(partial(self.system.remember, ends=True))
+            self._remember(ends=True)
         if final is not None and self.context.ok():
-            self._report.publish_output(None, final)
-            self._report.publish_state(force=True)
+            self._publish_output(None, final)
+            self._publish_state(force=True)
 
     def may_start(self) -> bool:
         """Return whether nothing is latched from the process before; else a reset makes the node active."""
@@ -130,13 +136,14 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         """Latch the emergency stop, in any state, also over a restart; return what is wrong all the same."""
         return self._rest(self.system.latch.stop)
 
-    def reset(self) -> None:
+    def reset(self) -> str:
         """Clear the emergency stop and faults; a node that they deactivated is active again, but disarmed."""
         self.system.reset()
         if self._reactivate and self.stage == "inactive":
             self.require(self.trigger_activate)
         self._reactivate = False
         self._step()
+        return ""
 
     def on_pose(self, message: PoseWithCovarianceStamped, number: int) -> None:
         """Register a needle pose, for the next currents."""
@@ -191,158 +198,113 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
             self._reactivate = True
             self.trigger_deactivate()
 
-    def raise_priority(self) -> None:
-        """Set the real-time priority of the loop; meant for a process of its own."""
-        self._report.report_scheduling(raise_priority((self.settings or CoilBridgeSettings()).realtime_priority))
+    def own_process(self) -> None:
+        """Set the real-time priority of the loop."""
+        scheduling = raise_priority((self.settings or CoilBridgeSettings()).realtime_priority)
+        self.health.note(**{SCHEDULING: scheduling})
+        self.get_logger().info(f"{SCHEDULING}: {scheduling}")
 
     def refuse(self, problem: Exception) -> None:
-        """Report a message that was refused."""
-        self._report.report_refused(problem)
+        """Count and report a message that was refused."""
+        self._refused += 1
+        self.health.refuse(problem)
 
     def _rest(self, switch: Callable[[], None]) -> str:
         """Come to rest by a switch, and only then wait for the disk; return what is wrong with that."""
         switch()
         self.system.zero()
         self._step()
-        return self._report.report_unless(self.system.remember)
+        return self._remember()
+
+    def _remember(self, *, ends: bool = False) -> str:
+        """Keep the latch over a restart, which must not hold up what comes after; return what is wrong with that."""
+        try:
+            self.system.remember(ends=ends)
+        except MagnetosutureError as error:
+            self.get_logger().error(str(error))
+            return str(error)
+        return ""
 
     def _step(self) -> None:
         """Compute, apply and publish the currents."""
         output = self.system.step(*self._times(), self._scene.problem)
         if output is not None and output.publish:
-            self._report.publish_output(None if output.reasons else self._stamps.get(output.source), output)
-        self._report.publish_state(force=False)
+            self._publish_output(None if output.reasons else self._stamps.get(output.source), output)
+        self._publish_state(force=False)
 
     def _times(self) -> tuple[float, float]:
         """Return the time of the stamps' clock and a monotonic time [s]."""
         return self.get_clock().now().nanoseconds * 1e-9, time.monotonic()
 
-
-def _respond(response: Any, act: Callable[[], str | None]) -> Any:
-    """Answer by a text about what is wrong although it was done, or by why it was not."""
-    try:
-        response.message = act() or ""
-    except MagnetosutureError as error:
-        response.success, response.message = False, str(error)
-    else:
-        response.success = True
-    return response
-
-
-class CoilReport:
-    """Publishes currents, state and diagnostics of the coil bridge.
-
-    Args:
-        node: the coil bridge.
-        system: bridge, driver and latch.
-        steady: a clock that does not depend on /clock.
-    """
-
-    def __init__(self, node: PackageNode, system: CoilSystem, steady: Clock) -> None:
-        self._node = node
-        self._system = system
-        self._health = node.health
-        self._refused = 0
-        self._last_state: object = None
-        self._last_log = ""
-        self._setpoints = topics.NEEDLE_SETPOINT.publisher(node)
-        self._currents = topics.CURRENTS.publisher(node)
-        self._states = topics.BRIDGE_STATE.publisher(node)
-        self._filter = topics.FILTER_STATE.publisher(node)
-        self._rig = topics.RIG_CURRENTS.publisher(node)
-        node.create_timer(STATE_PERIOD, lambda: self.publish_state(force=True), clock=steady)
-        # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
-        self._log(system.closed, system.driver_state)
-
-    def send_to_rig(self, currents: np.ndarray) -> None:
+    def _send_to_rig(self, currents: np.ndarray) -> None:
         """Send currents to the simulated rig."""
-        self._rig.publish(packed_rig_currents(self._node.get_clock().now().to_msg(), currents))
+        self._rig.publish(packed_rig_currents(self.get_clock().now().to_msg(), currents))
 
-    def count_rigs(self) -> int:
+    def _count_rigs(self) -> int:
         """Return the number of simulated rigs that subscribe; none after ROS has shut down."""
-        return int(self._rig.get_subscription_count()) if self._node.context.ok() else 0
+        return int(self._rig.get_subscription_count()) if self.context.ok() else 0
 
-    def report_scheduling(self, scheduling: str) -> None:
-        """Log how the process is scheduled."""
-        self._health.note(**{SCHEDULING: scheduling})
-        self._node.get_logger().info(f"{SCHEDULING}: {scheduling}")
-
-    def report_unless(self, act: Callable[[], object]) -> str:
-        """Do what may fail but must not hold up what comes after; log and return the problem, empty if none."""
-        try:
-            act()
-        except MagnetosutureError as error:
-            self._node.get_logger().error(str(error))
-            return str(error)
-        return ""
-
-    def report_refused(self, problem: Exception) -> None:
-        """Count and report a refused message."""
-        self._refused += 1
-        self._health.refuse(problem)
-
-    def publish_output(self, command: Time | None, output: BridgeOutput) -> None:
+    def _publish_output(self, command: Time | None, output: BridgeOutput) -> None:
         """Publish the output of a step; `command` is the stamp of the command that it follows, if any."""
-        stamp = self._node.get_clock().now().to_msg()
+        stamp = self.get_clock().now().to_msg()
         self._currents.publish(packed_currents(stamp, command, output))
         self._setpoints.publish(packed_twist(stamp, output.applied))
         self._filter.publish(packed_filter_state(command or stamp, output))
 
-    def publish_state(self, *, force: bool) -> None:
+    def _publish_state(self, *, force: bool) -> None:
         """Publish the state if it has changed, or if forced."""
-        system = self._system
+        system = self.system
         latch, output, driver = system.latch, system.output, system.driver_state
         reasons = () if output is None else output.reasons
         scene = "" if system.bridge is None else system.bridge.scene_version
-        now = (
-            latch.state,
-            latch.stop_reason,
-            "" if output else system.closed,
-            reasons,
-            driver.ready,
-            driver.problem,
-            driver.warnings,
-            scene,
-        )
-        changed = now != self._last_state
-        if not changed and not force:
+        closed = "" if output else system.closed
+        now = (latch.state, latch.stop_reason, closed, reasons, driver.ready, driver.problem, driver.warnings, scene)
+        if now == self._last_state and not force:
             return
-        stamp = self._node.get_clock().now().to_msg()
+        self._last_state = now
+        stamp = self.get_clock().now().to_msg()
         self._states.publish(packed_bridge_state(stamp, system, driver, self._refused))
         if output is not None and not output.publish:
             self._filter.publish(packed_filter_state(stamp, output))
         jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)
-        self._health.note(**{key: round(value, 3) for key, value in jitter})
         ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
-        self._health.note(**{AGE_KEY.format(topic=t): round(1e3 * ages.get(t, math.nan), 1) for t in AGED_TOPICS})
-        self._health.note(
-            driver=system.driver_name, scene=scene or "none", **{"driver problem": driver.problem or "none"}
+        self.health.note(
+            **{key: round(value, 3) for key, value in jitter},
+            **{AGE_KEY.format(topic=topic): round(1e3 * ages.get(topic, math.nan), 1) for topic in AGED_TOPICS},
+            driver=system.driver_name,
+            scene=scene or "none",
+            **{"driver problem": driver.problem or "none"},
         )
-        self._last_state = now
-        self._log(latch.state.value if output else system.closed, driver)
+        self._log(closed or latch.state.value, driver)
         if latch.latched_reason:
-            self._health.error(f"{FAULT_PREFIX}{latch.latched_reason}")
-        elif output is None:
-            self._health.ok(system.closed)
+            self.health.error(f"fault: {latch.latched_reason}")
+        elif closed:
+            self.health.ok(closed)
         elif not driver.ready:
-            self._health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
+            self.health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
         elif latch.stop_reason:
-            self._health.ok(latch.stop_reason)
+            self.health.ok(latch.stop_reason)
         elif reasons:
-            self._health.warn(f"stopped: {'; '.join(reasons)}")
+            self.health.warn(f"stopped: {'; '.join(reasons)}")
         elif driver.warnings:
-            self._health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
+            self.health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
         else:
-            self._health.ok("following commands")
+            self.health.ok("following commands")
 
     def _log(self, state: str, driver: DriverState) -> None:
         """Log changes of state and driver, as a record of incidents."""
-        latch = self._system.latch
+        latch = self.system.latch
         text = f"{state}{', armed' if latch.armed else ''}{f': {latch.latched_reason}' if latch.latched_reason else ''}"
-        text += f"; driver {self._system.driver_name}: {'ready' if driver.ready else driver.problem}"
+        text += f"; driver {self.system.driver_name}: {'ready' if driver.ready else driver.problem}"
         if text != self._last_log:
             self._last_log = text
-            self._node.get_logger().info(text)
+            self.get_logger().info(text)
+
+
+def _done(answer: Any, problem: str) -> Any:
+    """Answer that a request was executed, and what is wrong all the same; what refuses one is raised before."""
+    answer.success, answer.message = True, problem
+    return answer
 
 
 def stop_record(node: Node) -> StopRecord:
@@ -354,12 +316,3 @@ def stop_record(node: Node) -> StopRecord:
     state = Path(home if os.path.isabs(home) else os.path.expanduser("~/.local/state"))
     name = node.get_fully_qualified_name().strip("/").replace("/", ".")
     return StopRecord(state / "magnetosuture" / f"{name}.domain_{node.context.get_domain_id()}.stop")
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(CoilBridgeNode, arguments, CoilBridgeNode.raise_priority)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

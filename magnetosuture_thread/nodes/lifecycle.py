@@ -1,10 +1,14 @@
-"""Lifecycle nodes: parameters are checked when a node is configured, and stay as they are until it is cleaned up."""
+"""Lifecycle nodes: parameters are checked when a node is configured, and stay until it is cleaned up.
+
+Those that a node can change while it runs are checked together with all that stay, by the configuration class, and are
+in force once all of the node's callbacks have agreed.
+"""
 
 from __future__ import annotations
 
 import gc
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
@@ -15,18 +19,21 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from magnetosuture_thread import ConfigurationError
-from magnetosuture_thread.configuration import ROS_PARAMETERS, Configuration, configuration_fields
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.nodes.node import PackageNode, reason_of
-from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import as_declared, declare, declare_unchecked, plain_value
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, MAX_REQUEST_ENTRIES, PackageNode, reason_of
+from magnetosuture_thread.nodes.parameters import (
+    as_declared,
+    declare,
+    given_parameters,
+    plain_value,
+)
 
 C = TypeVar("C", bound=Configuration)
 E = TypeVar("E", bound="Publisher | Subscription | Service | Timer")
 
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-ERROR = TransitionCallbackReturn.ERROR
+SUCCESS = TransitionCallbackReturn.SUCCESS
 INACTIVE = "inactive: messages are not used until the node is activated"
 
 
@@ -41,23 +48,29 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
 
     Attributes:
         settings: as the node was configured with them; None while unconfigured.
-        problem: why the last transition failed, or why the parameters that were given are invalid.
+        problem: why the last transition failed.
+
+    Raises:
+        ConfigurationError: a parameter is invalid, or a parameter file cannot be used.
     """
 
     def __init__(self, name: str, settings: type[C], *, fixed: Mapping[str, str] | None = None, **options: Any) -> None:
         self.settings: C | None = None
-        super().__init__(name, **node_options(name, options))
-        self._class, self._fixed = settings, fixed
+        super().__init__(name, **options)
+        self._class = settings
+        every = dict.fromkeys((each.name for each in configuration_fields(settings)), "")
+        self._fixed = every if fixed is None else fixed
+        self._agreed: tuple[C, Callable[[], None]] | None = None
         self.problem: Exception | None = None
         self._starts = False
-        # All can be set before the node is configured, which then says which of them are invalid.
         try:
-            self._declare()
-        except ConfigurationError as error:
-            self.problem = error
-            declare_unchecked(self, settings)
+            declare(self, settings, given_parameters(self, name, options), read_only=False, fixed=self._fixed)
+        except ConfigurationError:
+            self._leave()
+            raise
         self.add_pre_set_parameters_callback(lambda parameters: as_declared(settings, parameters))
-        self.add_on_set_parameters_callback(self._keep)
+        self.add_on_set_parameters_callback(self._check_change)
+        self.add_post_set_parameters_callback(self._put_in_force)
 
     @abstractmethod
     def allocate(self, settings: C) -> None:
@@ -74,6 +87,13 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     @abstractmethod
     def release(self) -> None:
         """Give all back that was taken in `allocate`, also if that did not get to its end; must not fail."""
+
+    def prepare(self, settings: C) -> Callable[[], None]:
+        """Return what puts other settings in force, which must not fail; raise `MagnetosutureError` if they cannot be.
+
+        Only called where some parameters are not fixed.
+        """
+        raise NotImplementedError
 
     @property
     def configured_settings(self) -> C:
@@ -122,8 +142,6 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             MagnetosutureError: a transition failed; the node is destroyed.
         """
         if self.get_parameter_or("autostart").value == "unconfigured":
-            if self.problem is not None:
-                self.get_logger().error(reason_of(self.problem))
             return
         self._starts = True
         try:
@@ -139,11 +157,10 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""
         try:
-            settings = self._declare()
+            current = {each.name: self.get_parameter(each.name) for each in configuration_fields(self._class)}
+            given = {name: plain_value(value) for name, value in current.items()}
+            settings = declare(self, self._class, given, read_only=False, fixed=self._fixed)
             self.allocate(settings)
-            # The last one is called first: what is refused must not be prepared, and a barrier not imported.
-            self.remove_on_set_parameters_callback(self._keep)
-            self.add_on_set_parameters_callback(self._keep)
             if not self._starts:  # as `run` does when the node has started
                 gc.collect()
                 gc.freeze()
@@ -168,7 +185,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         except Exception as error:
             self.on_cleanup(state)
             self._failed(error)
-            return ERROR
+            return TransitionCallbackReturn.ERROR
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -199,32 +216,71 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         try:
             self.release()
         finally:
-            super().destroy_node()
+            self._leave()
+
+    def _leave(self) -> None:
+        super().destroy_node()
         # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
         self._state_machine.destroy_when_not_in_use()
 
-    def _declare(self) -> C:
-        fields = [about.name for about in configuration_fields(self._class)]
-        fixed = dict.fromkeys(fields, "") if self._fixed is None else self._fixed
-        return declare(self, self._class, read_only=False, fixed=fixed)
+    def change(self, values: Mapping[str, Any]) -> None:
+        """Set parameters together, as the service does.
+
+        Raises:
+            MagnetosutureError: they are refused; nothing has changed.
+        """
+        if values:
+            result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+            if not result.successful:
+                raise MagnetosutureError(result.reason)
 
     def _failed(self, error: Exception) -> TransitionCallbackReturn:
         self.problem = error
         if not self._starts:  # at its start the node ends by this error
             self.get_logger().error(reason_of(error))
-        return FAILURE
+        return TransitionCallbackReturn.FAILURE
 
-    def _keep(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse to change settings under a configured node; the value that is in force is no change."""
-        for parameter in parameters if self.settings is not None else ():
-            name, value = parameter.name, plain_value(parameter)
-            free = name.split(".")[0] in ROS_PARAMETERS or (self._fixed is not None and name not in self._fixed)
-            if not free and value != plain_value(self.get_parameter_or(name)):
-                shown = value[:10] if isinstance(value, list) else value  # a million entries take long to write
-                expected = "its value in force, until the node is cleaned up"
-                error = ConfigurationError(f"{self._class.GROUP}.{name}", shown, expected)
-                return SetParametersResult(successful=False, reason=str(error))
+    def _check_change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Refuse to change fixed settings of a configured node, and prepare others; the value in force is no change."""
+        self._agreed = None
+        if self.settings is None:
+            return SetParametersResult(successful=True)
+        in_force = to_mapping(self.settings)
+        asked = {each.name: plain_value(each) for each in parameters if each.name in in_force}
+        asked = {name: value for name, value in asked.items() if value != in_force[name]}
+        try:
+            for name, value in asked.items():
+                self._check_free(name, value)
+            if asked:
+                settings = from_mapping(self._class, {**in_force, **asked})
+                self._agreed = settings, self.prepare(settings)
+        except MagnetosutureError as error:
+            return SetParametersResult(successful=False, reason=_reason(error, asked))
         return SetParametersResult(successful=True)
+
+    def _check_free(self, name: str, value: Any) -> None:
+        where = f"{self._class.GROUP}.{name}"
+        if name in self._fixed:
+            shown = value[:10] if isinstance(value, list) else value  # a million entries take long to write
+            raise ConfigurationError(where, shown, "its value in force, until the node is cleaned up")
+        if isinstance(value, list) and len(value) > MAX_REQUEST_ENTRIES:
+            expected = f"at most {MAX_REQUEST_ENTRIES} while the node runs"
+            raise ConfigurationError(where, f"{len(value)} entries", expected)
+
+    def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
+        if self._agreed is not None:
+            (self.settings, put_in_force), self._agreed = self._agreed, None
+            put_in_force()
+
+
+def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
+    """Return why a change was refused, in one line: of a long list its beginning and what was expected."""
+    text = " ".join(str(error).split())
+    if len(text) > MAX_REASON_CHARS:
+        text = f"{text[: MAX_REASON_CHARS // 2]} … {text[-MAX_REASON_CHARS // 2 :]}"
+    named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
+    together = "" if named in ("", *asked) else "; what belongs together is set at once, by set_parameters_atomically"
+    return text + together
 
 
 class StandbyNode(ManagedNode[C]):
@@ -282,8 +338,7 @@ class StandbyNode(ManagedNode[C]):
         """Go as far as the parameter `autostart` says; see `ManagedNode`."""
         super().start()
         if not self.is_active:
-            problem = f": {self.problem}" if self.problem else ""
-            self.health.stand_by(INACTIVE if self.stage == "inactive" else f"unconfigured{problem}")
+            self.health.stand_by(INACTIVE if self.stage == "inactive" else "unconfigured")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""

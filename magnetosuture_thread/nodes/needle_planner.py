@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -39,7 +38,6 @@ from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamp
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode, reason_of
-from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
@@ -49,17 +47,7 @@ from magnetosuture_thread.planning.settings import NeedlePlannerSettings
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
-MAX_DISTURBANCES = 20  # that are read of a message
 IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed: to read them costs most
-STATES = {
-    None: StateMessage.STATE_IDLE,
-    ProcedureState.READY: StateMessage.STATE_READY,
-    ProcedureState.RUNNING: StateMessage.STATE_RUNNING,
-    ProcedureState.PAUSED: StateMessage.STATE_PAUSED,
-    ProcedureState.DONE: StateMessage.STATE_DONE,
-    ProcedureState.FAILED: StateMessage.STATE_FAILED,
-}
-ENDED = (StateMessage.STATE_DONE, StateMessage.STATE_FAILED)
 
 
 class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
@@ -75,7 +63,7 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         self._planning = ThreadPoolExecutor(1)
         self._offers = False  # whether the action is there
         self._moving = False  # whether the last command was not zero
-        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self._scene = SceneFollower(self, self.on_scene)
         self.start()
 
     def allocate(self, settings: NeedlePlannerSettings) -> None:
@@ -89,7 +77,12 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         self._plans = self.held(topics.PROCEDURE_PLAN.publisher(self))
         self._published: tuple[Any, ...] = ()
         self._published_at = -math.inf
-        ProcedureInputs(self, self._session, settings.hold_timeout)
+        self._read_due: dict[str, float] = {}  # when the next message of a thread is read while nothing is executed [s]
+        self.held(topics.TRACKER_STATE.subscribe(self, self.while_active(self.on_tracker)))
+        self._read_sparingly(topics.PREDICTED_THREAD, self.on_prediction)
+        self._read_sparingly(topics.ESTIMATED_THREAD, self.on_estimate)
+        self._read_sparingly(topics.MARGINS, self.on_margins)
+        self.held(topics.PROCEDURE_HOLD.subscribe(self, self.while_active(self.on_hold)))
         self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
         self.held(topics.BRIDGE_STATE.subscribe(self, self.on_bridge))
         self.held(topics.OPERATOR_COMMAND.subscribe(self, self.while_active(self.on_operator)))
@@ -187,6 +180,42 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         self._session.pause("an operator commands the needle")
         self._publish()
 
+    def on_tracker(self, message: TrackerState) -> None:
+        """Register whether the needle is tracked."""
+        self._session.known.on_tracker("" if message.state == TrackerState.STATE_TRACKED else _reason(message))
+
+    def on_prediction(self, message: PredictedThread) -> None:
+        """Register the tension of the thread."""
+        tension = float(np.max(message.tension, initial=0.0))
+        if not math.isfinite(tension):
+            return self.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
+        self._session.known.on_prediction(time.monotonic(), tension, lambda: _vertices(message))
+
+    def on_estimate(self, message: EstimatedThread) -> None:
+        """Register how sure the estimate is, and which forces the model does not know of."""
+        found = {
+            reading.seconds(each.since): disturbance_text(
+                each.arc_length, each.force, (each.direction.x, each.direction.y)
+            )
+            for each in message.disturbances[:20]
+        }
+        known = self._session.known
+        known.on_estimate(time.monotonic(), message.unmeasured_for, found, lambda: _vertices(message))
+
+    def on_margins(self, message: SafetyMargins) -> None:
+        """Register the thread's friction, and whether its margins are valid."""
+        reason = "" if message.valid else _reason(message)
+        if not reason and not 0.0 < message.slowdown <= 1.0:
+            return self.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
+        nodes, version = len(message.friction_nodes), message.scene_version
+        self._session.known.on_margins(time.monotonic(), reason, nodes, message.slowdown, version)
+
+    def on_hold(self, message: Header) -> None:
+        """Register that somebody holds the page; a message that was on its way for too long does not count."""
+        age = self.get_clock().now().nanoseconds * 1e-9 - reading.seconds(message.stamp)
+        if abs(age) <= self.configured_settings.hold_timeout:
+            self._session.known.on_hold(time.monotonic())
+
     def on_timer(self) -> None:
         """Look after the graph, and after a needle of which no pose comes."""
         self._session.known.on_graph(self._graph_problem())
@@ -197,6 +226,17 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         """Leave the graph."""
         self._planning.shutdown(wait=False, cancel_futures=True)
         super().destroy_node()
+
+    def _read_sparingly(self, topic: topics.Topic, handle: Callable[[Any], None]) -> None:
+        """Read every message of a topic while a procedure is executed, and few while none is."""
+
+        def take(data: bytes) -> None:
+            now = time.monotonic()
+            if now >= self._read_due.get(topic.name, 0.0) or self._session.is_active:
+                self._read_due[topic.name] = now + IDLE_PERIOD
+                topic.decoded(self, data, handle)
+
+        self.held(topic.subscribe(self, self.while_active(take), raw=True))
 
     def _offer(self, name: str, execute: Callable[[], bool]) -> None:
         self.held(self.create_service(Trigger, name, partial(self._serve, execute)))
@@ -272,87 +312,6 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
             self._session.known.shift(time.monotonic() - began)
 
 
-class ProcedureInputs:
-    """Registers tracker, thread and held page in the state of the loop.
-
-    Args:
-        node: that subscribes.
-        session: in which it is registered.
-        hold_timeout: age beyond which a message on `procedure/hold` does not count [s].
-    """
-
-    def __init__(
-        self, node: StandbyNode[NeedlePlannerSettings], session: ProcedureSession, hold_timeout: float
-    ) -> None:
-        self._node, self._session, self._hold_timeout = node, session, hold_timeout
-        self._known = session.known
-        node.held(topics.TRACKER_STATE.subscribe(node, node.while_active(self.on_tracker)))
-        for topic, handle in (
-            (topics.PREDICTED_THREAD, self.on_prediction),
-            (topics.ESTIMATED_THREAD, self.on_estimate),
-            (topics.MARGINS, self.on_margins),
-        ):
-            node.held(topic.subscribe(node, node.while_active(self._sparing(topic, handle)), raw=True))
-        node.held(topics.PROCEDURE_HOLD.subscribe(node, node.while_active(self.on_hold)))
-
-    def on_tracker(self, message: TrackerState) -> None:
-        """Register whether the needle is tracked."""
-        tracked = message.state == TrackerState.STATE_TRACKED
-        self._known.on_tracker("" if tracked else _reason(message))
-
-    def on_prediction(self, message: PredictedThread) -> None:
-        """Register the tension of the thread."""
-        tension = float(np.max(message.tension, initial=0.0))
-        if not math.isfinite(tension):
-            self._node.refuse(InvalidInputError("thread/predicted.tension", tension, "finite numbers"))
-            return
-        self._known.on_prediction(time.monotonic(), tension, lambda: _vertices(message))
-
-    def on_estimate(self, message: EstimatedThread) -> None:
-        """Register how sure the estimate is, and which forces the model does not know of."""
-        found = {
-            reading.seconds(each.since): disturbance_text(
-                each.arc_length, each.force, (each.direction.x, each.direction.y)
-            )
-            for each in message.disturbances[:MAX_DISTURBANCES]
-        }
-        self._known.on_estimate(time.monotonic(), message.unmeasured_for, found, lambda: _vertices(message))
-
-    def on_margins(self, message: SafetyMargins) -> None:
-        """Register the thread's friction, and whether its margins are valid."""
-        reason = "" if message.valid else _reason(message)
-        if not reason and not 0.0 < message.slowdown <= 1.0:
-            self._node.refuse(InvalidInputError("thread/margins.slowdown", message.slowdown, "above 0 and at most 1"))
-            return
-        nodes = len(message.friction_nodes)
-        self._known.on_margins(time.monotonic(), reason, nodes, message.slowdown, message.scene_version)
-
-    def on_hold(self, message: Header) -> None:
-        """Register that somebody holds the page; a message that was on its way for too long does not count."""
-        now = self._node.get_clock().now().nanoseconds * 1e-9
-        if abs(now - reading.seconds(message.stamp)) <= self._hold_timeout:
-            self._known.on_hold(time.monotonic())
-
-    def _sparing(self, topic: topics.Topic, handle: Callable[[Any], None]) -> Callable[[bytes], None]:
-        """Return a callback that reads every message while a procedure is executed, and few while none is."""
-        due = -math.inf
-
-        def take(data: bytes) -> None:
-            nonlocal due
-            now = time.monotonic()
-            if now < due and not self._session.is_active:
-                return
-            due = now + IDLE_PERIOD
-            try:
-                message = topic.decode(data)
-            except InvalidInputError as error:
-                self._node.refuse(error)
-            else:
-                handle(message)
-
-        return take
-
-
 def _reason(message: Any) -> str:
     """Return the reason that a message gives, as it may be kept."""
     return shortened(message.reason, MAX_REASON_CHARS) or "no reason is given"
@@ -368,7 +327,7 @@ def state_message(stamp: Any, status: ProcedureStatus) -> StateMessage:
     """Return the state of a procedure as a message."""
     return StateMessage(
         header=Header(stamp=stamp, frame_id=DISH_FRAME),
-        state=STATES[status.state],
+        state=getattr(StateMessage, f"STATE_{'IDLE' if status.state is None else status.state.name}"),
         procedure=shortened(status.procedure),
         goals=list(status.goals),
         goal=status.goal,
@@ -441,7 +400,7 @@ class ProcedureAction:
         """Take the state of the procedure: feedback of the goal, or its end."""
         if self._goal is None or self._ended is not None:
             return
-        if status.state in ENDED:
+        if status.state in (StateMessage.STATE_DONE, StateMessage.STATE_FAILED):
             self._ended = status
         else:
             self._goal.publish_feedback(ExecuteProcedure.Feedback(status=status))
@@ -466,12 +425,3 @@ class ProcedureAction:
             return result
 
         self._server.notify_execute(goal, finished)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(NeedlePlannerNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

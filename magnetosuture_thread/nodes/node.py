@@ -1,30 +1,162 @@
-"""The base of every node of this package: no request, message or time from outside ends it."""
+"""The base of every node of this package: its status, and that no request, message or time from outside ends it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakMethod
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.service import Service
 from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError
+from magnetosuture_thread.compiled import compilations
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.texts import shortened
 
-USE_SIM_TIME = "use_sim_time"
+PERIOD = 1.0  # s between two reports of a node
+# Keys of the coil bridge's report, which its clients read.
+SCHEDULING = "scheduling"
+JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th percentile", "maximum"))
+COMPILING = "compiling"  # how the state of a node begins that does
+MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
-MAX_REASON_CHARS = 400
-LOG_PERIOD = 1.0  # s between two lines about refused messages
+
+
+class Health:
+    """Publishes a node's state once a second, and at once when it changes.
+
+    Changes are not published more often than `quiet` seconds apart, so that a flood of bad messages
+    does not become a flood of reports: one that comes sooner waits, and the last of those that wait is
+    published. The count of refusals goes on all the same.
+
+    Args:
+        node: whose health it is.
+
+    Attributes:
+        loading: how many nodes of this process load; no driver may be open then, as a signal ends the process.
+    """
+
+    quiet = 0.05
+    loading: ClassVar[int] = 0
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._publisher = topics.DIAGNOSTICS.publisher(node)
+        self._level, self._text, self._standby = DiagnosticStatus.OK, "starting", ""
+        self._refused = 0
+        self._last_refusal = ""
+        self._values: dict[str, object] = {}
+        self._sent = -1.0
+        node.create_timer(PERIOD, self.publish, clock=self._clock)
+        self._late = node.create_timer(self.quiet, self._publish_late, clock=self._clock)
+        self._late.cancel()
+
+    def ok(self, text: str, **values: object) -> None:
+        """Report level OK."""
+        self._set(DiagnosticStatus.OK, text, values)
+
+    def warn(self, text: str, **values: object) -> None:
+        """Report level WARN: the node continues but cannot do all of its work."""
+        self._set(DiagnosticStatus.WARN, text, values)
+
+    def error(self, text: str, **values: object) -> None:
+        """Report level ERROR: the node cannot do its work."""
+        self._set(DiagnosticStatus.ERROR, text, values)
+
+    def stand_by(self, text: str) -> None:
+        """Report this at level WARN, whatever else there is to report; an empty text ends that."""
+        if text != self._standby:
+            self._standby = shortened(text, MAX_REASON_CHARS)
+            self._publish_soon()
+
+    def note(self, **values: object) -> None:
+        """Keep values for the next report."""
+        self._values.update(values)
+
+    def refuse(self, problem: Exception, **values: object) -> None:
+        """Say that an input was refused; the node itself goes on. An error that it has said before stays said."""
+        self._refused += 1
+        self._last_refusal = shortened(str(problem), MAX_REASON_CHARS)
+        if self._level == DiagnosticStatus.ERROR:
+            self._values.update(values)
+        else:
+            self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
+
+    @contextmanager
+    def load(self, what: str) -> Iterator[None]:
+        """Report once a second, at level WARN, that the node loads, or compiles what no cache has, while it does."""
+        before, compiling, done = compilations(), f"{COMPILING} {what}, once on this machine", threading.Event()
+        self.warn(f"loading {what}")
+        self._node.get_logger().info(self._text)
+
+        def repeat() -> None:
+            while not done.wait(PERIOD):
+                if compilations() > before and self._text != compiling:
+                    self.warn(compiling)
+                    self._node.get_logger().info(compiling)
+                self.publish()
+
+        thread = threading.Thread(target=repeat, daemon=True)
+        thread.start()
+        Health.loading += 1
+        try:
+            yield
+        finally:
+            Health.loading -= 1
+            done.set()
+            thread.join()
+
+    def publish(self) -> None:
+        """Publish the state now."""
+        values = {**self._values, "refused": self._refused, "last refusal": self._last_refusal or "none"}
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if self._standby else self._level,
+            name=f"{self._node.get_fully_qualified_name().lstrip('/')}: state",
+            message=self._standby or self._text,
+            hardware_id="magnetosuture",
+            values=[KeyValue(key=key, value=shortened(str(value), MAX_REASON_CHARS)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+        self._sent = self._clock.now().nanoseconds * 1e-9
+
+    def _set(self, level: bytes, text: str, values: dict[str, object]) -> None:
+        text = shortened(text, MAX_REASON_CHARS)
+        changed = (level, text) != (self._level, self._text)
+        self._level, self._text = level, text
+        self._values.update(values)
+        if changed and not self._standby:
+            self._publish_soon()
+
+    def _publish_soon(self) -> None:
+        if self._clock.now().nanoseconds * 1e-9 - self._sent > self.quiet:
+            self.publish()
+        elif self._late.is_canceled():
+            self._late.reset()
+
+    def _publish_late(self) -> None:
+        self._late.cancel()
+        self.publish()
+
+
+def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
+    """Return message and values of a status, of anybody, with texts of bounded length."""
+    values = {shortened(each.key): shortened(each.value, MAX_REASON_CHARS) for each in status.values[:100]}
+    return shortened(status.message, MAX_REASON_CHARS), values
 
 
 class GuardedNode(Node):
@@ -51,9 +183,12 @@ class GuardedNode(Node):
         """Whether the node was shut down for good, so that its process can end."""
         return False
 
+    def own_process(self) -> None:
+        """Do what concerns the whole process, where the node is alone in it."""
+
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
-        self.get_logger().warning(f"refused: {problem}", throttle_duration_sec=LOG_PERIOD)
+        self.get_logger().warning(f"refused: {problem}", throttle_duration_sec=PERIOD)
 
     def finish(self) -> None:
         """Publish what others must know before the node ends in order; the graph is still there."""
@@ -66,7 +201,7 @@ class GuardedNode(Node):
         self, msg_type: Any, topic: str, callback: Callable[..., None], *arguments: Any, **options: Any
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
-        if msg_type is Clock and not options.get("raw"):
+        if msg_type is ClockMessage and not options.get("raw"):
             options["raw"], received, refuse = True, callback, _weakly(self.refuse)
 
             def callback(data: bytes) -> None:
@@ -89,10 +224,10 @@ class GuardedNode(Node):
         for parameter in parameters:
             if not parameter.name:  # which rclpy would declare
                 return SetParametersResult(successful=False, reason="a parameter without a name")
-            if parameter.name == USE_SIM_TIME and self.clock_is_fixed:
-                now = self.get_parameter(USE_SIM_TIME).value
+            if parameter.name == "use_sim_time" and self.clock_is_fixed:
+                now = self.get_parameter("use_sim_time").value
                 if parameter.value is not now:
-                    error = ConfigurationError(USE_SIM_TIME, parameter.value, f"{now}, as the node has now")
+                    error = ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now")
                     return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -130,20 +265,20 @@ class _GuardedCallback:
         self._name, self._logger = service.srv_name, logger
 
     def __call__(self, request: Any, response: Any) -> Any:
+        reason = ""
         try:
             _check_lengths(request)
-            if isinstance(request, SetParameters.Request):
-                # Each for itself: one that fails must not hide what became of those before it.
-                response.results = [self._set(parameter) for parameter in request.parameters]
-                refused = [result.reason for result in response.results if not result.successful]
-                # One line for all of them: rclpy takes long to find out who logs.
-                if refused:
-                    self._log(refused[0])
-                return response
-            return self._call(request, response)
+            if not isinstance(request, SetParameters.Request):
+                return self._call(request, response)
+            # Each for itself: one that fails must not hide what became of those before it.
+            response.results = [self._set(parameter) for parameter in request.parameters]
+            reason = next((result.reason for result in response.results if not result.successful), "")
         except Exception as error:
-            self._log(reason := reason_of(error))
-            return _refused(type(response)(), reason, request)
+            reason = reason_of(error)
+            response = _refused(type(response)(), reason, request)
+        if reason:  # one line for all of a request: rclpy takes long to find out who logs
+            self._logger.warning(f"{self._name} refused: {reason}", throttle_duration_sec=PERIOD)
+        return response
 
     def _set(self, parameter: Any) -> SetParametersResult:
         try:
@@ -153,9 +288,6 @@ class _GuardedCallback:
         result = answer.results[0]
         result.reason = shortened(result.reason, 2 * MAX_REASON_CHARS)  # rclpy's own may hold a name from outside
         return result
-
-    def _log(self, reason: str) -> None:
-        self._logger.warning(f"{self._name} refused: {reason}", throttle_duration_sec=LOG_PERIOD)
 
 
 def reason_of(error: Exception) -> str:

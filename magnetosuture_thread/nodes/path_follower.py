@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT, run
+from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 
@@ -29,7 +28,7 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
         super().__init__("path_follower", PathFollowerSettings, **options)
         self._follower: PathFollower | None = None
         self._blocked = ""  # reason why the path cannot be followed
-        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self._scene = SceneFollower(self, self.on_scene)
         self.start()
 
     def allocate(self, settings: PathFollowerSettings) -> None:
@@ -97,12 +96,3 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
             self._setpoints.publish(packed_pose_stamped(message.header.stamp, command.tip, 0.0))
         text = "done" if command.progress >= 1.0 else "following" if command.progress else "settling"
         self.health.ok(text, progress=round(command.progress, 4))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(PathFollowerNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

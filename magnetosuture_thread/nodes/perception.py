@@ -1,19 +1,15 @@
 """Vision tracker and thread model in one process: the prediction follows the frame without a way between.
 
-    perception --ros-args --params-file SETUP
-
 Both nodes have their names, topics and parameters as if each ran alone, and publish the same to the last bit. What the
 tracker sees is published, and handed to the model by a call.
 """
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 
@@ -44,12 +40,3 @@ def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
     else:
         model.listen()
     return tracker, model
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the nodes as a program."""
-    return run(perception, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -5,13 +5,10 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, TypeAlias
 
-import rclpy
 import rclpy.time
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
@@ -32,11 +29,10 @@ from magnetosuture_thread.interface import (
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.nodes.clients import Inbox, answer_requests, joined
 from magnetosuture_thread.nodes.timeline import Timeline
 
-CLOCK_PERIOD = 0.01  # s of simulated time between two messages on /clock
-STILL_PERIOD = 0.1  # s of real time between two messages on /clock while it stands still
+CLOCK_PERIOD = 10_000_000  # ns of simulated time between two messages on /clock
 START_TIMEOUT = 180.0  # s for all nodes to be there
 # s after we have found all nodes, for the nodes to have found us and each other: DDS announces a node a few times as it
 # starts and then each 3 s, and on a busy machine the first of these get lost.
@@ -45,10 +41,8 @@ QUIET = 0.5  # s without any answer, once all has been taken and answered: the g
 STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
 DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
-MAX_TAKEN = 100  # outputs taken between two inputs at the most
 ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data` (CDR bytes)
-FRAMES = frozenset(channel.name for channel in CAMERA.values())
 
 
 class Losses:
@@ -71,7 +65,7 @@ class Losses:
     @property
     def frames_played(self) -> int:
         """Return the camera frames published."""
-        return sum(count for topic, count in self.played.items() if topic in FRAMES)
+        return sum(self.played[channel.name] for channel in CAMERA.values())
 
     @property
     def frames_waiting(self) -> bool:
@@ -157,38 +151,33 @@ class LiveReplay:
         self._log = log
         self._last_answer = time.perf_counter()
         self._still, self._last_clock = timeline.start, 0.0
-        self._taken = 0
         self.losses = Losses()
         self.published: dict[str, dict[int, float]] = defaultdict(dict)
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain, args=[])
-        self._node = GuardedNode("replay", context=self._context, start_parameter_services=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._stack = ExitStack()
+        self._node = self._stack.enter_context(joined(name="replay", domain=domain))
         self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
+        # A quality of service that waits for slow readers: only the replay has time to.
+        reliable = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
         self._inputs = {
-            topic.channel.recorded: self._node.create_publisher(topic.message, topic.name, _lossless(topic.qos))
+            topic.channel.recorded: self._node.create_publisher(
+                topic.message, topic.name, QoSProfile(**reliable, durability=topic.qos.durability)
+            )
             for topic in played
         }
         self._echoed = {topic.channel.recorded for topic in played if topic in topics.OUTPUTS}
         # Poses are played where no tracker runs.
-        by_tracker = (topics.TRACKER_STATE, topics.THREAD_OBSERVATION)
-        unheard = {*self._echoed, *(topic.channel.recorded for topic in by_tracker if self._echoed)}
-        self._outputs = {
-            topic.name: self._node.create_subscription(
-                topic.message, topic.name, self._taker(topic), _lossless(topic.qos), raw=True
-            )
+        unheard = {topics.TRACKER_STATE, topics.THREAD_OBSERVATION} if self._echoed else set()
+        self._outputs = [
+            Inbox(self._node, topic, DEPTH, reliable=True)
             for topic in topics.OUTPUTS
-            if topic.channel.recorded not in unheard
-        }
+            if topic.channel.recorded not in self._echoed and topic not in unheard
+        ]
 
     def close(self) -> None:
         """Leave the graph."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._stack.close()
 
     def wait_for_graph(self) -> None:
         """Wait until every played input has a subscriber and every output a publisher.
@@ -196,20 +185,19 @@ class LiveReplay:
         Raises:
             GraphError: the nodes do not come, or one ends.
         """
-        on_request = {topic.name for topic in topics.ON_REQUEST}
         deadline = time.perf_counter() + START_TIMEOUT
         complete: float | None = None
         while complete is None or time.perf_counter() - complete < SETTLE:
-            self._watch()
+            self._take()
             self._publish_clock(self._time.start)
-            self._executor.spin_once(timeout_sec=0.02)
+            time.sleep(0.02)
             missing = [
                 name
                 for name, publisher in self._inputs.items()
                 if name not in (CAMERA_INFO.recorded, SCENE.recorded) and not publisher.get_subscription_count()
             ]
-            expected = {name: output for name, output in self._outputs.items() if name not in on_request}
-            missing += [name for name, output in expected.items() if not output.get_publisher_count()]
+            silent = (inbox.topic for inbox in self._outputs if not inbox.has_publisher)
+            missing += [topic.name for topic in silent if topic not in topics.ON_REQUEST]
             if self._clock.get_subscription_count() < self._nodes:
                 missing.append("/clock")
             if missing:
@@ -249,8 +237,7 @@ class LiveReplay:
             self.play(records(), lambda time: None)
 
     def _publish(self, publisher: Any, record: Recorded) -> None:
-        name, stamp = record.topic.lstrip("/"), header_stamp(record.data)
-        now = time.time()
+        name, stamp, now = record.topic.lstrip("/"), header_stamp(record.data), time.time()
         publisher.publish(record.data)
         self.losses.played[name] += 1
         if stamp is not None:
@@ -271,58 +258,47 @@ class LiveReplay:
             enough = STUCK if self.losses.poses_waiting else QUIET
             if not self.losses.frames_waiting and time.perf_counter() > self._last_answer + enough:
                 return
-            clock = self._run_clock(clock, clock + round(CLOCK_PERIOD * 1e9))
+            clock = self._run_clock(clock, clock + CLOCK_PERIOD)
 
     def _run_clock(self, clock: int, until: int) -> int:
         """Publish /clock up to a simulated time, taking outputs all the while; return the next tick."""
-        self._take_waiting()
+        self._take()  # however late we are
         while clock < until:
-            self._spin_until(clock)
+            self._wait_until(clock)
             self._publish_clock(clock)
-            clock += round(CLOCK_PERIOD * 1e9)
-        self._spin_until(until)
+            clock += CLOCK_PERIOD
+        self._wait_until(until)
         return clock
 
-    def _take_waiting(self) -> None:
-        """Take outputs that have come already, however late we are."""
-        self._watch()
-        for _ in range(MAX_TAKEN):
-            before = self._taken
-            self._executor.spin_once(timeout_sec=0.0)
-            if self._taken == before:
-                return
-
-    def _spin_until(self, simulated: int) -> None:
+    def _wait_until(self, simulated: int) -> None:
         """Take outputs until a simulated time is there."""
         while (left := self._time.left(simulated)) > 0.0:
-            self._watch()
-            self._executor.spin_once(timeout_sec=min(left, 0.01))
-            if self._time.paused and time.perf_counter() - self._last_clock > STILL_PERIOD:
+            self._take()
+            time.sleep(min(left, 0.002))
+            if self._time.paused and time.perf_counter() - self._last_clock > 0.1:
                 self._publish_clock(self._still)
 
-    def _taker(self, topic: topics.Topic) -> Callable[[Any, Any], None]:
-        """Return the callback of an output topic."""
-        name = topic.channel.name
+    def _take(self) -> None:
+        """Take the outputs that have come, and answer requests."""
+        self._watch()
+        answer_requests(self._node)
+        for inbox in self._outputs:
+            for data, info in inbox.messages():
+                with suppress(InvalidInputError, ValueError):  # no message of ours
+                    self._count(inbox.topic, data, info)
+                    self._receive(inbox.topic.channel.recorded, self._time.now(), data)
 
-        def take(data: bytes, info: dict[str, Any]) -> None:
-            self._taken += 1
-            with suppress(InvalidInputError, ValueError):  # no message of ours
-                count(data, info)
-                self._receive(topic.channel.recorded, self._time.now(), bytes(data))
-
-        def count(data: bytes, info: dict[str, Any]) -> None:
-            is_currents = topic.channel is CURRENTS  # which count by the command that they follow, if any
-            stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
-            if stamp is not None:
-                # When it reached this process: how long it waited here for its turn is not the graph's delay.
-                self.arrived[name].setdefault(stamp, info["received_timestamp"] * 1e-9)
-            if topic in ANSWERS:
-                self._last_answer = time.perf_counter()
-                self.losses.heard(name, stamp, info["publication_sequence_number"])
-            if topic.channel is DIAGNOSTICS:
-                self.losses.count_diagnostics(data)
-
-        return take
+    def _count(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
+        is_currents = topic.channel is CURRENTS  # which count by the command that they follow, if any
+        stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
+        if stamp is not None:
+            # When it reached this process: how long it waited here for its turn is not the graph's delay.
+            self.arrived[topic.channel.name].setdefault(stamp, info["received_timestamp"] * 1e-9)
+        if topic in ANSWERS:
+            self._last_answer = time.perf_counter()
+            self.losses.heard(topic.channel.name, stamp, info["publication_sequence_number"])
+        if topic.channel is DIAGNOSTICS:
+            self.losses.count_diagnostics(data)
 
     def _on_pause(self, asked: Any, answer: Any) -> Any:
         """Let time stand still, or go on."""
@@ -336,8 +312,3 @@ class LiveReplay:
     def _publish_clock(self, simulated: int) -> None:
         self._still, self._last_clock = simulated, time.perf_counter()
         self._clock.publish(Clock(clock=rclpy.time.Time(nanoseconds=simulated).to_msg()))
-
-
-def _lossless(qos: QoSProfile) -> QoSProfile:
-    """Return a quality of service that waits for slow readers; only the replay has time to."""
-    return QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=qos.durability)

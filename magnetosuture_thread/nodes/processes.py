@@ -20,7 +20,6 @@ from magnetosuture_thread.nodes.run import raise_priority
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
-GRACE = 5.0  # s to end by itself, then it is killed
 
 # What could lead a graph out of this machine or to another graph.
 LEADS_ELSEWHERE = (
@@ -32,8 +31,6 @@ LEADS_ELSEWHERE = (
     "ROS_STATIC_PEERS",
     "ROS_SUPER_CLIENT",
 )
-_PARTICIPANTS = 120  # of a domain at most: it has no more discovery ports
-_PR_SET_PDEATHSIG = 1
 
 
 def graph_environment(domain: int) -> dict[str, str]:
@@ -86,7 +83,7 @@ def reserved_domain() -> Iterator[int]:
 
 def is_empty(domain: int) -> bool:
     """Return whether no process on this machine uses a discovery port of a ROS domain."""
-    return all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(_PARTICIPANTS))
+    return all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(120))  # a domain has no more
 
 
 def _is_free(port: int) -> bool:
@@ -162,8 +159,8 @@ class NodeProcesses:
             module: that runs it; the one of that name in this subpackage if empty.
             arguments: besides those for all, after `--ros-args`.
         """
-        program = module or f"magnetosuture_thread.nodes.{name}"
-        command = [*self._prefix, sys.executable, "-m", program, "--ros-args", *self._arguments, *arguments]
+        program = [module] if module else ["magnetosuture_thread.nodes.program", name]
+        command = [*self._prefix, sys.executable, "-m", *program, "--ros-args", *self._arguments, *arguments]
         with (self._logs / f"{name}.log").open("wb") as log:
             self._processes[name] = subprocess.Popen(
                 command,
@@ -196,7 +193,7 @@ class NodeProcesses:
                 process.send_signal(signal.SIGINT)
         for process in self._processes.values():
             try:
-                process.wait(GRACE)
+                process.wait(5.0)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -208,4 +205,4 @@ _LIBC = ctypes.CDLL(None)
 
 def _end_with_parent() -> None:
     """Ask Linux to interrupt this process when its parent dies."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGINT)
+    _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
@@ -22,27 +20,20 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface
 from magnetosuture_thread.interface import PAUSE_RIG
-from magnetosuture_thread.messages.outputs import camera_outputs, ground_truth_outputs
-from magnetosuture_thread.messages.packing import packed_image
+from magnetosuture_thread.messages.packing import camera_outputs, ground_truth_outputs, packed_image
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.parameter_files import node_options
-from magnetosuture_thread.nodes.parameters import declare
-from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.parameters import declare, given_parameters
 from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene
 from magnetosuture_thread.nodes.timeline import Timeline
-from magnetosuture_thread.rig.camera import DishCamera, encode_jpeg
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
 from magnetosuture_thread.rig.rig import Rig, RigFrame
 from magnetosuture_thread.rig.settings import RigSettings
 
-MIN_CATCH_UP, CATCH_UP_FRAMES = 0.1, 2.0  # s, or frame periods, for which the rig moves in one callback
-MIN_ITERATIONS, ITERATION_RATE = 1000.0, 1e4  # of Newton in one callback, or for a second's frames; they take 40 us
 MAX_WAITING = 2  # frames that are rendered or wait for that; the next ones are left out
 MIN_REAL_TIME_FACTOR = 0.9  # below which the status says so
-FACTOR_PERIOD = 1.0  # s over which the real-time factor is taken
 BOARD_PERIOD = 0.005  # s between two looks at the boards, which keep real time whatever the rig's own is
-EARLY = 0.1  # of a period, that a tick may come before its time
 CLOCK_PERIOD = 0.005  # s of simulated time between two messages on /clock
 EPOCH = 1_000_000_000  # ns; simulated time begins here, as time 0 means "not set" in ROS
 
@@ -51,17 +42,18 @@ class RigSimulatorNode(PackageNode):
     """Stands in for coils, dish and camera."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("rig_simulator", **node_options("rig_simulator", options))
-        self._settings = settings = declare(self, RigSettings)
+        super().__init__("rig_simulator", **options)
+        self._settings = settings = declare(self, RigSettings, given_parameters(self, "rig_simulator", options))
         # Who runs by /clock gets it from the rig: nobody else can say what time it is in a simulation.
         simulated = bool(self.get_parameter("use_sim_time").value)
         rate = settings.rate if simulated else 1.0
         scene = initial_scene(settings.scene)
         if scene is None:
             raise ConfigurationError(f"{settings.GROUP}.scene", "", "a scene file: what is simulated has a dish")
-        # What one callback may take, so that frames come and the others of this computer get on: else time lags.
-        self._catch_up = max(MIN_CATCH_UP, CATCH_UP_FRAMES / settings.frame_rate)
-        iterations = max(MIN_ITERATIONS, ITERATION_RATE / settings.frame_rate)
+        # What one callback may take, so that frames come and the others of this computer get on: else time lags. For so
+        # long the rig moves [s]; an iteration of its Newton method takes 40 us.
+        self._catch_up = max(0.1, 2.0 / settings.frame_rate)
+        iterations = max(1e3, 1e4 / settings.frame_rate)
         with self.health.load("the rig's kernels"):
             self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
             self.rig.warm_up()
@@ -75,21 +67,36 @@ class RigSimulatorNode(PackageNode):
         self._renderer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="renderer")
         self._rendering: deque[Future[None]] = deque()
         self._late: deque[tuple[float, int, RigFrame]] = deque()
-        self._publisher = FramePublisher(self, self.rig.camera, settings)
+        self._outputs = {
+            interface.COMPRESSED_IMAGE: topics.COMPRESSED_IMAGE.publisher(self),
+            interface.CAMERA_INFO: topics.CAMERA_INFO.publisher(self),
+            interface.GROUND_TRUTH_NEEDLE: topics.GROUND_TRUTH_NEEDLE.publisher(self),
+            interface.GROUND_TRUTH_THREAD: topics.GROUND_TRUTH_THREAD.publisher(self),
+            interface.GROUND_TRUTH_PULL: topics.GROUND_TRUTH_PULL.publisher(self),
+        }
+        self._raw = topics.IMAGE.publisher(self)
         topics.FAULT_REQUEST.subscribe(self, self.on_fault)
-        self._scene = SceneFollower(self, self.health, scene, self.on_scene)
+        self._scene = SceneFollower(self, self.on_scene, scene)
         if simulated:
             self._clocks = topics.CLOCK.publisher(self)
             self.create_timer(CLOCK_PERIOD / rate, self.on_clock, clock=self._steady)
         self.create_timer(1.0 / (settings.frame_rate * rate), self.on_frame, clock=self._steady)
-        self.currents = RigCurrents(self, settings, self._steady, self._apply)
+        self._stage = stage = settings.power()  # simulated boards; None where currents come as messages
+        if stage is None:
+            topics.RIG_CURRENTS.subscribe(self, self.on_currents)
+        else:
+            stage.open()
+            self.create_timer(BOARD_PERIOD, lambda: self._apply(stage.currents()), clock=self._steady)
         self.get_logger().info("ready: everything here is simulated")
 
     def on_scene(self, scene: Scene) -> None:
         """Put another dish and other shapes around needle and thread, which stay where they are."""
         wait(self._rendering)
         self.rig.set_scene(scene)
-        self._publisher.take(self.rig.camera)
+
+    def on_currents(self, message: CoilCurrents) -> None:
+        """Apply the coils' currents of a message."""
+        self._apply(np.asarray(message.current, dtype=float))
 
     def on_fault(self, message: String) -> None:
         """Apply a fault that begins now."""
@@ -114,7 +121,7 @@ class RigSimulatorNode(PackageNode):
         elapsed = self.time.elapsed()
         if self._phase is None:
             self._phase = elapsed
-        index = math.floor((elapsed - self._phase) * self._settings.frame_rate + EARLY)
+        index = math.floor((elapsed - self._phase) * self._settings.frame_rate + 0.1)  # a tick may be early
         # No frame is stamped later than it is taken: the first tick may have been later than the others.
         self._phase = min(self._phase, elapsed - index / self._settings.frame_rate)
         while self._rendering and self._rendering[0].done():
@@ -125,13 +132,14 @@ class RigSimulatorNode(PackageNode):
             self._take(self._phase + index / self._settings.frame_rate)
         while self._late and self._late[0][0] <= elapsed:
             _, stamp, frame = self._late.popleft()
-            self._rendering.append(self._renderer.submit(self._publisher.publish, stamp, frame))
+            self._rendering.append(self._renderer.submit(self._publish, stamp, frame))
 
     def destroy_node(self) -> None:
         """End rendering, and remove the serial lines of simulated boards."""
         self._renderer.shutdown()
         try:
-            self.currents.close()
+            if self._stage is not None:
+                self._stage.close()
         finally:
             super().destroy_node()
 
@@ -179,7 +187,19 @@ class RigSimulatorNode(PackageNode):
         if frame.lateness:
             self._late.append((elapsed + frame.lateness, stamp, frame))
         else:
-            self._publisher.publish(stamp, frame)
+            self._publish(stamp, frame)
+
+    def _publish(self, stamp: int, frame: RigFrame) -> None:
+        """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
+        outputs = [*ground_truth_outputs(stamp, frame)]
+        if frame.image is not None:
+            camera, jpeg = self.rig.camera, encode_jpeg(frame.image, self._settings.jpeg_quality)
+            distance = self._settings.camera_distance
+            outputs = [*camera_outputs(stamp, jpeg, camera.size, camera.view, distance), *outputs]
+            if self._raw.get_subscription_count():
+                self._raw.publish(packed_image(stamp, frame.image))
+        for channel, data in outputs:
+            self._outputs[channel].publish(data)
 
     def _fail(self, error: MagnetosutureError) -> None:
         """Switch the coils off where the simulation does not find its next state, and say so."""
@@ -230,7 +250,7 @@ class RigTime:
     def real_time_factor(self, elapsed: float) -> float:
         """Return the share of time that was not left out, over the last second or two until a time of its own [s]."""
         now, (then, before) = elapsed + self.lag, self._mark
-        if now - then >= FACTOR_PERIOD:
+        if now - then >= 1.0:
             self._mark, self._factor = (now, self.lag), 1.0 - (self.lag - before) / (now - then)
         return self._factor
 
@@ -249,86 +269,3 @@ class RigTime:
         answer.success = True
         answer.message = f"{'paused' if asked.data else 'goes on'} at {self.elapsed():.2f} s"
         return answer
-
-
-class FramePublisher:
-    """Publishes frames as a camera does, and where needle and thread really are and how they pull.
-
-    Args:
-        node: that publishes.
-        camera: that the frames are from.
-        settings: of the rig.
-    """
-
-    def __init__(self, node: Node, camera: DishCamera, settings: RigSettings) -> None:
-        self._quality, self._distance = settings.jpeg_quality, settings.camera_distance
-        self._outputs = {
-            interface.COMPRESSED_IMAGE: topics.COMPRESSED_IMAGE.publisher(node),
-            interface.CAMERA_INFO: topics.CAMERA_INFO.publisher(node),
-            interface.GROUND_TRUTH_NEEDLE: topics.GROUND_TRUTH_NEEDLE.publisher(node),
-            interface.GROUND_TRUTH_THREAD: topics.GROUND_TRUTH_THREAD.publisher(node),
-            interface.GROUND_TRUTH_PULL: topics.GROUND_TRUTH_PULL.publisher(node),
-        }
-        self._raw = topics.IMAGE.publisher(node)
-        self.take(camera)
-
-    def take(self, camera: DishCamera) -> None:
-        """Publish frames of another camera from now on."""
-        self._camera = camera
-
-    def publish(self, stamp: int, frame: RigFrame) -> None:
-        """Publish a frame with its stamp [ns]; the ground truth is published also for a lost frame."""
-        outputs = [*ground_truth_outputs(stamp, frame)]
-        if frame.image is not None:
-            camera, jpeg = self._camera, encode_jpeg(frame.image, self._quality)
-            outputs = [*camera_outputs(stamp, jpeg, camera.size, camera.view, self._distance), *outputs]
-            if self._raw.get_subscription_count():
-                self._raw.publish(packed_image(stamp, frame.image))
-        for channel, data in outputs:
-            self._outputs[channel].publish(data)
-
-
-class RigCurrents:
-    """Hands on what the settings name.
-
-    Args:
-        node: that has the rig.
-        settings: of the rig.
-        clock: that the boards are looked at by.
-        apply: takes the coils' currents from now on, shape (m,) [A].
-
-    Attributes:
-        stage: the simulated boards, None where currents come as messages.
-
-    Raises:
-        ConfigurationError: a path for the boards cannot be used.
-    """
-
-    def __init__(
-        self, node: PackageNode, settings: RigSettings, clock: Clock, apply: Callable[[NDArray[np.float64]], None]
-    ) -> None:
-        self._apply = apply
-        self.stage = stage = settings.power()
-        if stage is None:
-            topics.RIG_CURRENTS.subscribe(node, self.on_currents)
-        else:
-            stage.open()
-            node.create_timer(BOARD_PERIOD, lambda: apply(stage.currents()), clock=clock)
-
-    def on_currents(self, message: CoilCurrents) -> None:
-        """Apply currents from a message."""
-        self._apply(np.asarray(message.current, dtype=float))
-
-    def close(self) -> None:
-        """Remove the boards' serial lines."""
-        if self.stage is not None:
-            self.stage.close()
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(RigSimulatorNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, TypeVar
+from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
@@ -24,9 +24,8 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from magnetosuture_thread import MagnetosutureError
-from magnetosuture_thread.nodes.diagnostics import Health
-from magnetosuture_thread.nodes.node import GuardedNode
-from magnetosuture_thread.nodes.parameter_files import init
+from magnetosuture_thread.nodes.node import GuardedNode, Health
+from magnetosuture_thread.nodes.parameters import init
 from magnetosuture_thread.nodes.program import STOPS
 
 LOADING_GRACE = 1.0  # s to end in order for a process that is asked to while it loads
@@ -81,9 +80,6 @@ class Interruption:
         self._asked = True
 
 
-ORDINARY = "ordinary"
-
-
 def raise_priority(priority: int, process: int | None = None) -> str:
     """Give all threads of a process a real-time priority, and return the result as text.
 
@@ -98,18 +94,15 @@ def raise_priority(priority: int, process: int | None = None) -> str:
         How the process is scheduled now, for a person.
     """
     if not priority:
-        return ORDINARY
+        return "ordinary"
     try:
         for thread in Path(f"/proc/{process or 'self'}/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except ProcessLookupError:
         pass  # a thread that has just ended
     except OSError as error:
-        return f"{ORDINARY}; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
+        return f"ordinary; real-time priority {priority} refused ({error.strerror}), see `ulimit -r`"
     return f"real time, priority {priority}"
-
-
-N = TypeVar("N", bound="Node | tuple[Node, ...]")
 
 
 def end_signals() -> tuple[signal.Signals, ...]:
@@ -167,9 +160,7 @@ class _Ending(Future):
                 os._exit(0)
 
 
-def run(
-    make: Callable[[], N], arguments: Sequence[str] | None = None, made: Callable[[N], None] = lambda node: None
-) -> int:
+def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | None = None) -> int:
     """Run a node, or several in one process, until it is interrupted, terminated, hung up, or shut down.
 
     A node then publishes its final messages while the graph is still there: see `GuardedNode.finish`. One that is asked
@@ -178,25 +169,19 @@ def run(
     Args:
         make: makes the node, or all of them.
         arguments: of the command line; those of the process if None.
-        made: called with what was made; for what concerns the whole process.
 
     Returns:
-        0 when it was asked to end, 1 when it could not start.
+        0 when it was asked to end, 1 with one line on standard error when it could not start or go on.
     """
     nodes: tuple[Node, ...] = ()
     executor = None
     try:
         ending = _Ending()
-        try:
-            init(arguments, signal_handler_options=SignalHandlerOptions.NO)
-            result = make()
-        except Exception as error:  # rclpy raises several kinds, some private, for a broken file or parameter
-            if isinstance(error, (MagnetosutureError, ParameterException, ValueError)) or not rclpy.ok():
-                print(f"error: {_one_line(error)}", file=sys.stderr)
-                return 1
-            raise
-        nodes = result if isinstance(result, tuple) else (result,)
-        made(result)
+        init(arguments, signal_handler_options=SignalHandlerOptions.NO)
+        made = make()
+        nodes = made if isinstance(made, tuple) else (made,)
+        if isinstance(made, GuardedNode):
+            made.own_process()
         # The multi-threaded executor loses messages in the wheels of Jazzy.
         executor = SingleThreadedExecutor()
         for node in nodes:
@@ -208,9 +193,16 @@ def run(
         _finish(nodes)
     except ExternalShutdownException:
         _finish(nodes)
-    except rclpy_implementation.RCLError:
-        if rclpy.ok():
-            raise  # else a callback was still at work when the context was shut down
+    except Exception as error:
+        is_shut_down = not rclpy.ok()
+        if nodes and is_shut_down and isinstance(error, rclpy_implementation.RCLError):
+            return 0  # a callback was still at work when the context was shut down
+        # rclpy raises several kinds, some private, for a broken file or parameter.
+        cannot_start = not nodes and (isinstance(error, ValueError) or is_shut_down)
+        if not (cannot_start or isinstance(error, (MagnetosutureError, ParameterException))):
+            raise
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
     finally:
         if executor is not None:
             executor.shutdown()
@@ -231,7 +223,3 @@ def _finish(nodes: tuple[Node, ...]) -> None:
     for node in nodes:
         for publisher in node.publishers:
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, until - time.monotonic())))
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

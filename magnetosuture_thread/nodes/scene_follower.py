@@ -7,7 +7,6 @@ from collections.abc import Callable
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.node import PackageNode
 from magnetosuture_thread.texts import shortened
 
@@ -29,26 +28,19 @@ class SceneFollower:
 
     Args:
         node: that subscribes.
-        health: of the node.
-        scene: in force at first; None if it is not known yet.
         changed: called with a scene of the topic that is another than the one in force, before it is; raises a
             `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
+        scene: in force at first; None if it is not known yet.
 
     Attributes:
         scene: in force; None until one is known.
         problem: why the scene that came last is not in force; empty where it is, or none came.
     """
 
-    def __init__(
-        self,
-        node: PackageNode,
-        health: Health,
-        scene: Scene | None,
-        changed: Callable[[Scene], None] = lambda scene: None,
-    ) -> None:
+    def __init__(self, node: PackageNode, changed: Callable[[Scene], None], scene: Scene | None = None) -> None:
         self.scene, self.problem = scene, ""
         self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
-        self._node, self._health, self._changed = node, health, changed
+        self._node, self._changed = node, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True)
 
     @property
@@ -79,10 +71,10 @@ class SceneFollower:
                 self._changed(scene)
         except MagnetosutureError as error:
             self.problem = f"scene refused: {shortened(str(error))}"
-            self._health.refuse(error, **{"scene problem": self.problem})
+            self._node.health.refuse(error, **{"scene problem": self.problem})
         else:
             self.scene, self.problem = scene, ""
-            self._health.note(**{"scene problem": "none"})
+            self._node.health.note(**{"scene problem": "none"})
 
 
 def received_scene(data: bytes) -> Scene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +13,6 @@ from magnetosuture_thread.messages.markers import packed_scene_markers
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import initial_scene
 from magnetosuture_thread.scene.editing import SceneEditor, SceneServerSettings
 
@@ -84,12 +82,3 @@ class SceneServerNode(StandbyNode[SceneServerSettings]):
         text = f"scene {scene.version}: dish of {1e3 * scene.dish.diameter:g} mm, {count} shape{'s' * (count != 1)}"
         self.health.ok(text, version=scene.version, shapes=", ".join(scene.names) or "none")
         self.get_logger().info(text)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(SceneServerNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from queue import SimpleQueue
 from threading import Thread
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from magnetosuture_msgs.srv import ForecastPath
@@ -18,7 +20,7 @@ from magnetosuture_thread import (
     Scene,
     ThreadForecaster,
 )
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast import Forecast, make_forecaster
 from magnetosuture_thread.interface import FORECAST_PATH
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.markers import packed_forecast_markers
@@ -29,23 +31,7 @@ from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSet
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
-MAX_PATH_POINTS, MAX_PLACE = 1000, 0.5  # of a path that is sent; m
-MAX_PATH_HORIZON = 10.0  # s; the node does nothing else while it is computed
-MIN_SPEED, MAX_SPEED = 1e-5, 0.1  # m/s
-NEVER = 2**62  # ns before; earlier than any stamp that a message can hold
 MAX_COMMAND_AGE = 500_000_000  # ns; a command is held no longer when none follows
-
-
-class ForecastTask(NamedTuple):
-    """One forecast to make: the held command, where it starts, and the stamp of its message [ns]."""
-
-    forecaster: ThreadForecaster
-    stamp: int
-    start: ForecastStart
-    commanded: np.ndarray
-    horizon: float
-    slowed: bool
-    generation: int
 
 
 class ThreadForecasts:
@@ -63,7 +49,7 @@ class ThreadForecasts:
     def __init__(self, node: StandbyNode[ThreadModelSettings], session: ThreadSession) -> None:
         self._node, self._session = node, session
         self._last: tuple[PredictionResult, NeedlePose] | None = None
-        self._started = -NEVER  # stamp of the last estimate that is forecast [ns]
+        self._started: int | None = None  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
         self._forecaster()
@@ -72,7 +58,8 @@ class ThreadForecasts:
         self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
         node.held(node.create_service(ForecastPath, FORECAST_PATH, self.on_path))
-        self._waiting: SimpleQueue[ForecastTask | None] = SimpleQueue()
+        # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
+        self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
         self._error: Exception | None = None
         self._worker = Thread(target=self._work, name="forecasts", daemon=True)
         self._worker.start()
@@ -109,8 +96,11 @@ class ThreadForecasts:
         if result.estimate is None or not result.estimate.converged:
             return
         forecaster, settings = self._forecaster(), self._session.settings
-        self._last, elapsed = (result, pose), abs(result.stamp - self._started)  # either way if time is set back
-        if forecaster is None or elapsed < 1_000_000_000 * settings.forecast_period:
+        self._last = result, pose
+        elapsed = (
+            math.inf if self._started is None else 1e-9 * abs(result.stamp - self._started)
+        )  # time may be set back
+        if forecaster is None or elapsed < settings.forecast_period:
             return
         self._started = result.stamp
         commanded, filtered, source = np.zeros(2), None, ""
@@ -118,29 +108,28 @@ class ThreadForecasts:
             _, commanded, filtered, source = self._command
         start = ForecastStart.of_estimate(result.estimate, pose, filtered)
         slowed = source == "operator" or settings.friction_feedback == "all"
-        horizon = settings.forecast_horizon
-        task = ForecastTask(forecaster, result.stamp, start, commanded, horizon, slowed, self._generation)
-        self._waiting.put(task)
+        make = partial(forecaster.forecast, start, commanded, settings.forecast_horizon, slowed=slowed)
+        self._waiting.put((result.stamp, self._generation, make))
 
     def _work(self) -> None:
         while self._error is None and (task := self._waiting.get()) is not None:
             try:
                 if self._waiting.empty():
-                    self._publish(task)
+                    self._publish(*task)
             except Exception as error:
                 self._error = error
 
-    def _publish(self, task: ForecastTask) -> None:
+    def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
         try:
-            forecast = task.forecaster.forecast(task.start, task.commanded, task.horizon, slowed=task.slowed)
+            forecast = make()
         except MagnetosutureError as error:
             self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
             return
-        if task.generation != self._generation:
+        if generation != self._generation:
             return
-        self._published.publish(packed_forecast(task.stamp, forecast))
+        self._published.publish(packed_forecast(stamp, forecast))
         if self._markers.get_subscription_count():
-            self._markers.publish(packed_forecast_markers(task.stamp, forecast))
+            self._markers.publish(packed_forecast_markers(stamp, forecast))
 
     def on_path(self, request: Any, answer: Any) -> Any:
         """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
@@ -188,14 +177,14 @@ def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollo
         InvalidInputError: path, speed or horizon are out of bounds.
     """
     points = np.array([(point.x, point.y) for point in request.path]).reshape(-1, 2)
-    if not (0 < len(points) <= MAX_PATH_POINTS):
-        raise InvalidInputError("path", f"{len(points)} points", f"1 to {MAX_PATH_POINTS}")
-    if not (np.abs(points) <= MAX_PLACE).all():
-        raise InvalidInputError("path", "a point that is not finite or far away", f"within {MAX_PLACE:g} m")
-    if not MIN_SPEED <= request.speed <= MAX_SPEED:
-        raise InvalidInputError("speed", request.speed, f"{MIN_SPEED:g} to {MAX_SPEED:g} m/s")
-    if not (math.isfinite(request.horizon) and 0.0 < request.horizon <= MAX_PATH_HORIZON):
-        raise InvalidInputError("horizon", request.horizon, f"above 0 and at most {MAX_PATH_HORIZON:g} s")
+    if not 0 < len(points) <= 1000:
+        raise InvalidInputError("path", f"{len(points)} points", "1 to 1000")
+    if not (np.abs(points) <= 0.5).all():
+        raise InvalidInputError("path", "a point that is not finite or far away", "within 0.5 m")
+    if not 1e-5 <= request.speed <= 0.1:
+        raise InvalidInputError("speed", request.speed, "1e-05 to 0.1 m/s")
+    if not 0.0 < request.horizon <= 10.0:  # s; the node does nothing else while it is computed
+        raise InvalidInputError("horizon", request.horizon, "above 0 and at most 10 s")
     chosen = PathFollowerSettings(
         waypoints=tuple(points.ravel().tolist()),
         speed=request.speed,

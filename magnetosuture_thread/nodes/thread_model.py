@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,18 +10,17 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from magnetosuture_msgs.msg import ThreadMaterial
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene, ThreadEstimate, interface
-from magnetosuture_thread.configuration import configuration_fields
+from magnetosuture_thread.configuration import to_mapping
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_thread_markers
-from magnetosuture_thread.messages.outputs import estimate_outputs, prediction_outputs
+from magnetosuture_thread.messages.packing import estimate_outputs, prediction_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.parameters import Changeable
-from magnetosuture_thread.nodes.run import run
+from magnetosuture_thread.nodes.node import Health
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
 from magnetosuture_thread.thread.prediction import STARTED
@@ -30,8 +28,6 @@ from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings, parse_material
 from magnetosuture_thread.thread_observation import ThreadObservation
-
-UNMEASURED_TOO_LONG = 1.0  # s; an estimate that is only a prediction for longer is a warning
 
 
 class ThreadModelNode(StandbyNode[ThreadModelSettings]):
@@ -48,12 +44,10 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
 
     def __init__(self, *, listens: bool = True, **options: Any) -> None:
         super().__init__("thread_model", ThreadModelSettings, fixed=FIXED, **options)
-        self._scene = SceneFollower(self, self.health, None, self.on_scene)
+        self._scene = SceneFollower(self, self.on_scene)
         self._states = ThreadHealth(self.health)
-        self._changes: Changeable[ThreadModelSettings] | None = None
         self._forecasts: ThreadForecasts | None = None
-        self._material: bytes | None = None  # that came while the node was unconfigured; each is applied once
-        topics.MATERIAL.subscribe(self, self.on_material, raw=True)
+        topics.MATERIAL.subscribe(self, self.on_material)
         self._observed = False
         self._listens = listens
         self.start()
@@ -64,10 +58,6 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         with self.health.load("the model's kernels"):
             self._session = ThreadSession(settings, scene)
             self._forecasts = ThreadForecasts(self, self._session) if settings.forecast_horizon > 0.0 else None
-        self._changes = Changeable(self, settings, self._prepare)
-        if self._material is not None:
-            self.on_material(self._material)
-            self._material = None
         self._outputs = {
             interface.PREDICTED_THREAD: self.held(topics.PREDICTED_THREAD.publisher(self)),
             interface.ESTIMATED_THREAD: self.held(topics.ESTIMATED_THREAD.publisher(self)),
@@ -77,7 +67,9 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         self._last_margins = 0  # stamp of those that were published [ns]
         if self._listens:
             self._subscribe()
-        self.get_logger().info(f"ready: {model_text(settings, scene)}")
+        where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
+        thread = f"{settings.segments} segments of {settings.material}"
+        self.get_logger().info(f"ready: {thread}, {where}, {settings.formulation} by {settings.solver}")
 
     def activate(self) -> None:
         """Wait for a needle pose."""
@@ -94,9 +86,7 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         """Give the model up, once no forecast is being made."""
         if self._forecasts is not None:
             self._forecasts.close()
-        if self._changes is not None:
-            self._changes.close()
-        self._changes = self._forecasts = None
+        self._forecasts = None
         super().release()
 
     def listen(self) -> None:
@@ -105,13 +95,10 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         if self.settings is not None:
             self._subscribe()
 
-    def on_material(self, data: bytes) -> None:
-        """Set the parameters that a ThreadMaterial message names; before the node is configured it waits for that."""
-        if self._changes is None:
-            self._material = data
-            return
+    def on_material(self, message: ThreadMaterial) -> None:
+        """Set the parameters that a message names."""
         try:
-            self._changes.set(parse_material(topics.MATERIAL.decode(data)))
+            self.change(parse_material(message))
         except MagnetosutureError as error:
             self.health.refuse(error)
 
@@ -209,17 +196,14 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
                 self._markers.publish(packed_thread_markers(result.stamp, *shown))
         self._states.show(result, step_time)
 
-    def _prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
-        """Return what puts other settings in force."""
+    def prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
+        """Return what puts other settings in force, from the next pose on."""
+        before, after = to_mapping(self._session.settings), to_mapping(settings)
         put_in_force = self._session.prepare(settings, self._session.scene)
 
         def change() -> None:
-            before = self._session.settings
             put_in_force()
-            names = [about.name for about in configuration_fields(ThreadModelSettings)]
-            changed = [name for name in names if getattr(settings, name) != getattr(before, name)]
-            if changed:
-                self.get_logger().info(f"changed: {', '.join(changed)}")
+            self.get_logger().info(f"changed: {', '.join(name for name in after if after[name] != before[name])}")
 
         return change
 
@@ -275,7 +259,7 @@ class ThreadHealth:
             found.append(self._disturbance[1])
         else:
             self._disturbance = None
-        if estimate.unmeasured_for >= UNMEASURED_TOO_LONG:
+        if estimate.unmeasured_for >= 1.0:
             why = f" ({estimate.problems[0]})" if estimate.problems else ""
             found.append(f"the estimate is only a prediction since {math.floor(estimate.unmeasured_for)} s{why}")
         return found
@@ -291,19 +275,3 @@ class ThreadHealth:
         if estimate.problems:
             figures["last_refused_piece"] = estimate.problems[0]
         return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}
-
-
-def model_text(settings: ThreadModelSettings, scene: Scene | None) -> str:
-    """Return in words which thread is modelled, where and how."""
-    where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
-    thread = f"{settings.segments} segments of {settings.material}"
-    return f"{thread}, {where}, {settings.formulation} by {settings.solver}"
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(ThreadModelNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

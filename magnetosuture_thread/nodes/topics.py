@@ -49,7 +49,6 @@ MAX_BYTES = {
     "std_msgs": 1 << 12,
     "rosgraph_msgs": 1 << 12,
 }
-MAX_OTHER_BYTES = 1 << 19
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
 MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 
@@ -74,7 +73,7 @@ class Topic:
     def max_bytes(self) -> int:
         """Return how many bytes a message may have."""
         kind = self.channel.type_name
-        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], MAX_OTHER_BYTES)
+        return MAX_BYTES.get(kind) or MAX_BYTES.get(kind.partition("/")[0], 1 << 19)
 
     @property
     def message(self) -> Any:
@@ -110,7 +109,7 @@ class Topic:
             callback: called with each message that can be decoded, or with the CDR bytes of each.
             raw: whether with its bytes.
         """
-        return self._subscribe(node, callback if raw else lambda data: self._decoded(node, data, callback))
+        return self._subscribe(node, callback if raw else lambda data: self.decoded(node, data, callback))
 
     def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
@@ -126,12 +125,13 @@ class Topic:
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
                 number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
-            self._decoded(node, data, lambda message: callback(message, number))
+            self.decoded(node, data, lambda message: callback(message, number))
 
         subscription = self._subscribe(node, take)
         return subscription
 
-    def _decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+    def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
+        """Call back with the message of some bytes; where they are none, the node reports that they are refused."""
         try:
             message = self.decode(data)
         except InvalidInputError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -14,12 +13,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.outputs import Outputs, pose_outputs, thread_outputs
-from magnetosuture_thread.messages.packing import packed_tracker_state
+from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.diagnostics import Health
 from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.images import decode_image, unpack_image
@@ -52,9 +48,10 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__("vision_tracker", VisionTrackerSettings, **options)
         self._session: TrackerSession | None = None
-        self._scene = SceneFollower(self, self.health, None, self.on_scene)
-        self._words = TrackerHealth(self.health)
+        self._scene = SceneFollower(self, self.on_scene)
+        self._text = ""  # what was seen last
         self._lens: Lens | None = None
+        self._lens_problem = ""  # why frames are not corrected for the lens, until valid parameters come
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._last_frame = self._arrival()
@@ -83,7 +80,8 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
 
     def activate(self) -> None:
         """Look for needle and thread in the next frame."""
-        self._words.begin(self._session)
+        self._text = "nothing seen"
+        self.health.warn("no camera frame yet" if self._session is not None else NO_SCENE)
 
     def deactivate(self) -> None:
         """Forget needle and thread, which move meanwhile."""
@@ -118,9 +116,9 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
     def on_camera_info(self, message: CameraInfo) -> None:
         """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
         try:
-            self._lens, self._words.lens_problem = lens_of(message), ""
+            self._lens, self._lens_problem = lens_of(message), ""
         except InvalidInputError as error:
-            self._lens, self._words.lens_problem = None, str(error)
+            self._lens, self._lens_problem = None, str(error)
             self.health.refuse(error)
         if self._session is not None:
             self._session.set_lens(self._lens)
@@ -132,7 +130,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
             self._states.publish(packed_tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
-            self._words.show_silence(reason)
+            self.health.warn("; ".join(filter(None, (reason, f"before that {self._text}", self._lens_problem))))
 
     def _new_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> TrackerSession | None:
         if scene is None:
@@ -176,61 +174,25 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             for follower in self._followers:
                 follower.on_tracked(stamp, track.tail, track.heading, track.covariance)
         self._states.publish(packed_tracker_state(stamp, track, 0.0 if seen.problem else taken))
-        self._words.show(seen, self._session)
+        self._report(seen, self._session)
+
+    def _report(self, seen: FrameMeasurement, session: TrackerSession) -> None:
+        """Report what was seen in a frame."""
+        track = seen.track
+        values: dict[str, Any] = {"frames": session.frames, "tracked": session.tracked}
+        if track.needle_length is not None:
+            values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
+        if seen.problem is not None:
+            self.health.refuse(seen.problem, **values)
+        elif not seen.tracked:
+            self._text = f"{track.state.value}: {track.reason}"
+            self.health.warn(self._text, **values)
+        else:
+            self._text = f"tracking; {track.warning}" if track.warning else "tracking"
+            text = "; ".join(filter(None, (self._text, self._lens_problem)))
+            report = self.health.ok if text == "tracking" else self.health.warn
+            report(text, confidence=round(track.confidence, 3), **values)
 
     def _publish(self, outputs: Outputs) -> None:
         for channel, data in outputs:
             self._outputs[channel].publish(data)
-
-
-class TrackerHealth:
-    """Puts what is seen of needle and thread into words.
-
-    Args:
-        health: of the node.
-
-    Attributes:
-        lens_problem: why frames are not corrected for the lens; stays in the state until valid parameters come.
-    """
-
-    def __init__(self, health: Health) -> None:
-        self._health = health
-        self._words = ""
-        self.lens_problem = ""
-
-    def begin(self, session: TrackerSession | None) -> None:
-        """Report that no frame has come yet; without a scene there is no session."""
-        self._words = "nothing seen"
-        self._health.warn("no camera frame yet" if session is not None else NO_SCENE)
-
-    def show(self, measured: FrameMeasurement, session: TrackerSession) -> None:
-        """Report what was seen in a frame."""
-        track = measured.track
-        values: dict[str, Any] = {"frames": session.frames, "tracked": session.tracked}
-        if track.needle_length is not None:
-            values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
-        if measured.problem is not None:
-            self._health.refuse(measured.problem, **values)
-        elif measured.tracked:
-            values["confidence"] = round(track.confidence, 3)
-            self._words = f"tracking; {track.warning}" if track.warning else "tracking"
-            if self.lens_problem:
-                self._health.warn(f"{self._words}; {self.lens_problem}", **values)
-            else:
-                (self._health.warn if track.warning else self._health.ok)(self._words, **values)
-        else:
-            self._words = f"{track.state.value}: {track.reason}"
-            self._health.warn(self._words, **values)
-
-    def show_silence(self, reason: str) -> None:
-        """Report why no frame comes, and what was seen before."""
-        self._health.warn("; ".join(filter(None, (reason, f"before that {self._words}", self.lens_problem))))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(VisionTrackerNode, arguments)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_without_gil
+from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.packed_scene import measure, pack_scene
 from magnetosuture_thread.scene import Scene
 
 CELLS = 400  # of the clearance map across the dish
@@ -57,7 +57,7 @@ def map_clearance(scene: Scene, shapes: tuple[str, ...] | None = None) -> Cleara
         scene: dish and shapes.
         shapes: names of the shapes to measure from, without the wall; None for wall and all shapes.
     """
-    packed = pack_scene(scene)
+    packed = pack_obstacles(scene.obstacles, scene.dish.radius)
     radius = scene.dish.radius
     at = np.linspace(-radius, radius, CELLS + 1)
     wanted = [k for k in range(len(packed.shapes)) if shapes is None or scene.names[packed.shapes[k]] in shapes]

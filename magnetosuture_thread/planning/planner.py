@@ -109,7 +109,7 @@ class NeedlePlanner:
         self.near = map_clearance(scene)
         self.lever = 0.5 * needle.chord
         # Points a step of the grid apart, about the middle of the chord.
-        axis = needle_points(needle.length, needle.curvature, self.near.step).points
+        axis = needle_points(needle.length, needle.curvature, self.near.step)[0]
         along = needle.chord_direction(np.array([1.0, 0.0]))
         turn = np.array([[along[0], along[1]], [-along[1], along[0]]])
         self.body = np.ascontiguousarray((axis - self.lever * along) @ turn.T)

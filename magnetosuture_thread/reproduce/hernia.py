@@ -23,12 +23,12 @@ from rich.table import Table
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import BagError, InvalidInputError, SolverError
-from magnetosuture_thread.evaluation.plots import FAINT, INK, KIND_COLOURS, draw_dish, shape_patch, tidy
+from magnetosuture_thread.evaluation.plots import FAINT, INK, KIND_COLOURS, draw_empty_dish, shape_patch, tidy
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import OPERATOR_COMMAND
-from magnetosuture_thread.jobs.output import whole_folder
 from magnetosuture_thread.messages.reading import seconds
 from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
@@ -432,7 +432,7 @@ def draw_animation(path: Path, run: HerniaRun) -> None:
 
 def draw_instant(axes: Axes, scene: Scene, instant: SteeredInstant) -> None:
     """Draw the dish, the thread in the colour of its friction, and the needle with its commanded velocity, in mm."""
-    draw_dish(axes, scene, 0.08)
+    draw_empty_dish(axes, scene, 0.08)
     for shape in scene.shapes:
         face, edge = KIND_COLOURS[shape.kind]
         axes.add_patch(shape_patch(shape.geometry, facecolor=face, edgecolor=edge, linewidth=0.9))

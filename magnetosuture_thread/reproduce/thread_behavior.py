@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.figures import AGAINST
 from magnetosuture_thread.evaluation.frames import FrameResult
@@ -20,8 +22,6 @@ from magnetosuture_thread.evaluation.graph_outputs import LoopSummary
 from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, look_at, tidy
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
-from magnetosuture_thread.jobs.output import whole_folder
-from magnetosuture_thread.jobs.simulate import measure_loop, simulate
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup

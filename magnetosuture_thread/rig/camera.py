@@ -26,12 +26,10 @@ Box = tuple[slice, slice]
 ToCanvas = Callable[[Points], NDArray[np.int32]]
 
 OVERSAMPLING = 4
-TILE_PX = 60.0  # a long line is drawn in pieces of this length: a large, nearly empty canvas would be slow
 STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
 LAMP = (-0.5, 0.86)  # direction towards the lamp, in the dish frame
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
-SHADOW_BEGIN_PX = (-10, -9)  # shifted by 2.5 and 3.5 px, less 12.5 of the blur
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
 NOISE_FIELDS = 12
 NOISE_LEVEL = 1.6  # of white light of level 90, before the sensor's interpolation spreads it
@@ -220,7 +218,9 @@ class DishCamera:
             needle = covered(near, lambda canvas, at: cv2.fillPoly(canvas, [at(outline)], 255, cv2.LINE_8, 4))
             inside = _within(near, box)
             np.maximum(shade[inside], needle, out=shade[inside])
-        lay(region, blurred(shade, SHADOW, *SHADOW_BEGIN_PX), 0.16, (0.0, 0.0, 0.0))
+        # Shifted to the right and down by 2.5 and 3.5 px, from the middle of the kernel's 26 values.
+        cast = cv2.sepFilter2D(shade, cv2.CV_32F, SHADOW, SHADOW, anchor=(15, 16), borderType=cv2.BORDER_CONSTANT)
+        lay(region, cast, 0.16, (0.0, 0.0, 0.0))
         lay(region, strand, 1.0, scene.thread_bgr)
         if near is not None and needle is not None:
             lay(region[inside], needle, 1.0, STEEL_BGR)
@@ -463,7 +463,11 @@ def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
     rows, columns = box[0].stop - box[0].start, box[1].stop - box[1].start
     canvas = np.zeros((rows * OVERSAMPLING, columns * OVERSAMPLING), np.uint8)
 
-    draw(canvas, lambda pixels: _on_canvas(pixels - (box[1].start, box[0].start)))
+    def on_canvas(pixels: Points) -> NDArray[np.int32]:
+        at = (pixels - (box[1].start, box[0].start) + 0.5) * OVERSAMPLING - 0.5
+        return np.asarray(np.round(16.0 * at), dtype=np.int32)
+
+    draw(canvas, on_canvas)
     small = cv2.resize(canvas, (columns, rows), interpolation=cv2.INTER_AREA)
     return np.asarray(small * np.float32(1.0 / 255.0), dtype=np.float32)
 
@@ -471,37 +475,28 @@ def covered(box: Box, draw: Callable[[Any, ToCanvas], Any]) -> Light:
 def line_covered(box: Box, line: Points, width_px: float) -> Light:
     """Return the share of each pixel in a box that a line of a given width covers, shape (rows, columns).
 
+    A long line is drawn in pieces of about 60 px: a large, nearly empty canvas would be slow.
+
     Args:
-        box: rows and columns.
+        box: rows and columns, in which the line is with all its pieces' margins; see `box_around`.
         line: vertices, shape (m, 2) [px].
         width_px: of the line; less than a quarter of a pixel is drawn as that and fainter.
     """
-    rows, columns = box
-    result = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+    result = np.zeros((box[0].stop - box[0].start, box[1].stop - box[1].start), np.float32)
     wide = max(1, round(width_px * OVERSAMPLING))
-    fainter = min(1.0, width_px * OVERSAMPLING / wide)
-    line = line - (columns.start, rows.start)
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-    starts = np.searchsorted(length, np.arange(0.0, length[-1], TILE_PX), side="right") - 1
-    ends = np.append(starts[1:], len(line) - 1)
-    low = np.minimum(np.minimum.reduceat(line, starts), line[ends]) - (2.0 + width_px)
-    high = np.maximum(np.maximum.reduceat(line, starts), line[ends]) + (3.0 + width_px)
-    parts = np.clip(np.column_stack([low, high]), 0.0, [*result.shape[::-1]] * 2).astype(int).tolist()
-    at = _on_canvas(line)
-    for first, last, (left, top, right, bottom) in zip(starts, ends, parts, strict=True):
-        if left < right and top < bottom:
-            canvas = np.zeros(((bottom - top) * OVERSAMPLING, (right - left) * OVERSAMPLING), np.uint8)
-            piece = at[first : last + 1] - (left * OVERSAMPLING * 16, top * OVERSAMPLING * 16)
-            cv2.polylines(canvas, [piece], False, 255, wide, cv2.LINE_8, 4)
-            part = result[top:bottom, left:right]
-            small = cv2.resize(canvas, part.shape[::-1], interpolation=cv2.INTER_AREA)
-            np.maximum(part, small, out=part)
-    return np.asarray(result * np.float32(fainter / 255.0), dtype=np.float32)
+    length = float(np.hypot(*np.diff(line, axis=0).T).sum())
+    count = max(1, round(60.0 * (len(line) - 1) / max(length, 60.0)))
+    for first in range(0, len(line) - 1, count):
+        piece = line[first : first + count + 1]
+        part = box_around(piece, (box[1].stop, box[0].stop), 3.0 + width_px)
+        if part is not None:
+            inside, drawn = _within(part, box), _line_drawn(part, piece, wide)
+            np.maximum(result[inside], drawn, out=result[inside])
+    return result * np.float32(min(1.0, width_px * OVERSAMPLING / wide))
 
 
-def _on_canvas(pixels: Points) -> NDArray[np.int32]:
-    """Return pixels (u, v) in the coordinates of a canvas that begins with (0, 0), in sixteenths."""
-    return np.asarray(np.round(((pixels + 0.5) * OVERSAMPLING - 0.5) * 16.0), dtype=np.int32)
+def _line_drawn(box: Box, line: Points, wide: int) -> Light:
+    return covered(box, lambda canvas, at: cv2.polylines(canvas, [at(line)], False, 255, wide, cv2.LINE_8, 4))
 
 
 @compiled
@@ -516,35 +511,3 @@ def lay(region: Light, share: Light, strength: float, bgr: tuple[float, float, f
                 region[i, j, 0] += part * (b - region[i, j, 0])
                 region[i, j, 1] += part * (g - region[i, j, 1])
                 region[i, j, 2] += part * (r - region[i, j, 2])
-
-
-@compiled
-def blurred(sparse: Light, kernel: Light, right: int, down: int) -> Light:
-    """Return the convolution of a mostly empty image with a kernel along rows and columns, zeros around it.
-
-    Args:
-        sparse: shape (rows, columns).
-        kernel: shape (k,); its first value is for the pixel `right` and `down` of one that is not zero.
-        right: see there.
-        down: the same.
-    """
-    rows, columns = sparse.shape
-    size = kernel.shape[0]
-    result = np.zeros_like(sparse)
-    line = np.zeros(columns, np.float32)
-    for i in range(rows):
-        low, high = columns, 0
-        for j in range(columns):
-            if sparse[i, j] != 0.0:
-                begin, end = max(j + right, 0), min(j + right + size, columns)
-                low, high = min(low, begin), max(high, end)
-                for n in range(begin, end):
-                    line[n] += sparse[i, j] * kernel[n - j - right]
-        if low < high:
-            spread = line[low:high]
-            for n in range(max(i + down, 0), min(i + down + size, rows)):
-                target, weight = result[n, low:high], kernel[n - i - down]
-                for j in range(spread.shape[0]):
-                    target[j] += weight * spread[j]
-            spread[:] = 0.0
-    return result

@@ -19,8 +19,7 @@ from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, Di
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
-from magnetosuture_thread.rig.mechanics.field import Coil, CoilField
-from magnetosuture_thread.rig.mechanics.needle import NeedleBody
+from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.rig.power.stage import StageProcess
 from magnetosuture_thread.scene import Scene, find_collision
@@ -203,17 +202,7 @@ class RigSettings(Configuration):
 
     def field(self) -> CoilField:
         """Return the coils' field."""
-        coils = [
-            Coil(
-                centre=(self.coil_distance * math.cos(a), self.coil_distance * math.sin(a), 0.0),
-                axis=(math.cos(a), math.sin(a), 0.0),
-                radius=self.coil_radius,
-                length=self.coil_length,
-                turns=self.coil_turns,
-            )
-            for a in self.coil_angles
-        ]
-        return CoilField(coils)
+        return CoilField(self.coil_angles, self.coil_distance, self.coil_radius, self.coil_length, self.coil_turns)
 
     def power(self) -> StageProcess | None:
         """Return the simulated boards, None where currents come as messages."""

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.half_planes import project_onto_half_planes
+from magnetosuture_thread.geometry.obstacles.distances import ContactRows, polygon_rows, shape_distance
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.safety.certificate import NOTHING, WALL, PosedNeedle, safe_time
-from magnetosuture_thread.safety.packed_scene import search_block, shape_distance
 
 LEAN, DEPTH = 0.1, 1e-5  # rad and m; so far beyond its bound, a point that slides leaves at this angle
 MAX_ROWS = 2048
@@ -21,6 +20,8 @@ PASSES = 4  # of the projection, each with what the motion of the one before ben
 STUCK = 1e-9  # of the velocity commanded; less is none
 ACTIVE = 1e-6  # of the speed; a barrier that leaves less room than this is active
 SURE = 1.0 - 1e-9  # of the certified time, against rounding
+ROUNDING = 1e-12  # of a projection beyond a line, relative to the size of the projected point
+SLACK = 1e-14  # of its intermediate results: without it, rounding would make two nearly equal lines exclude each other
 
 
 class AddedRows(NamedTuple):
@@ -74,44 +75,81 @@ def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
     Returns:
         The number of rows. Where there is no room for more, a shape's nearest points are left.
     """
-    data, scene = needle.data, needle.data.scene
-    distance, normal = np.empty(32), np.empty((32, 2))
-    points, keep, keep_wall = needle.points, data.keep + BAND, data.keep_wall + BAND
+    data, scene, points = needle.data, needle.data.scene, needle.points
+    keep, keep_wall = data.keep + BAND, data.keep_wall + BAND
     used, discs, count, room = 0, len(scene.discs), len(points), len(rows.margin)
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
         away = math.hypot(x, y)
         at_end = not data.body.straight or i == 0 or i == count - 1
-        if at_end and scene.radius - away - keep_wall <= reach and used < room and away > 1e-9:
-            rows.margin[used], rows.bend[used] = scene.radius - away - keep_wall, -1.0 / away
+        if at_end and scene.wall_radius - away - keep_wall <= reach and used < room and away > 1e-9:
+            rows.margin[used], rows.bend[used] = scene.wall_radius - away - keep_wall, -1.0 / away
             rows.gradient[used, 0], rows.gradient[used, 1] = -x / away, -y / away
             rows.point[used], rows.shape[used] = i, WALL
             used += 1
         for s in range(len(scene.shapes)):
-            nearest = needle.distances[i, s]
+            nearest, start = needle.distances[i, s], used
             if nearest - keep > reach:
                 continue
-            local = 0
             if s >= discs and nearest > 0.0:
-                far = reach + keep
-                for block in range(scene.polygons[s - discs, 0], scene.polygons[s - discs, 1]):
-                    bx, by = x - scene.circles[block, 0], y - scene.circles[block, 1]
-                    near = far + scene.circles[block, 2]
-                    if bx * bx + by * by > near * near:
-                        continue
-                    found = search_block(x, y, far, block, scene, local, distance, normal)
-                    local = found.rows if found.rows >= 0 else local
-            if local == 0:
-                distance[0], local = nearest, 1
-                normal[0, 0], normal[0, 1] = needle.normal[i, s, 0], needle.normal[i, s, 1]
-            for k in range(min(local, room - used)):
-                rows.margin[used] = distance[k] - keep
-                rows.gradient[used, 0], rows.gradient[used, 1] = normal[k, 0], normal[k, 1]
-                # A disc, or a corner for all that is known here, bends away from the point: that is left out.
-                rows.bend[used] = 0.0
-                rows.point[used], rows.shape[used] = i, scene.shapes[s]
+                to = ContactRows(rows.margin, rows.gradient)
+                used = max(start, polygon_rows(x, y, s - discs, reach + keep, scene, used, to).rows)
+            if used == start and used < room:
+                rows.margin[used] = nearest
+                rows.gradient[used, 0], rows.gradient[used, 1] = needle.normal[i, s, 0], needle.normal[i, s, 1]
                 used += 1
+            for k in range(start, used):
+                rows.margin[k] -= keep
+                # A disc, or a corner for all that is known here, bends away from the point: that is left out.
+                rows.bend[k], rows.point[k], rows.shape[k] = 0.0, i, scene.shapes[s]
     return used
+
+
+@compiled
+def project_onto_half_planes(
+    point: NDArray[np.float64], given: Points, bounds: NDArray[np.float64], work: Points, found: NDArray[np.float64]
+) -> bool:
+    """Write the nearest point; `work` (k, 3) has room for rows of length one; return whether there is one."""
+    # Of size one, so that the tolerance means something however small or large the point is.
+    size = math.hypot(point[0], point[1])
+    if size == 0.0:
+        size = max(1e-300, np.abs(bounds).max())
+    x, y = point[0] / size, point[1] / size
+    for i in range(len(given)):
+        length = math.hypot(given[i, 0], given[i, 1])
+        work[i, 2] = bounds[i] / length / size if length > 0.0 else -np.inf
+        work[i, 0] = given[i, 0] / length if length > 0.0 else 0.0
+        work[i, 1] = given[i, 1] / length if length > 0.0 else 0.0
+    best, inside = np.inf, True
+    for i in range(len(work)):
+        nx, ny, least = work[i, 0], work[i, 1], work[i, 2]
+        if nx * x + ny * y >= least:
+            continue
+        inside = False
+        # Along the line i, from its point nearest to the origin: where all the others let it be.
+        px, py, low, high = least * nx, least * ny, -np.inf, np.inf
+        for j in range(len(work)):
+            slope = work[j, 1] * nx - work[j, 0] * ny
+            missing = work[j, 2] - work[j, 0] * px - work[j, 1] * py - SLACK
+            if slope > 0.0:
+                low = max(low, missing / slope)
+            elif slope < 0.0:
+                high = min(high, missing / slope)
+        along = min(max(y * nx - x * ny, low), high)
+        qx, qy = px - along * ny, py + along * nx
+        square = (qx - x) ** 2 + (qy - y) ** 2
+        if not square < best:
+            continue
+        holds = True
+        for j in range(len(work)):
+            if work[j, 0] * qx + work[j, 1] * qy < work[j, 2] - ROUNDING:
+                holds = False
+                break
+        if holds:
+            best, found[0], found[1] = square, size * qx, size * qy
+    if inside:
+        found[0], found[1] = point[0], point[1]
+    return inside or best < np.inf
 
 
 @compiled
@@ -169,7 +207,7 @@ def _tangent(x: float, y: float, what: int, needle: PosedNeedle) -> tuple[float,
     data, scene = needle.data, needle.data.scene
     if what == WALL:
         away = math.hypot(x, y)
-        return -x / away, -y / away, scene.radius - away - data.keep_wall
+        return -x / away, -y / away, scene.wall_radius - away - data.keep_wall
     s = 0
     while scene.shapes[s] != what:
         s += 1

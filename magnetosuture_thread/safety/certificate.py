@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
+from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.packed_scene import PackedScene
 
 ROUNDING = 1e-13
 """What a point that is at its bound may get nearer in one hold, so that rounding does not keep it from sliding [m]."""
@@ -71,7 +70,7 @@ class FilterData(NamedTuple):
         rate: share of a margin by which the needle may approach [1/s].
         max_speed: of the tip [m/s].
         max_acceleration: maximum change of the velocity before the barriers [m/s^2].
-        scene: packed.
+        scene: dish and shapes.
     """
 
     body: BodyData
@@ -82,7 +81,7 @@ class FilterData(NamedTuple):
     rate: float
     max_speed: float
     max_acceleration: float
-    scene: PackedScene
+    scene: WorkspaceData
 
 
 class PosedNeedle(NamedTuple):
@@ -275,7 +274,7 @@ def safe_time(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.0) -> 
             continue
         if not data.body.straight or i == 0 or i == count - 1:
             away = math.hypot(x, y)
-            radius = max(scene.radius - data.keep_wall, away) + ROUNDING
+            radius = max(scene.wall_radius - data.keep_wall, away) + ROUNDING
             if radius - away <= speed * best:
                 t = circle_exit(x, y, radius - away, radius, px, py, omega, False)
                 if t < best:

@@ -16,11 +16,11 @@ from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
+from magnetosuture_thread.geometry.obstacles.distances import pack_obstacles
 from magnetosuture_thread.safety.barriers import SURE, AddedRows, nearest_clear, no_rows
 from magnetosuture_thread.safety.certificate import NOTHING, BodyData, FilterData, PosedNeedle, safe_time
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.safety.motion import STUCK, limit_velocity, needle_margin, pose_needle
-from magnetosuture_thread.safety.packed_scene import pack_scene
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
@@ -224,8 +224,8 @@ class NeedleSafetyFilter:
         points, turning, spacing = np.zeros((1, 2)), np.array([[0.0, 1.0]]), 0.0
         if needle_length > 0.0:
             spacing = max(min(COARSEST, 0.5 * keep_out), needle_length / (MAX_POINTS - 1))
-            body = needle_points(needle_length, needle_curvature, spacing)
-            points, turning, spacing = body.points, body.turning, needle_length / (len(body.points) - 1)
+            points, turning = needle_points(needle_length, needle_curvature, spacing)
+            spacing = needle_length / (len(points) - 1)
         x, y = self.kinematics.chord_direction(EAST).tolist()
         bend = abs(needle_curvature)
         is_straight, turn = bend * needle_length < 1e-9, 2.0 / chord if needle_length > 0.0 else 0.0
@@ -238,7 +238,7 @@ class NeedleSafetyFilter:
             min(approach_rate, 1.0 / hold_time),
             min(max_speed, MAX_SPEED),
             max_acceleration,
-            pack_scene(scene),
+            pack_obstacles(scene.obstacles, scene.dish.radius),
         )
         self._added = AddedNeedleBarriers(barriers, self.kinematics, self._data, len(scene.names))
         self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.obstacles.distances import measure
 from magnetosuture_thread.safety.barriers import nearest_clear, no_rows
 from magnetosuture_thread.safety.certificate import WALL, FilterData, PosedNeedle
 from magnetosuture_thread.safety.kinematics import move_pose
-from magnetosuture_thread.safety.packed_scene import measure
 
 Pair = tuple[float, float]
 
@@ -42,7 +42,7 @@ def needle_margin(data: FilterData, needle: PosedNeedle) -> tuple[float, int]:
     """Return the minimum distance of the needle's axis from wall and shapes, less keep_out [m], and of which shape."""
     minimum, shape = np.inf, WALL
     for i in range(len(needle.points)):
-        wall = data.scene.radius - math.hypot(needle.points[i, 0], needle.points[i, 1])
+        wall = data.scene.wall_radius - math.hypot(needle.points[i, 0], needle.points[i, 1])
         if wall < minimum:
             minimum, shape = wall, WALL
         for s in range(needle.distances.shape[1]):

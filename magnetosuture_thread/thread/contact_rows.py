@@ -22,11 +22,21 @@ import math
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles import FRICTION, WorkspaceData, find_contacts
+from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.program import SPAN, Mask, Vector
-from magnetosuture_thread.thread.step_buffers import GRIPS, NO_SHAPE, ContactBuffers, StepBuffers
+from magnetosuture_thread.thread.program import (
+    BEFORE,
+    GRIPS,
+    NO_SHAPE,
+    SPAN,
+    START,
+    ContactBuffers,
+    GripBuffers,
+    Mask,
+    RodBuffers,
+    StepBuffers,
+)
 
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
@@ -98,8 +108,8 @@ def contact_rows(
         if known[i] and (s == 0.0 or known[i + 1]):
             continue
         kind = 0 if s == 0.0 else 1
-        minimum[i, kind] = min(minimum[i, kind], contacts.distance[c] - radius)
         clearance = contacts.distance[c] - radius
+        minimum[i, kind] = min(minimum[i, kind], clearance)
         depth = max(depth, -clearance)
         bound = -clearance / unit
         begin, here = min(i, nodes - 3), row + kept
@@ -110,20 +120,21 @@ def contact_rows(
                 bound -= buffers.gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
             if known[begin + k]:
                 buffers.gradient[here, k] = 0.0
-        buffers.first[here], buffers.value[here] = begin, clearance / unit
+        buffers.first[here] = begin
         buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
         # both sides of a shape: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
         buffers.limit[here] = np.inf
         contacts.node[kept], contacts.obstacle[kept], contacts.place[kept] = i, contacts.obstacle[c], s
+        contacts.distance[kept] = contacts.distance[c]
         for a in range(dimension):
             contacts.normal[kept, a] = contacts.normal[c, a]
         kept += 1
     # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
     for c in range(kept):
         kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        pushes = buffers.value[row + c] * unit <= max(minimum[i, kind], DEPTH_TOLERANCE)
+        pushes = contacts.distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
         buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
     return kept, depth
 
@@ -177,42 +188,43 @@ def stays_clear(
 
 
 @compiled_uncounted
-def keep_multipliers(buffers: StepBuffers, multipliers: Vector, rows: int) -> None:
-    """Keep multipliers as a guess for the next solve; of the contacts, from row `rows` on, the largest of each node.
+def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
+    """Keep what contacts push nodes and segments with, and their forces with those of friction.
 
-    Of these also their forces, with those of friction.
+    Args:
+        buffers: of the program that was solved, with its multipliers; written.
+        rows: of the program.
+        row: the first row of the contacts.
     """
-    for r in range(len(multipliers)):
-        buffers.multipliers[r] = multipliers[r]
-    contacts = buffers.contacts
-    buffers.push[:] = 0.0
-    buffers.contact_force[:] = 0.0
-    for r in range(rows, len(multipliers)):
-        if buffers.limit[r] == np.inf:
-            node, kind = contacts.node[r - rows], 0 if contacts.place[r - rows] == 0.0 else 1
-            buffers.push[kind, node] = max(buffers.push[kind, node], multipliers[r])
+    program, contacts, force = buffers.program, buffers.program.contacts, buffers.contact_force
+    force[:] = 0.0
+    program.push[:] = 0.0
+    for r in range(row, rows):
+        if program.limit[r] == np.inf:
+            node, kind = contacts.node[r - row], 0 if contacts.place[r - row] == 0.0 else 1
+            program.push[kind, node] = max(program.push[kind, node], program.multipliers[r])
         for k in range(SPAN):
-            for a in range(buffers.contact_force.shape[1]):
-                buffers.contact_force[buffers.first[r] + k, a] += buffers.gradient[r, k, a] * multipliers[r]
+            for a in range(force.shape[1]):
+                force[program.first[r] + k, a] += program.gradient[r, k, a] * program.multipliers[r]
 
 
 @compiled_uncounted
 def knows_friction(workspace: WorkspaceData) -> bool:
     """Return whether any shape or the wall has friction."""
     largest = 0.0
-    for row in range(len(workspace.frames)):
-        largest = max(largest, workspace.frames[row, FRICTION])
+    for k in range(len(workspace.friction)):
+        largest = max(largest, workspace.friction[k])
     return largest > 0.0
 
 
 @compiled_uncounted
 def friction_rows(
-    buffers: StepBuffers, row: int, count: int, workspace: WorkspaceData, interval: float
+    rod: RodBuffers, row: int, count: int, workspace: WorkspaceData, interval: float
 ) -> tuple[int, float]:
     """Write the rows of friction of what shapes pushed in the last solve and is in contact with them now.
 
     Args:
-        buffers: written, behind the contacts; these must be there already.
+        rod: its rows are written behind the contacts; these must be there already.
         row: the first row of the contacts.
         count: how many contacts there are.
         workspace: has the coefficients of friction.
@@ -222,15 +234,15 @@ def friction_rows(
         The number of rows, -1 if there is no room for them; and by how much the limits differ from those of the last
         solve, over the greatest of them.
     """
-    contacts, best, known = buffers.contacts, buffers.grip_contact, buffers.known
-    before, start = buffers.before, buffers.start
-    nodes = buffers.grip.shape[1]
+    buffers, grips, known, contacts = rod.program, rod.grips, rod.known, rod.program.contacts
+    best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
+    nodes = len(known)
     best[:] = -1
     for c in range(count):
         kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        slot = _slot_of(buffers, kind, i, contacts.obstacle[c])
+        slot = _slot_of(grips, kind, i, contacts.obstacle[c])
         if slot >= 0:
-            force, other = buffers.grip[kind, i, slot], best[kind, i, slot]
+            force, other = grips.force[kind, i, slot], best[kind, i, slot]
             push = contacts.normal[c, 0] * force[0] + contacts.normal[c, 1] * force[1]
             least = contacts.normal[other, 0] * force[0] + contacts.normal[other, 1] * force[1] if other >= 0 else 0.0
             if push > least:
@@ -239,12 +251,12 @@ def friction_rows(
     for kind in range(2):
         for i in range(nodes):
             for slot in range(GRIPS):
-                shape = buffers.grip_shape[kind, i, slot]
+                shape = grips.shape[kind, i, slot]
                 if shape == NO_SHAPE:
                     continue
-                grip, limit, c = buffers.grip[kind, i, slot], 0.0, best[kind, i, slot]
+                grip, limit, c = grips.force[kind, i, slot], 0.0, best[kind, i, slot]
                 if c >= 0:
-                    limit = workspace.frames[shape + 1, FRICTION] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
+                    limit = workspace.friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
                 change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
                 if limit == 0.0:
                     continue
@@ -260,7 +272,7 @@ def friction_rows(
                         moved += x * (start[k, 0] - before[k, 0]) + y * (start[k, 1] - before[k, 1])
                     else:
                         buffers.gradient[here, k - begin, 0], buffers.gradient[here, k - begin, 1] = x, y
-                buffers.first[here], buffers.value[here] = begin, 0.0
+                buffers.first[here] = begin
                 buffers.lower[here] = buffers.upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
                 buffers.compliance[here], buffers.limit[here] = FRICTION_COMPLIANCE, limit
                 buffers.multipliers[here] = max(min(grip[2], limit), -limit)
@@ -270,48 +282,49 @@ def friction_rows(
 
 
 @compiled_uncounted
-def keep_grips(buffers: StepBuffers, multipliers: Vector, row: int, workspace: WorkspaceData) -> None:
+def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, workspace: WorkspaceData) -> None:
     """Keep the normal forces of a solve, by place and shape, and what friction there was.
 
     A place that more than `GRIPS` shapes with friction push at once has friction with the first of them.
 
     Args:
-        buffers: the program's; written.
-        multipliers: of all its rows, shape (r,).
+        buffers: of the program that was solved, with its multipliers.
+        grips: written.
+        rows: of the program.
         row: the first row of the contacts.
         workspace: has the coefficients of friction.
     """
-    contacts = buffers.contacts
-    buffers.grip[:] = 0.0
-    for r in range(row, len(multipliers)):
+    contacts, multipliers = buffers.contacts, buffers.multipliers
+    grips.force[:] = 0.0
+    for r in range(row, rows):
         i, shape, place = contacts.node[r - row], contacts.obstacle[r - row], contacts.place[r - row]
         kind = 0 if place == 0.0 else 1
-        slot = _slot_of(buffers, kind, i, shape)
+        slot = _slot_of(grips, kind, i, shape)
         if buffers.limit[r] < np.inf:
-            buffers.grip[kind, i, slot, 2] = multipliers[r]
-            buffers.grip[kind, i, slot, 3] = buffers.limit[r]
-            buffers.grip[kind, i, slot, 4] = place
+            grips.force[kind, i, slot, 2] = multipliers[r]
+            grips.force[kind, i, slot, 3] = buffers.limit[r]
+            grips.force[kind, i, slot, 4] = place
             continue
-        if not (multipliers[r] > 0.0 and workspace.frames[shape + 1, FRICTION] > 0.0):
+        if not (multipliers[r] > 0.0 and workspace.friction[shape + 1] > 0.0):
             continue
         if slot < 0:
-            slot = _slot_of(buffers, kind, i, NO_SHAPE)
+            slot = _slot_of(grips, kind, i, NO_SHAPE)
         if slot >= 0:
-            buffers.grip_shape[kind, i, slot] = shape
+            grips.shape[kind, i, slot] = shape
             for a in range(2):
-                buffers.grip[kind, i, slot, a] += multipliers[r] * contacts.normal[r - row, a]
+                grips.force[kind, i, slot, a] += multipliers[r] * contacts.normal[r - row, a]
     for kind in range(2):
-        for i in range(buffers.grip.shape[1]):
+        for i in range(grips.force.shape[1]):
             for slot in range(GRIPS):
-                if buffers.grip[kind, i, slot, 0] == 0.0 and buffers.grip[kind, i, slot, 1] == 0.0:
-                    buffers.grip_shape[kind, i, slot] = NO_SHAPE
-                    buffers.grip[kind, i, slot] = 0.0
+                if grips.force[kind, i, slot, 0] == 0.0 and grips.force[kind, i, slot, 1] == 0.0:
+                    grips.shape[kind, i, slot] = NO_SHAPE
+                    grips.force[kind, i, slot] = 0.0
 
 
 @compiled_inline
-def _slot_of(buffers: StepBuffers, kind: int, node: int, shape: int) -> int:
+def _slot_of(grips: GripBuffers, kind: int, node: int, shape: int) -> int:
     """Return which of the shapes of a node (kind 0) or of a chord (kind 1) this is, -1 for none."""
     for slot in range(GRIPS):
-        if buffers.grip_shape[kind, node, slot] == shape:
+        if grips.shape[kind, node, slot] == shape:
             return slot
     return -1

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.margins import FrictionState
-from magnetosuture_thread.thread.program import SPAN, Table, Vector
-
-if TYPE_CHECKING:
-    from magnetosuture_thread.thread.rod_step import RodProperties
-    from magnetosuture_thread.thread.step_buffers import StepBuffers
+from magnetosuture_thread.thread.mechanics import RodProperties
+from magnetosuture_thread.thread.program import BEFORE, SPAN, START, VELOCITIES, RodBuffers, Table, Vector
 
 SLIDING_TOLERANCE = 1e-6  # of a friction's limit
 
@@ -74,8 +70,8 @@ class ThreadForces:
         return float(np.max(self.tension))
 
 
-@compiled_inner
-def keep_internal_forces(buffers: StepBuffers, velocities: Points, multipliers: Vector, interval: float) -> None:
+@compiled_uncounted
+def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> None:
     """Keep what the segments push each node with, and what medium and contacts do at the needle's tail.
 
     A solution balances at each free node what the segments, the medium and contacts do. What the segments do is P u + q
@@ -87,19 +83,19 @@ def keep_internal_forces(buffers: StepBuffers, velocities: Points, multipliers: 
     the step's end, in place of y, are not: short segments are so stiff in bending that tenths of a micrometre count.
 
     Args:
-        buffers: of the program that was solved; written.
-        velocities: the solution, shape (n + 1, d).
-        multipliers: of all rows, shape (r,).
+        buffers: of the program that was solved, with its solution; written.
+        rows: of the program.
         interval: dt [s].
     """
+    program, motion, velocities = buffers.program, buffers.motion, buffers.motion[VELOCITIES]
     nodes, dimension = velocities.shape
-    internal, load, couplings = buffers.internal, buffers.tail_load, buffers.couplings
-    contacts = buffers.contacts
+    internal, load, multipliers = buffers.internal, buffers.tail_load, program.multipliers
+    blocks, couplings, contacts = program.blocks, program.couplings, program.contacts
     for i in range(nodes):
         for a in range(dimension):
-            value = buffers.linear[i, a] - buffers.drag_linear[i, a]
+            value = program.linear[i, a] - buffers.drag_linear[i, a]
             for b in range(dimension):
-                value += (buffers.blocks[i, a, b] - buffers.drag[i, a, b]) * velocities[i, b]
+                value += (blocks[i, a, b] - buffers.drag[i, a, b]) * velocities[i, b]
             for apart in range(1, min(SPAN, nodes - 1 - i) + 1):
                 value += couplings[apart - 1, i] * velocities[i + apart, a]
             for apart in range(1, min(SPAN, i) + 1):
@@ -108,15 +104,15 @@ def keep_internal_forces(buffers: StepBuffers, velocities: Points, multipliers: 
     for row in range(nodes - 1):
         for k in range(SPAN):
             for a in range(dimension):
-                internal[buffers.first[row] + k, a] += multipliers[row] * buffers.gradient[row, k, a]
+                internal[program.first[row] + k, a] += multipliers[row] * program.gradient[row, k, a]
     for a in range(dimension):
         load[a] = buffers.contact_force[0, a] - buffers.drag_linear[0, a]
         for b in range(dimension):
-            load[a] -= buffers.drag[0, a, b] * (buffers.start[0, b] - buffers.before[0, b]) / interval
+            load[a] -= buffers.drag[0, a, b] * (motion[START, 0, b] - motion[BEFORE, 0, b]) / interval
     # A row of a contact has no gradient at a node that is known, whose share is with the needle.
-    for row in range(nodes - 1, len(multipliers)):
+    for row in range(nodes - 1, rows):
         c = row - nodes + 1
-        if buffers.known[0] and contacts.node[c] == 0 and buffers.limit[row] == np.inf:
+        if buffers.known[0] and contacts.node[c] == 0 and program.limit[row] == np.inf:
             for a in range(dimension):
                 load[a] += (1.0 - contacts.place[c]) * contacts.normal[c, a] * multipliers[row]
 
@@ -184,7 +180,7 @@ def friction_of(grip: Table) -> tuple[Vector, Vector]:
     """Return friction on each node, that of chords shared by their nodes, and the greatest ratio to its limit.
 
     Args:
-        grip: as in `StepBuffers`.
+        grip: as in `GripBuffers`.
     """
     rubbed, limit, place = np.abs(grip[..., 2]), grip[..., 3], grip[..., 4]
     ratio = np.divide(rubbed, limit, out=np.zeros_like(limit), where=limit > 0.0).max(axis=2)

@@ -10,6 +10,8 @@ the chord and each cell's own tangent, the reference set's worst thread is wrong
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -21,6 +23,40 @@ END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
 CURVATURE_CORRECTION = 1.0 / 6.0  # of the energy, by the slope of the curvature
 CLAMP_CORRECTION = 1.5  # the same in the first segment of a clamped thread
 SHARPEST = 1.0  # rad^2; a sharper turn at a node is a kink between straight segments, and no arc
+
+
+class RodProperties(NamedTuple):
+    """What stays the same from step to step, for compiled code; D is the segment length.
+
+    Attributes:
+        clamped: whether the thread leaves along the needle's axis.
+        unit: D [m].
+        radius: rho, of the thread [m].
+        bending_stiffness: EI [N m^2].
+        drag_across: zeta_perp [Pa s].
+        drag_along: zeta_par [Pa s].
+        mass_per_length: mu [kg/m].
+        bending_damping: tau [s].
+        gravity: shape (d,) [m/s^2].
+        rest_angles: theta_i, shape (n - 1,) [rad].
+        weights: of the nodes, see `end_corrected_weights`, shape (n + 1,).
+        bands: of the bending Hessian, see `bending_bands`, shape (4, n + 1).
+        flow: w of the medium, shape (d,) [m/s].
+    """
+
+    clamped: bool
+    unit: float
+    radius: float
+    bending_stiffness: float
+    drag_across: float
+    drag_along: float
+    mass_per_length: float
+    bending_damping: float
+    gravity: NDArray[np.float64]
+    rest_angles: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    bands: NDArray[np.float64]
+    flow: NDArray[np.float64]
 
 
 @compiled_uncounted

@@ -37,10 +37,10 @@ from magnetosuture_thread.thread.barriers import (
     move_inside,
     squared_barrier,
 )
-from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows, keep_multipliers
+from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.mechanics import rest_distances
-from magnetosuture_thread.thread.program import SPAN, Mask, Solver
+from magnetosuture_thread.thread.program import SPAN, Mask, Solver, program_of
 from magnetosuture_thread.thread.step import (
     AddedRows,
     Formulation,
@@ -48,7 +48,6 @@ from magnetosuture_thread.thread.step import (
     StepResult,
     ThreadState,
 )
-from magnetosuture_thread.thread.step_buffers import program_of
 
 
 class PaperOptions(NamedTuple):
@@ -103,7 +102,7 @@ class PaperFormulation(Formulation):
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
-        unit, options, buffers = self._thread.segment_length, self._options, self._buffers
+        unit, options, buffers = self._thread.segment_length, self._options, self._program
         options = options._replace(
             gain=min(options.gain, 1.0 / interval), stiffness_gain=min(options.stiffness_gain, 1.0 / interval)
         )
@@ -113,7 +112,7 @@ class PaperFormulation(Formulation):
         moved[nodes] = drive.arrays()[1] / unit
         start = moved if options.lead_ahead else before
         if state.interval == 0.0:
-            buffers.forget()
+            self.forget()
         self._write_objective(velocities, options)
         self._write_barriers(start, options)
         contacts, before_depth = self._write_obstacles(start, known, options.gain)
@@ -122,7 +121,9 @@ class PaperFormulation(Formulation):
             self.added.begin(state.positions, drive.time, interval)
             added = self.added.linearised(start, moved, known, interval)
         solution = self._solve(program_of(buffers, known, self._rows + contacts), velocities, added)
-        keep_multipliers(buffers, solution.multipliers[: self._rows + contacts], self._rows)
+        rows = self._rows + contacts
+        buffers.multipliers[:rows], buffers.push[:] = solution.multipliers[:rows], 0.0
+        np.maximum.at(buffers.push[0], buffers.contacts.node[:contacts], buffers.multipliers[self._rows : rows])
         end = moved + interval * solution.velocities
         move_inside(end, known, self._wall_radius)
         after = ThreadState(end * unit, (end - before) * (unit / interval), interval)
@@ -137,13 +138,13 @@ class PaperFormulation(Formulation):
 
     def _write_objective(self, velocities: Points, options: PaperOptions) -> None:
         """Write P = I and q = -kappa v."""
-        self._buffers.blocks[:], self._buffers.couplings[:] = np.eye(self.dimension), 0.0
-        self._buffers.linear[:] = -options.damping * velocities
+        self._program.blocks[:], self._program.couplings[:] = np.eye(self.dimension), 0.0
+        self._program.linear[:] = -options.damping * velocities
 
     def _write_barriers(self, start: Points, options: PaperOptions) -> None:
         """Write the rows of connectivity, enhanced connectivity and stiffness, with their slacks as compliances."""
         connectivity, stiffness = 1.0 / options.connectivity_weight, 1.0 / options.stiffness_weight
-        row, buffers = 0, self._buffers
+        row, buffers = 0, self._program
         for barrier, gain, compliance in (
             (Connectivity(1.0), options.gain, connectivity),
             (EnhancedConnectivity(1.0), options.gain, connectivity),
@@ -161,16 +162,15 @@ class PaperFormulation(Formulation):
 
     def _write_obstacles(self, start: Points, known: Mask, gain: float) -> tuple[int, float]:
         """Write the rows of obstacles and wall; return how many there are, and the greatest depth of a node [m]."""
-        unit, radius, buffers, first = self._thread.segment_length, self._radius, self._buffers, self._rows
+        unit, radius, buffers, first = self._thread.segment_length, self._radius, self._program, self._rows
         workspace = self.workspace.data
         contacts, depth = contact_rows(buffers, first, workspace, start, start, known, 1.0 / gain, unit, radius, False)
         if contacts < 0:
             self._refuse_contacts()
         for row in range(first, first + contacts):
-            clearance = buffers.value[row]
-            if clearance > 0.0 and buffers.contacts.obstacle[row - first] != WALL:
+            signed = buffers.contacts.distance[row - first] / unit
+            if signed > radius / unit and buffers.contacts.obstacle[row - first] != WALL:
                 # grad h' u >= -alpha h, divided by the slope: the row's own size does not matter, it is hard.
-                signed = clearance + radius / unit
                 buffers.lower[row] = -gain * squared_barrier(signed, radius / unit) / signed
         return contacts, depth
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ from magnetosuture_thread.thread.formulations import (
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene, direction_between
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
-from magnetosuture_thread.thread.program import SOLVED, Residuals
+from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import make_solver
 
@@ -266,7 +266,7 @@ class ThreadPredictor:
         self.added.first_time = min(self.added.first_time, pose.stamp)
         self.state = ThreadState.at_rest(np.array(vertices, dtype=np.float64, order="C"))
         self.pose = pose
-        return self._prediction(pose, 0.0, 0, None, None, Residuals(0.0, 0.0, 0.0), True)
+        return self._prediction(pose, 0.0, (), {})
 
     def follow_on(self, other: ThreadPredictor) -> None:
         """Continue from the state of another predictor, if it has started."""
@@ -306,22 +306,17 @@ class ThreadPredictor:
         way = max(map(math.dist, begin.tolist(), end.tolist()))
         wanted = max(interval / self.options.max_step, way / (MAX_STEP_LENGTH * self.thread.segment_length), 1.0)
         substeps = min(self.options.max_substeps, math.ceil(wanted - 1e-9))
-        residuals, done, worst, converged = Residuals(0.0, 0.0, 0.0), None, None, True
 
         def drive(part: float) -> PrescribedMotion:
             heading = direction_between(last.heading, pose.heading, part)
             return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
 
-        steps, taken = ((index / substeps, interval / substeps) for index in range(1, substeps + 1)), 0
-        for part, duration in steps:
-            for done in self._follow(state, drive, part, duration, interval):
-                state, residuals = done.state, residuals.or_worse(done.residuals)
-                converged, taken = converged and done.converged, taken + 1
-                worst = done if worst is None or worst.status == SOLVED else worst
-        substeps = taken
+        results = list[StepResult]()
+        for index in range(1, substeps + 1):
+            results += self._follow(state, drive, index / substeps, interval / substeps, interval)
+            state = results[-1].state
         self.pose, self.state = pose, state
-        others = tuple((node, (ends[node] - place) / interval) for node, place in zip(nodes, begin, strict=True))
-        return self._prediction(pose, interval, substeps, done, worst, residuals, converged, others)
+        return self._prediction(pose, interval, results, dict(zip(nodes, (end - begin) / interval, strict=True)))
 
     def _follow(
         self,
@@ -331,11 +326,11 @@ class ThreadPredictor:
         duration: float,
         interval: float,
         halvings: int = 0,
-    ) -> Iterator[StepResult]:
-        """Yield the sub-step that ends at a part of the interval, or more of them where the thread is in its own way.
+    ) -> list[StepResult]:
+        """Return the sub-step that ends at a part of the interval, or more of them where the thread is in its own way.
 
         Raises:
-            SolverError: it would do so in the shortest of them, or see `step`.
+            SolverError: it would be so in the shortest of them, or see `step`.
         """
         done, crowded = None, self.formulation.touches_itself and halvings < MAX_CROWDED_HALVINGS
         try:
@@ -344,37 +339,34 @@ class ThreadPredictor:
             if not crowded:
                 raise
         if done is not None and not done.passed and (done.converged or not crowded):
-            yield done
-            return
+            return [done]
         if done is not None and done.passed and halvings == MAX_HALVINGS:
             self.formulation.forget()
             raise SolverError(done.solver, "the thread would pass through itself", math.inf, 0.0)
-        parts, begin = list[StepResult](), state
         try:
-            for end in (part - 0.5 * duration / interval, part):
-                parts += self._follow(begin, drive, end, 0.5 * duration, interval, halvings + 1)
-                begin = parts[-1].state
+            middle = part - 0.5 * duration / interval
+            first = self._follow(state, drive, middle, 0.5 * duration, interval, halvings + 1)
+            return first + self._follow(first[-1].state, drive, part, 0.5 * duration, interval, halvings + 1)
         except SolverError:
             if done is None or done.passed:
                 raise
-            parts = [done]  # no better than it was
-        yield from parts
+            return [done]  # no better than it was
 
     def _prediction(
-        self,
-        pose: NeedlePose,
-        interval: float,
-        substeps: int,
-        last: StepResult | None,
-        worst: StepResult | None,
-        residuals: Residuals,
-        converged: bool,
-        prescribed: Sequence[tuple[int, Points]] = (),
+        self, pose: NeedlePose, interval: float, results: Sequence[StepResult], velocities: Mapping[int, Points]
     ) -> Prediction:
+        """Return the prediction of the present state.
+
+        Args:
+            pose: of the needle.
+            interval: since the last one [s].
+            results: of the steps that led here; none at the start.
+            velocities: of the nodes of prescribed motion [m/s].
+        """
         state, formulation = self.state, self.formulation
         assert state is not None
         positions = state.positions
-        warm_start = formulation.warm_start() if prescribed and pose.motion is not None else None
+        warm_start = formulation.warm_start() if results and pose.motion is not None else None
         self.added.set_time(pose.stamp)
         added = self.added.rows(positions)  # at once, as barriers may move on before they are asked again
 
@@ -383,11 +375,13 @@ class ThreadPredictor:
             return Margins.of([*rows, *added], self.contact_tolerance, self.scene_version)
 
         def compute_forces() -> ThreadForces | None:
-            found = None if last is None else formulation.forces(last, pose.heading)
+            found = formulation.forces(results[-1], pose.heading) if results else None
             if found is None or warm_start is None:
                 return found
-            return self._forces_in_motion(state, pose, prescribed, warm_start) or found
+            return self._forces_in_motion(state, pose, velocities, warm_start) or found
 
+        # The first that was not solved at once, if there is one, else the last.
+        told = next((done for done in results if done.status != SOLVED), results[-1] if results else None)
         along = positions[1:] - positions[:-1]
         lengths = np.sqrt(np.einsum("ij,ij->i", along, along))
         return Prediction(
@@ -397,17 +391,17 @@ class ThreadPredictor:
             positions=positions,
             strain=lengths / formulation.rest_lengths(positions, pose.heading) - 1.0,
             interval=interval,
-            substeps=substeps,
-            solver=worst.solver if worst else "none",
-            status=worst.status if worst else STARTED,
-            residual=residuals.largest,
-            converged=converged,
+            substeps=len(results),
+            solver=told.solver if told else "none",
+            status=told.status if told else STARTED,
+            residual=max((done.residuals.largest for done in results), default=0.0),
+            converged=all(done.converged for done in results),
             compute_margins=compute_margins,
             compute_forces=compute_forces,
         )
 
     def _forces_in_motion(
-        self, state: ThreadState, pose: NeedlePose, prescribed: Sequence[tuple[int, Points]], warm_start: WarmStart
+        self, state: ThreadState, pose: NeedlePose, prescribed: Mapping[int, Points], warm_start: WarmStart
     ) -> ThreadForces | None:
         """Return the forces at a pose while the needle moves as `pose.motion` says; None where a step finds none.
 
@@ -418,9 +412,9 @@ class ThreadPredictor:
         assert motion is not None
         angle = math.atan2(pose.heading[1], pose.heading[0]) + motion.turning * MOTION_TIME
         heading = np.array([math.cos(angle), math.sin(angle)])
-        nodes = tuple(node for node, _ in prescribed)
-        velocities = np.array([motion.velocity if node == 0 else velocity for node, velocity in prescribed])
-        moved = PrescribedMotion(nodes, state.positions[list(nodes)] + MOTION_TIME * velocities, heading, pose.stamp)
+        velocities = np.array([motion.velocity if node == 0 else prescribed[node] for node in prescribed])
+        ends = state.positions[list(prescribed)] + MOTION_TIME * velocities
+        moved = PrescribedMotion(tuple(prescribed), ends, heading, pose.stamp)
         # After a much shorter step nothing is extrapolated from the last velocities.
         begin = ThreadState(state.positions, state.velocities, 0.1 * MOTION_TIME)
         kept = formulation.warm_start()

@@ -14,12 +14,12 @@ with d coordinates a node, all is one band of half-width 3 d.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -28,6 +28,12 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 SPAN = 3  # nodes that a row of the band touches, and how far apart nodes may be coupled
+CONTACTS_PER_NODE = 64  # for which there is room; a smooth outline has dozens of corners beside one segment
+GRIPS = 3  # shapes at most that a node or a chord has friction with at once
+NO_SHAPE = -2  # in place of a shape
+BEFORE, START, LAST, VELOCITIES, ABOUT, LAST_ABOUT = range(6)
+"""Of a step's motion: where the nodes are; the same with the prescribed nodes moved; velocities over the last step; of
+this step, better with each solve; where they lead; where the program was written about."""
 SOLVED = "solved"  # every solver's word for a solution at the first attempt
 
 
@@ -69,6 +75,185 @@ class ChainProgram(NamedTuple):
 def no_far_rows(dimension: int) -> tuple[Indices, Table]:
     """Return `far_nodes` and `far_gradient` of a program that has no far rows."""
     return np.zeros((0, 1), np.int64), np.zeros((0, 1, dimension))
+
+
+class ContactBuffers(NamedTuple):
+    """Where contacts are written, as by `find_contacts`.
+
+    Attributes:
+        node: shape (c,).
+        obstacle: shape (c,).
+        distance: shape (c,) [m].
+        normal: shape (c, d).
+        nearest: shape (c,).
+        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
+    """
+
+    node: Indices
+    obstacle: Indices
+    distance: Vector
+    normal: Points
+    nearest: Mask
+    place: Vector
+
+    @classmethod
+    def of(cls, nodes: int, dimension: int, shapes: int = 0) -> ContactBuffers:
+        """Return room for the contacts of a thread; more for one whose nodes may be near many shapes at once."""
+        count = (CONTACTS_PER_NODE + 2 * shapes) * nodes
+        (node, obstacle), (distance, place) = np.zeros((2, count), np.int64), np.zeros((2, count))
+        return cls(node, obstacle, distance, np.zeros((count, dimension)), np.zeros(count, np.bool_), place)
+
+
+class StepBuffers(NamedTuple):
+    """Memory for the programs of a thread with n + 1 nodes, kept from step to step so that no step pays for it.
+
+    Lengths are in units of the segment length.
+
+    Attributes:
+        blocks: see `ChainProgram`, as are those to `far_gradient`; rows of the formulation come first, then those of
+            contacts and friction.
+        multipliers: of the last solve: a guess for the next one, and the segments' tension, shape (r,).
+        chords: length of each segment, shape (n,).
+        work: shape (2, n + 1, d).
+        contacts: those with rows, then those of friction.
+        clearance: distance of each node from the nearest of all that is solid, at most the reach, shape (n + 1,) [m].
+        push: what contacts last pushed each node and each segment with, shape (2, n + 1).
+    """
+
+    blocks: Table
+    couplings: Table
+    linear: Points
+    first: Indices
+    gradient: Table
+    lower: Vector
+    upper: Vector
+    compliance: Vector
+    limit: Vector
+    far_nodes: Indices
+    far_gradient: Table
+    multipliers: Vector
+    chords: Vector
+    work: Table
+    contacts: ContactBuffers
+    clearance: Vector
+    push: Table
+
+    @classmethod
+    def of(cls, nodes: int, dimension: int, rows: int) -> StepBuffers:
+        """Return buffers for a number of rows besides those of contacts and friction."""
+        total = rows + CONTACTS_PER_NODE * nodes
+        lower, upper, compliance, multipliers = np.zeros((4, total))
+        return cls(
+            np.zeros((nodes, dimension, dimension)),
+            np.zeros((SPAN, nodes)),
+            np.zeros((nodes, dimension)),
+            np.zeros(total, np.int64),
+            np.zeros((total, SPAN, dimension)),
+            lower,
+            upper,
+            compliance,
+            np.full(total, np.inf),
+            *no_far_rows(dimension),
+            multipliers,
+            chords=np.zeros(nodes - 1),
+            work=np.zeros((2, nodes, dimension)),
+            contacts=ContactBuffers.of(nodes, dimension),
+            clearance=np.zeros(nodes),
+            push=np.zeros((2, nodes)),
+        )
+
+
+class GripBuffers(NamedTuple):
+    """Memory of friction: the shapes with friction that last pushed each node, and each chord between its nodes.
+
+    Attributes:
+        shape: of each, `NO_SHAPE` for none, shape (2, n + 1, GRIPS).
+        force: the force (2), the multiplier of friction, its limit, and the place on the chord, shape
+            (2, n + 1, GRIPS, 5).
+        contact: the contact that is now in its place, -1 for none, shape (2, n + 1, GRIPS).
+    """
+
+    shape: Indices
+    force: Table
+    contact: Indices
+
+
+class RodBuffers(NamedTuple):
+    """Memory for the steps of a rod; lengths are in units of the segment length, and forces in those of the program.
+
+    Attributes:
+        program: its programs.
+        grips: its friction.
+        motion: positions and velocities of the step, see `BEFORE` and what follows it, shape (6, n + 1, d).
+        known: the prescribed nodes, shape (n + 1,).
+        drag: the medium's part of `blocks`, shape (n + 1, d, d).
+        drag_linear: the medium's part of `linear`, shape (n + 1, d).
+        internal: what the segments push each node with, shape (n + 1, d).
+        contact_force: what contacts push each node with, with friction, shape (n + 1, d).
+        tail_load: what medium and contacts do at the needle's tail, shape (d,).
+    """
+
+    program: StepBuffers
+    grips: GripBuffers
+    motion: Table
+    known: Mask
+    drag: Table
+    drag_linear: Points
+    internal: Points
+    contact_force: Points
+    tail_load: Vector
+
+    @classmethod
+    def of(cls, program: StepBuffers, dimension: int) -> RodBuffers:
+        """Return buffers for a rod with these programs."""
+        nodes = len(program.linear)
+        places = (2, nodes, GRIPS)
+        drag_linear, internal, contact_force = np.zeros((3, nodes, dimension))
+        return cls(
+            program,
+            GripBuffers(np.full(places, NO_SHAPE), np.zeros((*places, 5)), np.full(places, -1)),
+            np.zeros((6, nodes, dimension)),
+            np.zeros(nodes, np.bool_),
+            np.zeros((nodes, dimension, dimension)),
+            drag_linear,
+            internal,
+            contact_force,
+            np.zeros(dimension),
+        )
+
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """What the next step takes over from the last besides the state: tension, pushes and friction."""
+        program = self.program
+        return program.multipliers[: len(program.linear) - 1], program.push, self.grips.shape, self.grips.force
+
+    def restore(self, memory: tuple[NDArray[Any], ...]) -> None:
+        """Restore what another rod's or an earlier `memory` had."""
+        for array, kept in zip(self.memory, memory, strict=True):
+            array[:] = kept
+
+
+def _program_of(buffers: StepBuffers, known: Mask, rows: int) -> ChainProgram:
+    """Return the program of the first rows."""
+    return ChainProgram(
+        buffers.blocks,
+        buffers.couplings,
+        buffers.linear,
+        known,
+        buffers.first[:rows],
+        buffers.gradient[:rows],
+        buffers.lower[:rows],
+        buffers.upper[:rows],
+        buffers.compliance[:rows],
+        buffers.limit[:rows],
+        buffers.far_nodes,
+        buffers.far_gradient,
+    )
+
+
+program_of = compiled(_program_of)
+program_view = compiled_inline(_program_of)
+"""The same for kernels that do not count references to arrays."""
 
 
 class Residuals(NamedTuple):
@@ -141,15 +326,6 @@ def residuals_of(program: ChainProgram, velocities: Points, multipliers: Vector)
     return Residuals(*compiled_residuals(program, velocities, multipliers))
 
 
-@compiled
-def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: Vector) -> tuple[float, float, float]:
-    """Return the same, for compiled code: primal, dual, complementarity.
-
-    Shares nothing with a solver, so P u is written out here once more.
-    """
-    return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
-
-
 @compiled_inline
 def _pull(program: ChainProgram, r: int, velocities: Points, multiplier: float, pulled: Points) -> float:
     """Add a_r lambda_r to what rows pull with; return a_r' u."""
@@ -163,11 +339,13 @@ def _pull(program: ChainProgram, r: int, velocities: Points, multiplier: float, 
     return image
 
 
-@compiled_inner
-def _residuals(
-    program: ChainProgram, velocities: Points, multipliers: Vector, force: Points, pulled: Points
-) -> tuple[float, float, float]:
-    """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
+@compiled
+def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: Vector) -> tuple[float, float, float]:
+    """Return the same, for compiled code: primal, dual, complementarity.
+
+    Shares nothing with a solver, so P u is written out here once more.
+    """
+    force, pulled = np.empty(velocities.shape), np.zeros(velocities.shape)
     nodes, dimension = velocities.shape
     largest = 1.0
     for i in range(nodes):

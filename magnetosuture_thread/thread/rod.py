@@ -30,28 +30,47 @@ a compliance of 1e-7 instead of slacks, and where the barriers are linearised is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import banded, mechanics
-from magnetosuture_thread.thread.barriers import Compression, Connectivity
-from magnetosuture_thread.thread.contact_rows import knows_friction
-from magnetosuture_thread.thread.forces import ThreadForces, friction_of, write_forces
+from magnetosuture_thread.thread.barriers import Compression, Connectivity, move_inside
+from magnetosuture_thread.thread.contact_rows import (
+    DEPTH_TOLERANCE,
+    contact_rows,
+    friction_rows,
+    keep_grips,
+    keep_pushes,
+    knows_friction,
+    stays_clear,
+)
+from magnetosuture_thread.thread.forces import ThreadForces, friction_of, keep_internal_forces, write_forces
 from magnetosuture_thread.thread.material import Attachment, Thread
-from magnetosuture_thread.thread.program import SOLVED, Mask, Residuals, Solver, Vector
-from magnetosuture_thread.thread.rod_step import (
-    ENDED,
-    MAX_SOLVES,
-    NO_ROOM,
-    RodProperties,
-    StepInput,
-    StepModel,
-    accept_step,
-    solve_step,
+from magnetosuture_thread.thread.mechanics import RodProperties
+from magnetosuture_thread.thread.program import (
+    ABOUT,
+    BEFORE,
+    LAST,
+    LAST_ABOUT,
+    NO_SHAPE,
+    SOLVED,
+    START,
+    VELOCITIES,
+    Indices,
+    Mask,
+    Residuals,
+    RodBuffers,
+    Solver,
+    StepBuffers,
+    Vector,
+    program_of,
+    program_view,
 )
 from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import BandedSolver, FallbackSolver
@@ -61,8 +80,349 @@ from magnetosuture_thread.thread.step import (
     PrescribedMotion,
     StepResult,
     ThreadState,
+    WarmStart,
 )
-from magnetosuture_thread.thread.step_buffers import program_of
+
+STRAIN_TOLERANCE = 1e-3  # of the segments; beyond it the barriers are linearised once more
+COMPLIANCE = 1e-7  # of a segment
+FRICTION_TOLERANCE = 0.003  # of the limits of friction; beyond it they are taken from the solve and it is repeated
+MAX_FRICTION_SOLVES = 5  # of a step; then the limits are those of the solve before
+MAX_SOLVES = 8  # of a step
+MAX_STEP_RATIO = 2.0  # of a step to the last one, for the second-order difference to stay stable
+ENDED, NO_ROOM, UNSOLVED = range(3)  # how far `solve_step` got
+
+
+class StepModel(NamedTuple):
+    """The thread and what is around it, for compiled code.
+
+    Attributes:
+        axes: 0 to d - 1.
+        rod: the thread.
+        workspace: obstacles and wall, with the reach of the program's rows [m].
+        tolerance: the largest residual with which a solution is accepted.
+        max_solves: of a step.
+        structured: whether the structured solver is to solve; if not, every solve is left to the caller.
+    """
+
+    axes: banded.Axes
+    rod: RodProperties
+    workspace: WorkspaceData
+    tolerance: float
+    max_solves: int = MAX_SOLVES
+    structured: bool = True
+
+
+class StepInput(NamedTuple):
+    """What a step starts from and where it leads, for compiled code.
+
+    Attributes:
+        positions: of all nodes, shape (n + 1, d) [m].
+        velocities: over the last step [m/s].
+        nodes: of prescribed motion, shape (k,).
+        ends: where these are at the end of the step, shape (k, d) [m].
+        heading: unit vector along the needle at the end of the step, shape (d,).
+        interval: dt [s].
+        last_interval: of the last step, 0 if there was none [s].
+    """
+
+    positions: Points
+    velocities: Points
+    nodes: Indices
+    ends: Points
+    heading: Points
+    interval: float
+    last_interval: float
+
+
+@compiled_inline
+def copy_points(given: Points, written: Points) -> None:
+    """Copy positions or velocities; an assignment of slices would make an array."""
+    for i in range(len(given)):
+        for a in range(given.shape[1]):
+            written[i, a] = given[i, a]
+
+
+@compiled_uncounted
+def assemble_step(
+    solves: int, model: StepModel, buffers: RodBuffers, given: StepInput, elsewhere: float, last_contacts: int
+) -> tuple[int, float, bool]:
+    """Write the program about a predicted end point; where that came from a solve and is exact, do not.
+
+    Where the program in the buffers was written about, and how many contacts it has, -1 if that is not known, make it
+    cheap to find that out.
+
+    Returns the number of rows of contacts and friction, -1 if there is no room for them; how far off the barriers the
+    point is: the strain, the depth, or what barriers from elsewhere are, over what is allowed, 1 or less if it is
+    exact; and whether the limits of friction are still to be found.
+    """
+    program, motion, known, interval = buffers.program, buffers.motion, buffers.known, given.interval
+    about, start = motion[ABOUT], motion[START]
+    rod, workspace, segments = model.rod, model.workspace, len(about) - 1
+    mechanics.chord_lengths(about, given.heading, rod.clamped, program.chords)
+    strain = segment_rows(program, about, start, known, interval)
+    rough, off = knows_friction(workspace), max(strain / STRAIN_TOLERANCE, elsewhere)
+    cheap = solves > 0 and last_contacts >= 0 and not rough and off <= 1.0
+    if cheap and stays_clear(program, workspace, motion[LAST_ABOUT], about, known, rod.unit, rod.radius):
+        return last_contacts, off, False
+    contacts, depth = contact_rows(
+        program, segments, workspace, about, start, known, interval, rod.unit, rod.radius, True
+    )
+    rubs = False
+    if contacts > 0 and rough:
+        rubbing, change = friction_rows(buffers, segments, contacts, workspace, interval)
+        contacts = contacts + rubbing if rubbing >= 0 else -1
+        rubs = change > FRICTION_TOLERANCE and 0 < solves < MAX_FRICTION_SOLVES
+    off = max(off, depth / DEPTH_TOLERANCE)
+    if contacts >= 0 and (solves == 0 or off > 1.0 or rubs):
+        _objective(rod, buffers, given)
+    return contacts, off if solves > 0 else np.inf, rubs
+
+
+@compiled_uncounted
+def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> None:
+    """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
+
+        P = a Z + r (dt + tau) K,    q = r (grad E(x) + tau K shift) - Z (v + flow)
+
+    and what `tension_stiffness` and `_taut` add. `shift` is the velocity of the prescribed nodes, which have
+    moved already. In air a = 1, and of Z v only the inertia's part is left; the flow acts on the drag's part alone.
+    """
+    program, motion, heading, interval = buffers.program, buffers.motion, given.heading, given.interval
+    before, start, last, about = motion[BEFORE], motion[START], motion[LAST], motion[ABOUT]
+    nodes, dimension = start.shape
+    blocks, couplings, linear = program.blocks, program.couplings, program.linear
+    inertia = rod.mass_per_length / interval
+    scale = inertia + rod.drag_across
+    rate = rod.bending_stiffness / (scale * rod.unit**4)
+    inertia = inertia / scale
+    mechanics.metric(about, rod.weights, inertia, rod.drag_across / scale, rod.drag_along / scale, blocks)
+    mechanics.bending_gradient(start, heading, rod.clamped, rod.rest_angles, program.work, linear)
+    ratio = interval / given.last_interval if given.last_interval > 0.0 else 0.0
+    if inertia > 0.0 or ratio > MAX_STEP_RATIO:
+        ratio = 0.0
+    leading, trailing = (1.0 + 2.0 * ratio) / (1.0 + ratio), ratio / (1.0 + ratio)
+    stiffness = rate * (interval + rod.bending_damping)
+    for i in range(nodes):
+        for a in range(dimension):
+            bending = value = rate * linear[i, a]
+            for b in range(dimension):
+                value -= trailing * blocks[i, a, b] * last[i, b]
+            value -= inertia * rod.weights[i] * (last[i, a] + interval / rod.unit * rod.gravity[a])
+            for b in range(dimension):
+                value -= blocks[i, a, b] * rod.flow[b] / rod.unit
+            linear[i, a] = value + inertia * rod.weights[i] * rod.flow[a] / rod.unit
+            buffers.drag_linear[i, a] = linear[i, a] - bending
+        for a in range(dimension):
+            for b in range(dimension):
+                blocks[i, a, b] *= leading
+                buffers.drag[i, a, b] = blocks[i, a, b]
+            blocks[i, a, a] += stiffness * rod.bands[0, i]
+        for apart in range(1, 4):
+            couplings[apart - 1, i] = stiffness * rod.bands[apart, i]
+    if rod.bending_damping > 0.0:
+        weight = rate * rod.bending_damping / interval
+        for i in range(nodes):
+            for apart in range(-3, 4):
+                if 0 <= i + apart < nodes:
+                    band = weight * rod.bands[abs(apart), min(i, i + apart)]
+                    for a in range(dimension):
+                        linear[i, a] += band * (start[i + apart, a] - before[i + apart, a])
+    mechanics.tension_stiffness(
+        start, heading, rod.clamped, program.multipliers, -0.5 * rate, interval, (blocks, couplings, linear)
+    )
+    _taut(program, about, start, interval)
+
+
+@compiled_uncounted
+def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
+    """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
+
+        1/2 dt sum_i T_i |w_i - w_{i-1}|^2,    w = u - (y - x) / dt
+
+    With it each linearisation is a Newton step of Lagrange's function; without it the solves of a thread
+    that is pulled hard, T dt > Z, swing from side to side and never end.
+    """
+    nodes, dimension = about.shape
+    for i in range(nodes - 1):
+        tension = max(buffers.multipliers[i], 0.0)
+        weight = interval * tension
+        for a in range(dimension):
+            moved = about[i + 1, a] - start[i + 1, a] - about[i, a] + start[i, a]
+            buffers.linear[i, a] += tension * moved
+            buffers.linear[i + 1, a] -= tension * moved
+            buffers.blocks[i, a, a] += weight
+            buffers.blocks[i + 1, a, a] += weight
+        buffers.couplings[0, i] -= weight
+
+
+@compiled_uncounted
+def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask, interval: float) -> float:
+    """Write the rows of connectivity and compression together; return the largest |h(y)|.
+
+        grad h(y)' u = (-h(y) - grad h(y)' (x - y)) / dt,    h_i = (D_i^2 - |y_{i+1} - y_i|^2) / 2
+
+    with the chord D_i of each segment.
+    """
+    nodes, dimension = about.shape
+    strain = 0.0
+    for i in range(nodes - 1):
+        begin, square, moved = min(i, nodes - 3), 0.0, 0.0
+        shift = i - begin
+        for a in range(dimension):
+            buffers.gradient[i, 0, a] = buffers.gradient[i, 1, a] = buffers.gradient[i, 2, a] = 0.0
+            along = about[i + 1, a] - about[i, a]
+            buffers.gradient[i, shift, a], buffers.gradient[i, shift + 1, a] = along, -along
+            square += along * along
+            moved += along * (start[i, a] - about[i, a] - start[i + 1, a] + about[i + 1, a])
+        value = 0.5 * (buffers.chords[i] ** 2 - square)
+        buffers.first[i] = begin
+        buffers.lower[i] = buffers.upper[i] = (-value - moved) / interval
+        buffers.compliance[i] = COMPLIANCE
+        if known[i] and known[i + 1]:
+            # Nothing in the program can change its length, and a tension that tries would bend its neighbours.
+            buffers.lower[i], buffers.upper[i], buffers.multipliers[i] = -np.inf, np.inf, 0.0
+        else:
+            strain = max(strain, abs(value))
+    return strain
+
+
+@compiled_uncounted
+def init_step(buffers: RodBuffers, given: StepInput, unit: float) -> None:
+    """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
+
+    Not after a step that was much shorter, where the velocities may be those of a sample's noise, and not
+    farther than a segment: then the guess is where the thread is.
+
+    Args:
+        buffers: written.
+        given: the step.
+        unit: D [m].
+    """
+    motion, known, interval = buffers.motion, buffers.known, given.interval
+    nodes, dimension = given.positions.shape
+    known[:] = False
+    for i in range(nodes):
+        for a in range(dimension):
+            motion[BEFORE, i, a] = motion[START, i, a] = given.positions[i, a] / unit
+            motion[LAST, i, a] = motion[VELOCITIES, i, a] = given.velocities[i, a] / unit
+    for k in range(len(given.nodes)):
+        known[given.nodes[k]] = True
+        for a in range(dimension):
+            motion[START, given.nodes[k], a] = given.ends[k, a] / unit
+    copy_points(motion[START], motion[ABOUT])
+    if not (given.last_interval > 0.0 and interval <= MAX_STEP_RATIO * given.last_interval):
+        return
+    for i in range(nodes):
+        for a in range(dimension):
+            if not known[i]:
+                motion[ABOUT, i, a] = motion[START, i, a] + interval * motion[LAST, i, a]
+                if not abs(motion[ABOUT, i, a] - motion[START, i, a]) <= 1.0:
+                    copy_points(motion[START], motion[ABOUT])
+                    return
+
+
+class StepProgress(NamedTuple):
+    """How far a step has got.
+
+    Attributes:
+        code: `ENDED`; `NO_ROOM` for all contacts in the buffers; or `UNSOLVED`, and then the program is there for
+            another solver.
+        contacts: number of rows of contacts and friction.
+        solves: that the step has had.
+        off: how far off the barriers are over what is allowed, 1 or less if they hold; see `assemble_step`.
+        status: the first of the solves that is not 0, see `banded.STATUS`.
+        residuals: the largest of each kind.
+    """
+
+    code: int
+    contacts: int
+    solves: int
+    off: float
+    status: int
+    residuals: tuple[float, float, float]
+
+
+@compiled_uncounted
+def solve_step(
+    model: StepModel,
+    buffers: RodBuffers,
+    solver_buffers: banded.SolverBuffers,
+    given: StepInput,
+    solves: int,
+    elsewhere: float,
+) -> StepProgress:
+    """Linearise and solve until the barriers are exact, or the solves are too many, or as far as it gets.
+
+    A solve whose residuals do not pass is repeated from a cold start. One that does not halve how far off the barriers
+    are is followed by one that is linearised halfway back.
+
+    Args:
+        model: the thread and what is around it.
+        buffers: the step under way; it has the program in the end, and its multipliers.
+        solver_buffers: of the structured solver.
+        given: the step.
+        solves: how many this step has had; with none it begins.
+        elsewhere: how far off the rows are that this code does not know, see `assemble_step`.
+    """
+    workspace, about, last_about = model.workspace, buffers.motion[ABOUT], buffers.motion[LAST_ABOUT]
+    if solves == 0:
+        init_step(buffers, given, model.rod.unit)
+    copy_points(about, last_about)
+    primal, dual, complementarity, segments = 0.0, 0.0, 0.0, len(about) - 1
+    # Numbers of a type of their own: a function is compiled again for each number that is written out.
+    first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
+    last_off, contacts, code, u = np.inf, unknown, UNSOLVED, buffers.motion[VELOCITIES]
+    while True:
+        contacts, off, rubs = assemble_step(solves, model, buffers, given, elsewhere, contacts)
+        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
+            # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
+            for i in range(len(about)):
+                for a in range(about.shape[1]):
+                    about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+            contacts, _, _ = assemble_step(first, model, buffers, given, elsewhere, unknown)
+        last_off = off
+        copy_points(about, last_about)
+        if contacts < 0:
+            code = NO_ROOM
+            break
+        if (off <= 1.0 and not rubs) or solves == model.max_solves:
+            if off > 1.0:  # whatever else holds, nothing passes the wall
+                move_inside(about, buffers.known, (workspace.wall_radius - model.rod.radius) / model.rod.unit)
+            code = ENDED
+            break
+        if not model.structured:
+            break
+        rows = segments + contacts
+        program, multipliers = program_view(buffers.program, buffers.known, rows), buffers.program.multipliers[:rows]
+        word, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+        if not max(found) <= model.tolerance:
+            u[:] = 0.0
+            multipliers[:] = 0.0
+            _, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+            if not max(found) <= model.tolerance:
+                u[:] = 0.0
+                multipliers[:] = 0.0
+                break
+            word = banded.RESTARTED
+        accept_step(buffers, workspace, rows, given.interval)
+        primal, dual, complementarity = max(primal, found[0]), max(dual, found[1]), max(complementarity, found[2])
+        status, solves = status if status != 0 else word, solves + 1
+    return StepProgress(code, contacts, solves, off, status, (primal, dual, complementarity))
+
+
+@compiled_uncounted
+def accept_step(buffers: RodBuffers, workspace: WorkspaceData, rows: int, interval: float) -> None:
+    """Accept the velocities and multipliers in the buffers as the solution of the first rows: keep what follows."""
+    start, velocities, about = buffers.motion[START], buffers.motion[VELOCITIES], buffers.motion[ABOUT]
+    segments = len(about) - 1
+    keep_pushes(buffers, rows, segments)
+    if knows_friction(workspace):
+        keep_grips(buffers.program, buffers.grips, rows, segments, workspace)
+    keep_internal_forces(buffers, rows, interval)
+    for i in range(len(about)):
+        for a in range(about.shape[1]):
+            # Known nodes have moved, and have no velocity.
+            about[i, a] = start[i, a] + interval * velocities[i, a]
 
 
 class RodFormulation(Formulation):
@@ -88,6 +448,7 @@ class RodFormulation(Formulation):
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
         medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
+        self._buffers = RodBuffers.of(self._program, self.dimension)
         self.rod = RodProperties(
             clamped,
             thread.segment_length,
@@ -106,7 +467,7 @@ class RodFormulation(Formulation):
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
-        self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._buffers.first))
+        self._solver_buffers = banded_solver.buffers(thread.segments + 1, self.dimension, len(self._program.first))
         selves = [barrier for barrier in barriers if isinstance(barrier, SelfContact)]
         self._self_contact = selves[0] if selves else None
         self.touches_itself = bool(selves)
@@ -116,10 +477,18 @@ class RodFormulation(Formulation):
     @property
     def nodes_in_contact(self) -> Mask:
         """Which nodes shapes or wall pushed in the last step, at a node or on a chord beside it, shape (n + 1,)."""
-        at_nodes, on_chords = self._buffers.push > 0.0
+        at_nodes, on_chords = self._program.push > 0.0
         at_nodes |= on_chords
         at_nodes[1:] |= on_chords[:-1]
         return np.asarray(at_nodes)
+
+    def _memory(self) -> WarmStart:
+        return self._buffers.memory
+
+    def forget(self) -> None:
+        """Forget the last solve; see `Formulation`."""
+        super().forget()
+        self._buffers.grips.shape[:], self._buffers.grips.force[:] = NO_SHAPE, 0.0
 
     def set_thread(self, thread: Thread) -> None:
         """Change stiffness, rest curvature and medium from the next step on; the chain itself stays as it is.
@@ -162,7 +531,7 @@ class RodFormulation(Formulation):
         """
         unit, buffers = self._thread.segment_length, self._buffers
         if state.interval == 0.0:
-            buffers.forget()
+            self.forget()
         # Compiled code would be compiled anew for another layout, in the middle of a run.
         positions = np.ascontiguousarray(state.positions, np.float64)
         velocities = np.ascontiguousarray(state.velocities, np.float64)
@@ -192,10 +561,12 @@ class RodFormulation(Formulation):
                         model, off = model._replace(structured=False, max_solves=solves + MAX_SOLVES), np.inf
                         continue
                 break
-            program = program_of(buffers, buffers.known, self._rows + done.contacts)
-            solution = self._solve(program, buffers.velocities, added)
-            own, pushes = np.split(solution.multipliers, [len(program.lower)])
-            accept_step(buffers, self.workspace.data, solution.velocities, own, interval)
+            rows = self._rows + done.contacts
+            program = program_of(self._program, buffers.known, rows)
+            solution = self._solve(program, buffers.motion[VELOCITIES], added)
+            self._program.multipliers[:rows], pushes = np.split(solution.multipliers, [rows])
+            buffers.motion[VELOCITIES] = solution.velocities
+            accept_step(buffers, self.workspace.data, rows, interval)
             if added is not None:
                 if self._only_self_contact:
                     buffers.contact_force[:] += added.force(pushes, positions.shape)
@@ -205,21 +576,27 @@ class RodFormulation(Formulation):
             worst, solves = worst.or_worse(solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
-        end = ThreadState(buffers.about * unit, (buffers.about - buffers.before) * (unit / interval), interval)
+        about, before_step = buffers.motion[ABOUT], buffers.motion[BEFORE]
+        end = ThreadState(about * unit, (about - before_step) * (unit / interval), interval)
         if done.off > 1.0:
             words = f"not converged in {solves} linearisations, off by {done.off:.1g} times what is allowed"
             status = f"{words}; {status}"
         loads = buffers.internal.copy(), buffers.contact_force.copy(), buffers.tail_load.copy()
-        grip, own_way = buffers.grip.copy() if self._rough else None, self._self_contact
+        grip, own_way = buffers.grips.force.copy() if self._rough else None, self._self_contact
         passed = done.off > 1.0 and own_way is not None and own_way.passed(positions, end.positions)
         return StepResult(end, solver, status, worst, solves, done.off <= 1.0, loads, grip, passed)
+
+    def new_buffers(self) -> RodBuffers:
+        """Return memory for the steps of another thread like this one."""
+        return RodBuffers.of(StepBuffers.of(self._rows + 1, self.dimension, self._rows), self.dimension)
 
     def step_model(self) -> StepModel:
         """Return the thread and what is around it, for compiled code."""
         return StepModel((0, 1, 2)[: self.dimension], self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
 
     def _linearised(self, interval: float) -> AddedRows:
-        return self.added.linearised(self._buffers.about, self._buffers.start, self._buffers.known, interval)
+        motion = self._buffers.motion
+        return self.added.linearised(motion[ABOUT], motion[START], self._buffers.known, interval)
 
     def forces(self, result: StepResult, heading: Points) -> ThreadForces:
         """Return the forces at the end of a step; see `Formulation`."""
@@ -240,7 +617,7 @@ class RodFormulation(Formulation):
         super().warm_up()
         nodes, heading = self._thread.segments + 1, np.eye(self.dimension)[0]
         still, chain = np.zeros((nodes, self.dimension)), np.outer(np.arange(nodes), heading)
-        accept_step(self._buffers, self.workspace.data, still, np.zeros(self._rows), 1.0)
+        accept_step(self._buffers, self.workspace.data, self._rows, 1.0)
         tension, force = np.zeros(self._rows), np.zeros(self.dimension)
         write_forces(self.rod, chain, still, heading, still, force, 1.0, tension, force)
 

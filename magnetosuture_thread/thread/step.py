@@ -6,9 +6,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import Barrier, BarrierRows
 from magnetosuture_thread.errors import SolverError
@@ -24,11 +25,12 @@ from magnetosuture_thread.thread.program import (
     Residuals,
     Solution,
     Solver,
+    StepBuffers,
     Table,
     Vector,
+    program_of,
     residuals_of,
 )
-from magnetosuture_thread.thread.step_buffers import StepBuffers, program_of
 
 ROW_REACH = 1.0  # segments; what is solid and farther from a node than this has no row in the program
 DISTANCE_TOLERANCE = 1e-7  # m; an added row that is met but for this much of its nodes' way holds
@@ -108,7 +110,7 @@ class StepResult:
             `paper` the hard ones, those of the obstacles.
         loads: what the segments push the nodes with, and what contacts do, shape (n + 1, d), and what medium and
             contacts do at the needle's tail, shape (d,), in the program's units; None where these are of no mechanics.
-        grip: of friction, as in `StepBuffers`; None where no shape has any.
+        grip: of friction, as in `GripBuffers`; None where no shape has any.
         passed: whether the thread has passed through itself where it may not; then the step must not be taken.
     """
 
@@ -123,7 +125,8 @@ class StepResult:
     passed: bool = False
 
 
-WarmStart = tuple[Vector, Table, Indices, Table]
+WarmStart = tuple[NDArray[Any], ...]
+"""What the next step takes over from the last besides the state: the solver's guess, and friction."""
 
 
 class AddedRows(NamedTuple):
@@ -297,7 +300,7 @@ class Formulation(ABC):
         friction = (workspace.friction, workspace.wall_friction) if self.has_friction else ((), 0.0)
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)
-        self._rows, self._buffers = rows, StepBuffers.of(nodes, self.dimension, rows)
+        self._rows, self._program = rows, StepBuffers.of(nodes, self.dimension, rows)
 
     @abstractmethod
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
@@ -310,28 +313,28 @@ class Formulation(ABC):
     def warm_up(self) -> None:
         """Load what only a step needs that is hard to solve; after a first step, before the thread's own."""
         nodes = self._thread.segments + 1
-        program = program_of(self._buffers, np.zeros(nodes, dtype=np.bool_), self._rows)
+        program = program_of(self._program, np.zeros(nodes, dtype=np.bool_), self._rows)
         solution = self._solver.solve(program, np.zeros((nodes, self.dimension)), np.zeros(self._rows))
         residuals_of(program, solution.velocities, solution.multipliers)
-        self._buffers.forget()
+        self.forget()
+
+    def _memory(self) -> WarmStart:
+        """Return the arrays that the next step takes over."""
+        return self._program.multipliers[: self._rows], self._program.push
 
     def warm_start(self) -> WarmStart:
-        """Return what the next step takes over from the last besides the state: the solver's guess, and friction."""
-        buffers = self._buffers
-        return (
-            buffers.multipliers[: self._rows].copy(),
-            buffers.push.copy(),
-            buffers.grip_shape.copy(),
-            buffers.grip.copy(),
-        )
+        """Return a copy of what the next step takes over from the last besides the state."""
+        return tuple(array.copy() for array in self._memory())
 
     def restore(self, warm_start: WarmStart) -> None:
         """Restore what `warm_start` returned, so that the next step is that one again to the last bit."""
-        self._buffers.restore(warm_start)
+        for array, kept in zip(self._memory(), warm_start, strict=True):
+            array[:] = kept
 
     def forget(self) -> None:
-        """Forget the last solve; see `StepBuffers.forget`."""
-        self._buffers.forget()
+        """Forget the last solve: the next step starts without tension, contacts and friction."""
+        self._program.multipliers[:] = 0.0
+        self._program.push[:] = 0.0
 
     def check_start(self, positions: Points) -> None:  # noqa: B027 - most know nothing against a shape
         """Refuse a shape that the thread cannot start from, shape (n + 1, d) [m].
@@ -370,13 +373,13 @@ class Formulation(ABC):
 
     def _solve(self, program: ChainProgram, velocities: Points, added: AddedRows | None) -> Solution:
         """Return the solution of a program with the rows of added barriers, started from the buffers' multipliers."""
-        guess = self._buffers.multipliers[: len(program.lower)]
+        guess = self._program.multipliers[: len(program.lower)]
         if added is not None:
             program = added.added_to(program)
             guess = np.concatenate([guess, np.zeros(len(added.lower))])
         solution = self._solver.solve(program, velocities, guess)
         if not solution.residuals.largest <= self._tolerance:
-            self._buffers.forget()
+            self.forget()
             raise SolverError(solution.solver, solution.status, solution.residuals.largest, self._tolerance)
         return solution
 
@@ -386,6 +389,6 @@ class Formulation(ABC):
         Raises:
             SolverError: always.
         """
-        self._buffers.forget()
-        most = len(self._buffers.contacts.node)
+        self.forget()
+        most = len(self._program.contacts.node)
         raise SolverError(self._solver.name, f"more than {most} contacts at once", math.inf, self._tolerance)

@@ -15,7 +15,7 @@ import dask
 from distributed import Client, KilledWorker, as_completed, get_worker
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.workers.pool import Log, Progress, Work, WorkerDiedError
+from magnetosuture_thread.workers import Log, Progress, Work, WorkerDiedError
 
 CONNECT_TIMEOUT = 20.0  # s to reach the scheduler
 WORKERS_TIMEOUT = 60.0  # s for its first worker, which may still start

@@ -34,7 +34,7 @@ def test_obstacles_have_200_triangles_and_are_met_by_the_thread_but_not_by_the_n
     assert len(motion.shapes) == 3
     for shape in motion.shapes:
         assert isinstance(shape, (Disc, Polygon))
-        assert isinstance(shape, Disc) or len(triangulate(shape).triangles) == 200
+        assert isinstance(shape, Disc) or len(triangulate(shape)) == 200
     workspace = Workspace(motion.shapes, 5e-3, dimension)
     assert workspace.near(motion.tails).distance.min() > 1e-4
     spy, positions = run_case(motion, BandedSolver())

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.calibration.output import parameter_table, to_yaml
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
@@ -22,6 +21,8 @@ from magnetosuture_thread.calibration.result import (
     BagErrors,
     CalibrationResult,
     Estimate,
+    parameter_table,
+    to_yaml,
 )
 from magnetosuture_thread.parameter_files import load_setup
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
@@ -70,7 +71,6 @@ def found(**changes: Any) -> CalibrationResult:
     )
     given: dict[str, Any] = {
         "settings": settings,
-        "start": SETTINGS,
         "against": "seen",
         "estimates": estimates,
         "attachment": AttachmentDecision("clamped", "pinned", {"pinned": 9.0, "clamped": 0.4}),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +11,13 @@ import pytest
 from magnetosuture_thread.calibration.recorded_run import MAX_FRAMES, SETTLING, read_run
 from magnetosuture_thread.calibration.residuals import (
     across_residuals,
-    frame_errors,
+    mean_error,
     offset_residuals,
     replay_with_parameters,
 )
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
-from magnetosuture_thread.thread_model.session import PARTIAL_WAIT
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 
 TRUE = 1.3e-9
@@ -62,43 +60,20 @@ def test_after_a_gap_it_begins_anew_from_the_measured_thread(observations: Obser
     model = stiff(TRUE)
     whole, parts = (read_run("bag", each, SETTINGS) for each in (observations, gap))
     last = [
-        frame_errors(replay_with_parameters(passage, model), passage.targets, LENGTH)[-1] for passage in (whole, parts)
+        mean_error(replay_with_parameters(passage, model)[-1:], passage.targets[-1:], LENGTH)
+        for passage in (whole, parts)
     ]
     assert last == pytest.approx([0.0, 0.0], abs=0.3)
-
-
-def observed(sight: Observation, shown: int) -> Observation:
-    """Return a sight in which so many points of the thread are seen, from the tail on."""
-    points = sight.measured[:shown]
-    whole = shown == len(sight.measured)
-    ends = PieceEnd.TAIL, PieceEnd.FREE if whole else PieceEnd.COVERED
-    piece = ThreadPiece(points, np.full(len(points), 1e-5), *ends, (0.0, 0.0))
-    return replace(sight, measured=points, observation=ThreadObservation((piece,), complete=whole))
-
-
-def test_a_leg_starts_from_a_complete_observation(observations: Observations):
-    covered = [observed(sight, 40 if k < 8 else 64) for k, sight in enumerate(observations)]
-    passage = read_run("bag", covered, SETTINGS)
-    assert passage.stamps[0] == observations[8].stamp
-    assert np.array_equal(passage.initials[0], observations[8].measured)
-
-
-def test_a_leg_starts_from_a_part_where_no_more_was_measured_for_a_second(observations: Observations):
-    part = [observed(sight, 40) for sight in observations]
-    passage = read_run("bag", part, SETTINGS)
-    assert (passage.stamps[0] - observations[0].stamp) * 1e-9 == pytest.approx(PARTIAL_WAIT * 1e-9, abs=0.1)
-    assert len(passage.initials[0]) == 40
 
 
 def test_errors_are_those_of_the_score(observations: Observations):
     passage = read_run("bag", observations, SETTINGS)
     vertices = replay_with_parameters(passage, SETTINGS)
-    found = frame_errors(vertices, passage.targets, LENGTH)
-    for slot in (0, 30, -1):
-        curve = observations[int(passage.frames[slot])].measured
-        assert found[slot] == pytest.approx(prediction_error_percent(vertices[slot], curve, LENGTH), rel=1e-6)
-    both = offset_residuals(vertices, passage, LENGTH).reshape(len(found), 2, -1)
-    assert 100.0 * np.hypot(both[:, 0], both[:, 1])[passage.known].mean() == pytest.approx(found.mean())
+    curves = [observations[int(frame)].measured for frame in passage.frames]
+    errors = [prediction_error_percent(v, curve, LENGTH) for v, curve in zip(vertices, curves, strict=True)]
+    assert mean_error(vertices, passage.targets, LENGTH) == pytest.approx(np.mean(errors), rel=1e-6)
+    both = offset_residuals(vertices, passage, LENGTH).reshape(len(vertices), 2, -1)
+    assert 100.0 * np.hypot(both[:, 0], both[:, 1])[passage.known].mean() == pytest.approx(np.mean(errors))
     assert (np.abs(across_residuals(vertices, passage, LENGTH)) <= np.hypot(both[:, 0], both[:, 1]) + 1e-12).all()
 
 
@@ -108,54 +83,29 @@ def test_a_thread_that_cannot_start_is_as_wrong_as_can_be(observations: Observat
     vertices = replay_with_parameters(passage, SETTINGS)
     assert np.isnan(vertices).all()
     assert (across_residuals(vertices, passage, LENGTH)[passage.known] == 1.0).all()
-    assert frame_errors(vertices, passage.targets, LENGTH) == pytest.approx(100.0)
+    assert mean_error(vertices, passage.targets, LENGTH) == pytest.approx(100.0)
 
 
-@pytest.mark.parametrize(
-    ("changed", "against", "words"),
-    [
-        (lambda observations: [Observation(sight.stamp, reason="dark") for sight in observations], "seen", "no needle"),
-        (
-            lambda observations: [replace(sight, measured=np.empty((0, 2))) for sight in observations],
-            "seen",
-            "no thread",
-        ),
-        (
-            lambda observations: [replace(sight, ground_truth=np.empty((0, 2))) for sight in observations],
-            "truth",
-            "no ground truth",
-        ),
-        (lambda observations: observations[:40], "seen", "too short"),
-        (
-            lambda observations: [
-                observations[0],
-                *(replace(sight, measured=sight.measured[:20]) for sight in observations[1:]),
-            ],
-            "seen",
-            "half of the thread",
-        ),
-        (
-            lambda observations: [replace(sight, measured=sight.measured[:20]) for sight in observations],
-            "seen",
-            "never shows half",
-        ),
-        (lambda observations: [still(observations[0], sight, 0.0) for sight in observations], "seen", "nothing moves"),
-        (
-            lambda observations: [still(observations[0], sight, 1e-5 * k) for k, sight in enumerate(observations)],
-            "seen",
-            "too slow",
-        ),
-        (lambda observations: [], "seen", "no needle"),
-    ],
-)
-def test_bags_that_cannot_be_used_are_refused_with_the_reason(
-    observations: Observations, changed: Callable[[Observations], Observations], against: str, words: str
-):
-    with pytest.raises(BagError, match=words) as refused:
-        read_run("a bag", changed(observations), SETTINGS, against)
-    assert str(refused.value).startswith("a bag: ")
+def unusable(observations: Observations) -> dict[str, Observations]:
+    """Return bags by the reason for which they cannot be used."""
+    first, empty = observations[0], np.empty((0, 2))
+    parts = [replace(sight, measured=sight.measured[:20]) for sight in observations]
+    return {
+        "no needle": [Observation(sight.stamp, reason="dark") for sight in observations],
+        "no thread": [replace(sight, measured=empty) for sight in observations],
+        "no ground truth": [replace(sight, ground_truth=empty) for sight in observations],
+        "too short": observations[:40],
+        "half of the thread": [first, *parts[1:]],
+        "never shows half": parts,
+        "nothing moves": [still(first, sight, 0.0) for sight in observations],
+        "too slow": [still(first, sight, 1e-5 * k) for k, sight in enumerate(observations)],
+    }
 
 
-def test_two_runs_in_one_bag_are_refused(observations: Observations):
+def test_bags_that_cannot_be_used_are_refused_with_the_reason(observations: Observations):
+    for words, sights in unusable(observations).items():
+        with pytest.raises(BagError, match=words) as refused:
+            read_run("a bag", sights, SETTINGS, "truth" if words == "no ground truth" else "seen")
+        assert str(refused.value).startswith("a bag: ")
     with pytest.raises(InvalidInputError, match="before the last"):
         read_run("a bag", [*observations, *observations], SETTINGS)

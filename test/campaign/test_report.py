@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.campaign.loop import LoopFrame
-from magnetosuture_thread.campaign.page import CampaignDetails, write_campaign_page
 from magnetosuture_thread.campaign.run import RunFigures, RunInstant, RunResult
+from magnetosuture_thread.commands.campaign import CampaignResult, write_page
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.setups import read_setup
@@ -55,10 +55,10 @@ def failed(seed: int, figures: RunFigures, reason: str, closest: RunInstant) -> 
     return RunResult(seed, False, reason, False, 2, figures, 82.0, instants, closest)
 
 
-@pytest.fixture
-def details() -> CampaignDetails:
-    """Return what is run: the hernia repair."""
-    return CampaignDetails(read_procedure("hernia"), read_setup("hernia_ring"), False, {}, {3: "bags/seed_3"})
+def page_of(*runs: RunResult) -> str:
+    """Return the page of a campaign of the hernia repair."""
+    bags = {3: "bags/seed_3"}
+    return write_page(CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, runs, {}, bags))
 
 
 def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:
@@ -69,10 +69,10 @@ def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:
     return parser.found
 
 
-def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_instant(details: CampaignDetails):
+def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_instant():
     close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "too <close>", instant(20.0, 0.0002, "wall"))
     slow = failed(4, replace(GOOD, time_s=200.0), "too slow", instant(20.0, 0.0003))
-    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0), close, slow])
+    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0), close, slow)
     tags = tags_of(page)
     assert [attrs["id"] for tag, attrs in tags if tag == "article"] == ["seed-3", "seed-4"]
     strips = page.split('<article class="run"')[1:]
@@ -86,9 +86,9 @@ def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_inst
     assert 'points="1.000,2.000 3.500,2.000"' in page  # the needle, in mm
 
 
-def test_reasons_tiles_and_limits_follow_from_the_figures(details: CampaignDetails):
+def test_reasons_tiles_and_limits_follow_from_the_figures():
     close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "", instant(79.0, 0.0002))
-    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0), close])
+    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0), close)
     assert re.search(r"came too close to wall or shape</th><td>1 of 2</td>", page)
     assert re.search(r"not all goals reached</th><td>1 of 2</td>", page)
     assert page.count(">1 of 2</span>") == 2  # tiles: succeeded, reached all goals
@@ -114,8 +114,8 @@ def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, chan
     assert words in found[name]
 
 
-def test_the_page_loads_and_runs_nothing(details: CampaignDetails):
-    page = write_campaign_page(details, [RunResult(2, True, "", True, 5, GOOD, 81.0)])
+def test_the_page_loads_and_runs_nothing():
+    page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0))
     tags = tags_of(page)
     assert {tag for tag, _ in tags} & {"script", "img", "link", "iframe", "object"} == set()
     links = [attrs[name] for _, attrs in tags for name in ("href", "src") if name in attrs]

@@ -65,20 +65,3 @@ def test_the_rate_is_kept_where_each_command_is_late_and_is_not_made_up_for_afte
     while loop.now < 1.25:
         loop.run_next()
     assert sent.count(1.0) <= 2
-
-
-def test_a_disarmed_bridge_ends_a_jog_at_once_and_one_that_stays_disarmed_ends_none(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(asyncio, "get_running_loop", ManualLoop)
-    sent: list[Any] = []
-    controller = JogController(sent.append, rate=10.0, timeout=0.35)
-    controller.acquire_control(1)
-    controller.set_armed(True)
-    controller.jog(1, (0.001, 0.0))
-    controller.set_armed(False)
-    assert sent[-1] == (0.0, 0.0)
-    assert controller.must_release
-    controller.end_jog(1)
-    controller.jog(1, (0.002, 0.0))
-    controller.set_armed(False)
-    assert sent[-1] == (0.002, 0.0)
-    assert not controller.must_release

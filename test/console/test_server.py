@@ -256,28 +256,6 @@ def test_the_host_gets_whether_an_operator_or_a_script_jogs(is_browser: bool, au
     run(test)
 
 
-def test_a_ping_is_answered_and_a_flood_of_them_ends_the_connection(monkeypatch: pytest.MonkeyPatch):
-    async def test(here: Console) -> None:
-        socket = await here.connect(autoping=False)
-        await socket.send_str(json.dumps({"type": "hello", "token": TOKEN}))
-
-        async def answers_until(*ends: aiohttp.WSMsgType) -> list[bytes]:
-            answers: list[bytes] = []
-            while (message := await socket.receive(timeout=WAIT_TIMEOUT)).type not in ends:
-                answers += [bytes(message.data)] if message.type is aiohttp.WSMsgType.PONG else []
-            return [*answers, bytes(message.data or b"")]
-
-        await socket.ping(b"once")
-        assert await answers_until(aiohttp.WSMsgType.PONG) == [b"once"]
-        with contextlib.suppress(ConnectionError):
-            for _ in range(300):
-                await socket.ping(b"again")
-        assert len(await answers_until(aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.ERROR)) < 300
-
-    monkeypatch.setattr("magnetosuture_thread.console.client.MAX_MESSAGE_RATE", 20)
-    run(test)
-
-
 def test_places_are_limited_for_each_address_that_watches_for_all_of_them_and_for_those_with_the_token(
     monkeypatch: pytest.MonkeyPatch,
 ):

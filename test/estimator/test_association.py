@@ -11,14 +11,12 @@ from magnetosuture_thread import Disc
 from magnetosuture_thread.estimator.association import (
     MIN_DEVIATION,
     POINT_CORRELATION,
-    AssociationInput,
     measured_points,
     path_lengths,
     path_without_outliers,
     place_pieces,
     project,
     read_piece,
-    search_start,
 )
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -84,30 +82,6 @@ def test_points_on_the_arc_that_the_thread_bends_in_have_no_innovation(turn: flo
         np.testing.assert_allclose(innovation, left, atol=1e-4)
 
 
-def test_beside_a_kink_the_thread_is_straight_and_beyond_its_ends_is_nothing() -> None:
-    nodes = np.array([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (2.0, 2.0)])
-    points = np.array([(1.5, 0.01), (1.8, -0.02), (2.03, 0.4), (2.0, 1.5), (2.0, 5.0)])
-    arcs = np.array([0.0, 0.3, 0.9, 2.0, 5.5])
-    place, innovation, count = project(nodes, points, arcs, 1.5, 0.1)
-    assert count == 4
-    np.testing.assert_allclose(place, [1.5, 1.8, 2.4, 3.5, np.nan])
-    np.testing.assert_allclose(innovation, [0.01, -0.02, -0.03, 0.0, 0.0], atol=1e-12)
-
-
-def test_start_of_a_piece_is_found_along_the_thread() -> None:
-    nodes = np.column_stack([np.arange(30.0), 3.0 * np.sin(0.3 * np.arange(30.0))])
-    at = np.arange(0.0, 8.0, 0.25)
-    along = np.concatenate([[0.0], np.hypot(*np.diff(nodes, axis=0).T).cumsum()])
-    unit = nodes * 29.0 / along[-1]
-    chain = np.column_stack(
-        [np.interp(np.linspace(0.0, 29.0, 30), along * 29.0 / along[-1], unit[:, a]) for a in (0, 1)]
-    )
-    points = np.column_stack([np.interp(11.3 + at, np.arange(30.0), chain[:, a]) for a in (0, 1)])
-    found, square = search_start(chain, points, at, 0.0, 21.0, 100.0)
-    assert found == pytest.approx(11.3, abs=0.06)
-    assert square < 0.01
-
-
 @pytest.mark.parametrize("beyond", [0.4, -0.3])
 def test_a_piece_is_placed_from_either_end_and_its_free_end_is_measured_along_the_thread(beyond: float) -> None:
     turn = 0.1 * np.arange(25.0)
@@ -121,7 +95,7 @@ def test_a_piece_is_placed_from_either_end_and_its_free_end_is_measured_along_th
         piece = ThreadPiece(given, np.full(len(points), 1e-5), *ends, NAN, direction_known=False)
         placed, problems = place_pieces(ThreadObservation((piece,)), nodes, np.ones(26), 1e-3)
         assert not problems
-        measured, _ = measured_points(placed, AssociationInput(nodes, 0.01, 1e-3, Workspace((), 5e-3), 0.0, 1.0))
+        measured, _ = measured_points(placed, nodes, 0.01, 1.0, 1e-3, (Workspace((), 5e-3), 0.0))
         assert measured is not None
         assert measured.end[0] == pytest.approx(beyond)
         found.append(placed[0])

@@ -15,16 +15,13 @@ from magnetosuture_thread.estimator.correction import (
     Corrector,
     Prior,
     correct,
-    measured_rows,
     normals_of,
     prior_information,
     robust_weights,
-    selected_inverse,
 )
-from magnetosuture_thread.thread.banded import assemble_matrix, factorise
 from magnetosuture_thread.thread.formulations import RodFormulation
-from magnetosuture_thread.thread.osqp_solver import as_quadratic_program
-from magnetosuture_thread.thread.step_buffers import StepBuffers, program_of
+from magnetosuture_thread.thread.program import StepBuffers, program_of
+from magnetosuture_thread.thread.solvers import as_quadratic_program
 from magnetosuture_thread.thread_observation import ThreadObservation
 from test.estimator.threads import (
     LENGTH,
@@ -99,52 +96,6 @@ def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
         assert d.ravel() @ found @ d.ravel() == pytest.approx(value / scale, rel=1e-10)
 
 
-def test_rows_of_a_segment_are_those_of_all_its_points() -> None:
-    rng = np.random.default_rng(2)
-    nodes = bent_chain(rng)
-    points = measured(rng, 60)._replace(weight=rng.uniform(0.2, 1.0, 60))
-    buffers, gram = StepBuffers.of(NODES, 2, 2 * NODES), np.zeros((NODES - 1, 5))
-    end = measured_rows(points, 1.0, nodes, 0, gram, buffers)
-    assert end <= 2 * (NODES - 1)
-    full = dense_rows(points, nodes)
-    precision = points.weight * points.share / points.variance
-    matrix, right = np.zeros((2 * NODES, 2 * NODES)), np.zeros(2 * NODES)
-    for r in range(end):
-        row = np.zeros(2 * NODES)
-        first = 2 * buffers.first[r]
-        row[first : first + 6] = buffers.gradient[r].ravel()
-        matrix += np.outer(row, row) / buffers.compliance[r]
-        right += row * buffers.lower[r] / buffers.compliance[r]
-    np.testing.assert_allclose(matrix, full.T @ (precision[:, None] * full), rtol=1e-9, atol=1e-6)
-    np.testing.assert_allclose(right, full.T @ (precision * points.innovation), rtol=1e-9, atol=1e-6)
-
-
-def test_selected_inverse_matches_the_dense_one() -> None:
-    rng = np.random.default_rng(3)
-    nodes, known = bent_chain(rng), np.zeros(NODES, dtype=np.bool_)
-    known[0] = True
-    buffers, points = StepBuffers.of(NODES, 2, 3 * NODES), measured(rng, 40)
-    normals = np.zeros((NODES, 2))
-    normals_of(nodes, normals)
-    prior = Prior(nodes, np.array([1.0, 0.0]), np.ones(NODES), np.ones(NODES), 1.5, 0.4)
-    prior_information(prior, 1.0, False, normals, buffers)
-    rows = measured_rows(points, 1.0, nodes, 0, np.zeros((NODES - 1, 5)), buffers)
-    band = np.zeros((2 * NODES + 6, 7))
-    program = program_of(buffers, known, rows)
-    assemble_matrix((0, 1), program, 1.0 / program.compliance, np.ones(rows, dtype=np.bool_), band)
-    dense = np.zeros((2 * NODES, 2 * NODES))
-    for j in range(2 * NODES):
-        for k in range(7):
-            if j + k < 2 * NODES:
-                dense[j, j + k] = dense[j + k, j] = band[j, k]
-    assert factorise((0, 1), band)
-    inverse = np.zeros((2 * NODES + 6, 7))
-    selected_inverse(6, 2 * NODES, band, inverse)
-    expected = np.linalg.inv(dense)
-    for k in range(7):
-        np.testing.assert_allclose(inverse[: 2 * NODES - k, k], np.diagonal(expected, k), rtol=1e-7, atol=1e-10)
-
-
 STRAIGHT = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
 
 
@@ -184,16 +135,6 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
 
 
-def test_points_that_the_correction_explains_count_fully() -> None:
-    """Five deviations from the prediction, to both sides, and next to nothing once the thread is corrected."""
-    places, aside = np.array([2.0, 5.0, 8.0, 11.0]), 0.05 * np.array([1, -1, 1, -1.0])
-    points = MeasuredPoints(places, aside, np.full(4, 1e-4), np.ones(4), np.ones(4))
-    code, _, _, memory = correct_straight(points, 10.0)
-    assert code == CORRECTED
-    np.testing.assert_allclose(-memory.moved[[2, 5, 8, 11], 1], points.innovation, rtol=0.1)
-    np.testing.assert_array_equal(points.weight, 1.0)
-
-
 def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
     """The points are a tenth of a segment aside, and a disc is a fiftieth of one away from the thread."""
     thread = thread_of(NODES - 1)
@@ -227,7 +168,7 @@ def test_sensitivity_information_and_score_are_those_of_a_dense_filter(end: tupl
     stiffness = thread.bending_stiffness / (thread.medium.drag_across * thread.segment_length**4)
     prior = Prior(start, np.array([-1.0, 0.0]), density, noise, 1.3, stiffness)
     corrector = Corrector(predictor, formulation)
-    assert not corrector.solve(prior, points).problem
+    assert not corrector.solve(prior, points)
     derivative = rng.normal(0.0, 1.0, (NODES, 2))
     derivative[0] = 0.0
     found = corrector.sensitivity(derivative)

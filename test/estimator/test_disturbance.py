@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimator
-from magnetosuture_thread.estimator.disturbance import BendingRelaxation, DisturbanceTest, significance
+from magnetosuture_thread.estimator.disturbance import BendingRelaxation, DisturbanceTest
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
@@ -32,21 +32,6 @@ def test_relaxation_solves_its_equation(clamped: bool) -> None:
     residual = relaxed - displacement + amount * curvature.T @ moment
     assert np.abs(residual[1:]).max() < 1e-12
     assert np.array_equal(relaxed[0], displacement[0])
-
-
-def test_the_significance_is_that_of_the_mean_displacement_of_the_worst_window() -> None:
-    """Of four windows over 16 nodes behind the needle, of which the last is not measured."""
-    rng = np.random.default_rng(3)
-    displacement, normals = rng.normal(size=(17, 2)), rng.normal(size=(17, 2))
-    response, deviations, variance = rng.normal(size=(17, 2)), np.array([0.1, 0.2]), np.array([0.3, 0.2, 0.1, np.inf])
-    across, window, expected = np.einsum("ia,ia->i", displacement, normals), np.arange(17) * 4 // 17, []
-    for w in range(3):
-        nodes = np.flatnonzero((window == w) & (np.arange(17) > 0))
-        square = 2.0 * variance[w] + np.sum((response[nodes].mean(axis=0) * deviations) ** 2)
-        expected.append(abs(across[nodes].mean()) / np.sqrt(square))
-    for sign in (1.0, -1.0):
-        found = significance(sign * displacement, normals, variance, response, deviations)
-        assert found == pytest.approx(max(expected))
 
 
 @pytest.mark.parametrize(("material", "attachment"), [("silk_6_0", "pinned"), ("polyamide_7_0", "clamped")])
@@ -136,18 +121,3 @@ def test_the_first_frame_after_a_gap_between_poses_says_nothing_of_disturbances(
     in_time, late = (forces_found(None, 12, interval) for interval in (1.0 / RATE, 3.0))
     first = [next(k for k, each in enumerate(found) if each) for found in (in_time, late)]
     assert first[1] == first[0] + 1
-
-
-@pytest.mark.parametrize("rest", [[1.0 / RATE] * 90, [100.0, 1.0 / RATE]])
-def test_a_disturbance_ends_once_the_camera_no_longer_moves_the_thread(rest: list[float]) -> None:
-    thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
-    untouched, normals = np.zeros(26, dtype=np.bool_), np.tile([0.0, -1.0], (26, 1))
-    test, stamp, confirmed = DisturbanceTest(thread), 0.0, []
-    for k, interval in enumerate([1.0 / RATE] * 30 + rest):
-        stamp += interval
-        test.decay(interval, untouched)
-        moved = pushed(thread, 12, 4e-5 if k < 30 else 0.0)
-        test.add(moved, normals, np.full(16, 1e-11), stamp, np.array([1e-5, 1e-3]))
-        confirmed.append(test.confirmed(stamp))
-    assert confirmed[29]
-    assert not confirmed[-1]

@@ -118,40 +118,6 @@ def test_bad_pieces_are_survived_with_the_reason(index: int) -> None:
     assert error_percent(result.estimate.positions, truth[-1]) < 0.2
 
 
-def test_pieces_in_the_wrong_order_are_the_same() -> None:
-    way = poses(40)
-    truth = true_shapes(thread_of(viscosity=1.5), way)
-    last = []
-    for turned in (False, True):
-        session = session_of()
-        for k, pose in enumerate(way):
-            session.on_pose(pose)
-            pieces = [piece_of(truth[k], k, 0.0, 0.4 * LENGTH), piece_of(truth[k], k + 1, 0.6 * LENGTH, LENGTH)]
-            result = session.on_observation(pose.stamp, ThreadObservation(tuple(pieces[::-1] if turned else pieces)))
-        assert result.estimate is not None
-        last.append(result.estimate.positions)
-    np.testing.assert_array_equal(last[0], last[1])
-
-
-def test_a_minute_without_observations_is_told_and_recovered_from() -> None:
-    way = poses(30)
-    last = way[-1]
-    rest = [type(last)(last.stamp + k / RATE, last.tail, last.heading) for k in range(1, int(60 * RATE))]
-    truth = true_shapes(thread_of(), way)
-    session = session_of()
-    for k, pose in enumerate(way):
-        session.on_pose(pose)
-        session.on_observation(pose.stamp, whole(truth[k], k))
-    for pose in rest:
-        estimate = session.on_pose(pose).estimate
-    assert estimate is not None
-    assert not estimate.corrected
-    assert estimate.unmeasured_for == pytest.approx(rest[-1].stamp - way[-1].stamp)
-    result = session.on_observation(rest[-1].stamp, whole(estimate.positions, 1))
-    assert result.estimate is not None
-    assert result.estimate.corrected
-
-
 def test_time_set_back_starts_anew() -> None:
     session, way = session_of(), poses(60)
     for pose in way:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator import EstimatorOptions, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.estimator.stiffness import (
     AUTOMATIC,
-    CHAIN,
     DEVIATION,
     NORMAL_95,
     STIFFNESS_OVER_DRAG,
@@ -79,25 +78,6 @@ def test_what_was_learned_stays_when_the_needle_rests() -> None:
     assert quiet[0][0].value == pytest.approx(3.0 * ratio_of(told), rel=0.02)
 
 
-def test_late_frames_give_what_frames_in_time_give() -> None:
-    told, way = thread_of(), poses(45)
-    shapes = true_shapes(stiff(told, 5.0), way)
-    sessions = [EstimatorSession(learner(told, STIFFNESS_OVER_DRAG)) for _ in range(2)]
-    for k, pose in enumerate(way):
-        sessions[0].on_observation(pose.stamp, whole(shapes[k], k))
-        in_time = sessions[0].on_pose(pose)
-        late = sessions[1].on_pose(pose)
-        if k == 0:
-            late = sessions[1].on_observation(pose.stamp, whole(shapes[k], k))
-        elif k % 5 == 4:
-            for j in range(k - 4 or 1, k + 1):
-                late = sessions[1].on_observation(way[j].stamp, whole(shapes[j], j))
-    assert in_time.estimate is not None
-    assert late.estimate is not None
-    np.testing.assert_array_equal(in_time.estimate.positions, late.estimate.positions)
-    assert in_time.estimate.slow_parameters == late.estimate.slow_parameters
-
-
 def test_no_data_leads_beyond_the_bounds() -> None:
     """Pieces that no thread could make, in any order, at any distance."""
     thread, rng = thread_of(), np.random.default_rng(5)
@@ -123,15 +103,6 @@ def test_unknown_parameters_and_threads_without_stiffness_are_refused() -> None:
     assert learner(limp, AUTOMATIC).thread == limp
 
 
-def test_by_default_a_right_model_learns_nothing_and_the_estimate_is_the_same_to_the_last_bit() -> None:
-    thread, way = thread_of(material="polyamide_7_0"), poses(120)
-    shapes = true_shapes(thread, way)
-    usual, without = play(estimator_of(thread), way, shapes), play(learner(thread), way, shapes)
-    for one, other in zip(usual, without, strict=True):
-        np.testing.assert_array_equal(one.positions, other.positions)
-    assert usual[-1].slow_parameters == ()
-
-
 @pytest.mark.parametrize("factor", [5.0, 0.2])
 def test_by_default_a_wrong_stiffness_is_learned_once_the_model_is_found_wrong(factor: float) -> None:
     """So that half of the thread, hidden afterwards, goes the way that a thread of that stiffness goes."""
@@ -155,18 +126,3 @@ def test_by_default_a_wrong_stiffness_is_learned_once_the_model_is_found_wrong(f
             assert learned.value == pytest.approx(factor * ratio_of(told), rel=0.03)
             assert learned.low <= factor * ratio_of(told) <= learned.high
     assert hidden[(AUTOMATIC,)] < 0.2 * hidden[()]
-
-
-def test_what_is_learned_by_itself_stays_within_a_factor_of_ten() -> None:
-    """Beyond, something else is wrong with the model, which is reported as that."""
-    told, way = thread_of(material="polyamide_7_0"), poses(200)
-    estimates = play(estimator_of(told), way, true_shapes(stiff(told, 100.0), way))
-    (learned,) = estimates[-1].slow_parameters
-    assert learned.value == pytest.approx(10.0 * ratio_of(told), rel=1e-6)
-
-
-def test_a_stiffness_that_is_known_exactly_is_off_by_what_an_error_of_the_chain_would_move_it_by() -> None:
-    learned, effect, square = learner(thread_of(), STIFFNESS_OVER_DRAG)._stiffness, 2e-3, 2e-6
-    learned.state = replace(learned.state, information=1e30, effect=(square, effect))
-    (found,) = learned.report()
-    assert 0.5 * np.log(found.high / found.low) == pytest.approx(CHAIN * LENGTH * effect / square)

@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from magnetosuture_msgs.msg import SafetyMargins
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread.interface import ARM
@@ -66,35 +62,24 @@ def drive_until(graph, condition: Callable[[], Any], what: str) -> None:
     graph.wait(holds, what)
 
 
-def call(graph, kind: Any, name: str, request: Any) -> Any:
-    """Call a service and return its answer."""
-    client = graph.probe.create_client(kind, name)
-    graph.wait(client.service_is_ready, f"the service {name}")
-    future = client.call_async(request)
-    graph.wait(future.done, f"an answer of {name}")
-    graph.probe.destroy_client(client)
-    return future.result()
-
-
 def press(graph, name: str) -> Any:
     """Call emergency stop or reset."""
-    return call(graph, Trigger, name, Trigger.Request())
+    return graph.call(Trigger, name)
 
 
 def arm(graph, on: bool = True) -> Any:
     """Arm or disarm."""
-    return call(graph, SetBool, ARM, SetBool.Request(data=on))
+    return graph.call(SetBool, ARM, data=on)
 
 
 def change(graph, transition: int) -> bool:
-    """Ask for a transition of the lifecycle."""
-    request = ChangeState.Request(transition=Transition(id=transition))
-    return bool(call(graph, ChangeState, "coil_bridge/change_state", request).success)
+    """Ask for a transition of the bridge's lifecycle."""
+    return bool(graph.change("coil_bridge", transition))
 
 
 def stage(graph) -> str:
-    """Return the lifecycle's state."""
-    return str(call(graph, GetState, "coil_bridge/get_state", GetState.Request()).current_state.label)
+    """Return the state of the bridge's lifecycle."""
+    return str(graph.stage("coil_bridge"))
 
 
 def applied(node) -> list[np.ndarray]:
@@ -110,10 +95,3 @@ def driven(node) -> bool:
 def reasons(states) -> str:
     """Return why the coils are at zero, by the last state."""
     return "; ".join(states[-1].reasons) if states else ""
-
-
-def set_parameter(graph, name: str, value: float) -> Any:
-    """Set a number among the bridge's parameters."""
-    parameter = Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value))
-    request = SetParameters.Request(parameters=[parameter])
-    return call(graph, SetParameters, "coil_bridge/set_parameters", request).results[0]

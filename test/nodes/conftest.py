@@ -6,17 +6,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.nodes.processes import is_empty, reserved_domain
+from magnetosuture_thread.nodes.processes import graph_environment, is_empty, reserved_domain
 from magnetosuture_thread.nodes.topics import Topic
+from test.nodes.programs import Programs
 
 
 class Graph:
@@ -88,6 +92,24 @@ class Graph:
         self.wait(lambda: all(s.get_publisher_count() > 0 for s in others), f"{topic.name} to be found")
         publisher.publish(message)
 
+    def call(self, kind: Any, name: str, timeout: float = 30.0, /, **fields: Any) -> Any:
+        """Call a service and return its answer."""
+        client = self.probe.create_client(kind, name)
+        self.wait(client.service_is_ready, f"the service {name}")
+        future = client.call_async(kind.Request(**fields))
+        self.wait(future.done, f"an answer of {name}", timeout)
+        self.probe.destroy_client(client)
+        return future.result()
+
+    def change(self, node: str, *transitions: int) -> bool:
+        """Make transitions of a node, as `ros2 lifecycle set` does; return whether all succeeded."""
+        name = f"{node}/change_state"
+        return all(self.call(ChangeState, name, transition=Transition(id=each)).success for each in transitions)
+
+    def stage(self, node: str) -> str:
+        """Return the name of a node's state, as `ros2 lifecycle get` does."""
+        return str(self.call(GetState, f"{node}/get_state").current_state.label)
+
     def wait(self, condition: Callable[[], bool], what: str, timeout: float = 30.0) -> None:
         """Wait until a condition holds."""
         deadline = time.monotonic() + timeout
@@ -146,3 +168,25 @@ def graph(shared_context: tuple[Context, int]) -> Iterator[Graph]:
     made = Graph(*shared_context)
     yield made
     made.close()
+
+
+@pytest.fixture(scope="session")
+def all_programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
+    """Start node programs, forked from one process."""
+    made = Programs(tmp_path_factory.mktemp("programs"))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def programs(all_programs: Programs) -> Iterator[Programs]:
+    """Start node programs, which are ended with the test."""
+    yield all_programs
+    all_programs.kill_all()
+
+
+@pytest.fixture
+def environment(state_home: Path) -> Iterator[dict[str, str]]:
+    """An environment on a ROS domain of its own."""
+    with reserved_domain() as domain:
+        yield graph_environment(domain)

@@ -98,20 +98,6 @@ def test_silence_stops_the_coils_and_the_next_command_starts_them(graph):
     drive_until(graph, lambda: np.any(currents[-1].current), "a current again")
 
 
-def test_cease_after_stop(graph):
-    """Zeros are published for a while; then the topic is silent, and the driver still told zero."""
-    node = armed(graph, zero_hold=0.1)
-    currents = graph.listen(topics.CURRENTS)
-    drive_until(graph, lambda: driven(node), "a current")
-    graph.wait(lambda: bool(currents) and currents[-1].stop != "", "zeros")
-    told = len(applied(node))
-    graph.wait(lambda: len(applied(node)) > told + 60, "more zeros to the driver")
-    heard, told = len(currents), len(applied(node))
-    graph.wait(lambda: len(applied(node)) > told + 60, "still more")
-    assert len(currents) <= heard + 1
-    assert not any(a.any() for a in applied(node)[told:])
-
-
 def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     """With /clock standing still the coils must stop all the same; before it runs nothing is good."""
     node = armed(graph, use_sim_time=True)
@@ -137,8 +123,6 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     ("spoil", "words"),
     [
         (lambda m: setattr(m.twist.linear, "x", math.nan), "finite numbers"),
-        (lambda m: setattr(m.twist.linear, "y", -math.inf), "finite numbers"),
-        (lambda m: setattr(m.twist.linear, "z", 0.001), "x and y alone count"),
         (lambda m: setattr(m.twist.angular, "z", math.nan), "x and y alone count"),
         (lambda m: setattr(m.header, "frame_id", "base_link"), "'dish'"),
         (lambda m: setattr(m.header, "stamp", Time(sec=5)), "at most 0.1 s"),

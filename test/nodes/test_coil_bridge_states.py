@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
 
@@ -17,7 +16,6 @@ from test.nodes.bridge import (
     arm,
     armed,
     change,
-    command,
     drive,
     driven,
     press,
@@ -136,21 +134,6 @@ def test_a_stop_calls_off_what_would_arm_by_itself(graph):
     graph.wait(lambda: len(states) > 3, "some states")
     assert stage(graph) == "active"
     assert not states[-1].armed
-
-
-def test_a_bad_message_does_not_hide_an_emergency_stop(graph):
-    graph.add(CoilBridgeNode)
-    diagnostics, states = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.BRIDGE_STATE)
-    assert press(graph, EMERGENCY_STOP).success
-    graph.wait(lambda: any(d.status[0].level == DiagnosticStatus.ERROR for d in diagnostics), "the fault")
-    bad = command(graph)
-    bad.header.frame_id = "map"
-    graph.publish(topics.NEEDLE_COMMAND, bad)
-    graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
-    heard = len(diagnostics)
-    graph.wait(lambda: len(diagnostics) > heard, "another report")
-    assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
-    assert diagnostics[-1].status[0].message == "fault: emergency stop"
 
 
 @pytest.mark.parametrize("transition", [Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVE_SHUTDOWN])

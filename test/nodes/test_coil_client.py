@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.cli.commands.run_graph import COIL_ACTIONS
+from magnetosuture_thread.commands.coils import ACTIONS as COIL_ACTIONS
 from magnetosuture_thread.nodes import clients as client
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 

@@ -5,31 +5,25 @@ from __future__ import annotations
 import asyncio
 import json
 import re
-import signal
-import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from magnetosuture_msgs.msg import CoilCurrents
-from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
+from rclpy.parameter_client import AsyncParameterClient
 
-from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.cli import main
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.jobs.console import BagRecording
+from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import joined
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.console import graph as console_graph
-from magnetosuture_thread.nodes.console.graph import ConsoleGraph
-from magnetosuture_thread.nodes.console.node import GraphHost, joined
+from magnetosuture_thread.nodes.console import ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
@@ -92,21 +86,19 @@ def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
     assert "expected one of arm, disarm, stop, reset" in act(console, "dance")
 
 
-def test_a_stop_that_is_not_kept_over_a_restart_says_so_on_page_and_terminal(graph, console, monkeypatch):
+def test_a_stop_that_is_not_kept_over_a_restart_says_so_on_page_and_terminal(graph, console, monkeypatch, capfd):
     node = graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
     graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
 
-    def full() -> None:
+    def full(**_: bool) -> None:
         raise InvalidInputError("stop_file", "No space left on device", "a file that can be written")
 
     monkeypatch.setattr(node.system, "remember", full)
     assert "No space left" in act(console, "stop")
     graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
-    command = [sys.executable, "-m", "magnetosuture_thread.cli", "coils", "stop"]
-    with subprocess.Popen(command, env=graph_environment(graph.domain), stdout=subprocess.PIPE, text=True) as process:
-        graph.wait(lambda: process.poll() is not None, "the command to end", timeout=60.0)
-        assert process.stdout is not None
-        assert "warning: stop_file: got No space left" in process.stdout.read()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
+    assert main(["coils", "stop"]) == 0
+    assert "warning: stop_file: got No space left" in "".join(capfd.readouterr())
 
 
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
@@ -163,16 +155,6 @@ def test_a_flood_of_diagnostics_keeps_the_state_small_and_our_own_nodes_in_it(gr
     graph.wait(lambda: set(console.nodes()) == {"coil_bridge"}, "the silent nodes to be dropped")
 
 
-def test_in_a_namespace_nodes_of_other_rigs_are_not_shown(graph):
-    names = ("left/coil_bridge", "left/rig_simulator", "right/thread_model", "right/console", "scene_server", "usb_cam")
-    with joined(domain=graph.domain, namespace="left") as node:
-        console = ConsoleGraph(node, ConsoleSettings())
-        report = DiagnosticArray(status=[DiagnosticStatus(name=f"{name}: state", message="x") for name in names])
-        tell(graph, topics.DIAGNOSTICS, report, lambda: "usb_cam" in console.nodes(), "the report")
-        assert set(console.nodes()) == {"coil_bridge", "rig_simulator", "usb_cam"}
-        assert GraphHost(console).state()["simulated"]
-
-
 @pytest.mark.parametrize("transport", ["compressed", "raw"])
 def test_camera_frames_are_numbered_pictures(graph, node, transport: str):
     console = ConsoleGraph(node, ConsoleSettings(image_transport=transport))
@@ -209,70 +191,6 @@ def test_a_rig_is_paused_where_there_is_one(graph, console):
     assert not rig.time.paused
     assert "not started from the page" in asyncio.run(host.select_setup("petri_150mm_silk"))
     assert "--graph" in asyncio.run(host.set_recording(True, "an operator"))
-
-
-def test_a_recording_gets_what_is_published(graph, console, tmp_path: Path):
-    publisher = graph.probe.create_publisher(topics.CURRENTS.message, topics.CURRENTS.name, topics.CURRENTS.qos)
-    heard = graph.listen_later(topics.CURRENTS)
-
-    async def record() -> None:
-        recording = BagRecording(tmp_path / "bag", {"setup": "mine"}, console, [topics.SCENE, topics.CURRENTS])
-        await recording.begin()
-        deadline = time.monotonic() + 30.0
-        while len(heard) < 3:
-            taking = [s for s in console.node.subscriptions if s.topic_name == publisher.topic_name]
-            if publisher.get_subscription_count() == 2 and all(s.get_publisher_count() for s in taking):
-                publisher.publish(CoilCurrents(current=[1.0, 2.0]))
-            assert time.monotonic() < deadline
-            await asyncio.sleep(0.02)
-        assert not recording.ended
-        await recording.end()
-
-    asyncio.run(record())
-    (*_, last) = Bag(tmp_path / "bag").records({"/coils/currents"})
-    assert abs(last.time * 1e-9 - time.time()) < 60.0
-    assert last.decode().current.tolist() == [1.0, 2.0]
-
-
-def program(domain: int, *parameters: str) -> subprocess.Popen[str]:
-    """Run the node as a program."""
-    given = [part for parameter in parameters for part in ("-p", parameter)]
-    command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", *given]
-    environment = graph_environment(domain)
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
-
-
-@pytest.mark.parametrize("which", [signal.SIGTERM])
-def test_the_node_serves_the_page_says_so_and_ends_when_it_is_asked_to(graph, which: signal.Signals):
-    reports = graph.listen_later(topics.DIAGNOSTICS)
-    with program(graph.domain, "port:=0", "scene:=dish_150mm") as process:
-        try:
-            assert process.stdout is not None
-            found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
-            assert found is not None
-            with urllib.request.urlopen(found[0], timeout=10.0) as page:
-                assert page.status == 200
-            graph.wait(lambda: any("console: state" in r.status[0].name for r in reports), "its report", timeout=90.0)
-            process.send_signal(which)
-            assert process.wait(60.0) == 0
-        finally:
-            process.kill()
-
-
-@pytest.mark.parametrize(
-    ("parameter", "words"),
-    [
-        ("scene:=nowhere", "scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end"),
-        ("dish:=0.035", "console.dish: got 0.035"),
-        ("address:=0.0.0.0", "a token, as 0.0.0.0 can be reached"),
-    ],
-)
-def test_the_node_refuses_parameters_in_one_line(graph, parameter: str, words: str):
-    with program(graph.domain, parameter) as process:
-        _, errors = process.communicate(timeout=120.0)
-    assert process.returncode == 1
-    assert words in errors
-    assert errors.count("\n") == 1
 
 
 def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, console):
@@ -316,25 +234,23 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
     assert asyncio.run(console.execute_procedure("plan", near, False)) == "starting"
 
 
-def test_the_node_answers_the_services_of_its_parameters(graph):
-    with joined(domain=graph.domain) as other:
-        client = other.create_client(GetParameters, "console/get_parameters")
-        command = [sys.executable, "-m", "magnetosuture_thread.nodes.console", "--ros-args", "-p", "port:=0"]
-        process = subprocess.Popen(command, env=graph_environment(graph.domain))
-        answers = []
+def test_the_node_serves_the_page_and_answers_the_services_of_its_parameters(graph, programs):
+    process = programs.start("console", "-p", "port:=0", environment=graph_environment(graph.domain))
+    process.wait_for("/#token=")
+    found = re.search(r"http://127\.0\.0\.1:\d+/", process.output)
+    assert found is not None
+    with urllib.request.urlopen(found[0], timeout=10.0) as page:
+        assert page.status == 200
+    client = AsyncParameterClient(graph.probe, "console")
+    graph.wait(client.services_are_ready, "the parameter services")
+    answers = [client.get_parameters(["port"])]
 
-        def answered() -> bool:
-            if client.service_is_ready():
-                with client.handle:
-                    client.handle.send_request(GetParameters.Request(names=["port"]))
-                    answers.append(client.handle.take_response(GetParameters.Response)[1])
-            return any(answer is not None for answer in answers)
+    def answered() -> bool:
+        if time.monotonic() > asked + len(answers):  # an answer may be lost before the two have found each other
+            answers.append(client.get_parameters(["port"]))
+        return any(answer.done() for answer in answers)
 
-        try:
-            graph.wait(answered, "an answer", 90.0)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30.0) == 0
-        finally:
-            process.kill()
-    (values, *_) = (answer.values for answer in answers if answer is not None)
+    asked = time.monotonic()
+    graph.wait(answered, "an answer")
+    (values, *_) = (answer.result().values for answer in answers if answer.done())
     assert [value.integer_value for value in values] == [0]

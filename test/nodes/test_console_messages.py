@@ -6,24 +6,17 @@ import json
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Vector3
+from geometry_msgs.msg import Point
 from magnetosuture_msgs.msg import (
     BarrierMargin,
-    CoilBridgeState,
-    EstimatedThread,
-    PredictedThread,
     SafetyMargins,
-    ThreadDisturbance,
     ThreadForecast,
 )
 
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.nodes.console import messages
-from magnetosuture_thread.scene import read_scene
-from test.nodes import wire
+from magnetosuture_thread.nodes import console_state as messages
 
 STAMP = Time(sec=12)
 
@@ -31,46 +24,6 @@ STAMP = Time(sec=12)
 def plain(told: Any) -> Any:
     """Return what a page gets; a value that JSON does not know is an error."""
     return json.loads(json.dumps(told, allow_nan=False))
-
-
-def test_the_threads():
-    path = wire.path_message(STAMP, np.array([[0.0, 0.001], [0.002, 0.003]]))
-    assert plain(messages.measured_thread(path)) == [[0.0, 0.001], [0.002, 0.003]]
-    message = PredictedThread(positions=[Point(x=0.1, y=0.2)], residual=1e-9, step_time=1e-4, solver_status="solved")
-    assert plain(messages.predicted(message)) == {
-        "tension": [],
-        "needle_force": None,
-        "vertices": [[0.1, 0.2]],
-        "residual": 1e-9,
-        "step_time": 1e-4,
-        "status": "solved",
-    }
-
-
-def test_the_estimated_thread():
-    found = ThreadDisturbance(arc_length=0.031, force=2e-4, position=Point(x=0.3), direction=Vector3(x=-1.0))
-    message = EstimatedThread(
-        positions=[Point(x=0.1, y=0.2)], deviation=[1e-5], unmeasured_for=0.5, prediction_only=True, hidden=1.0
-    )
-    message.disturbances = [found]
-    assert plain(messages.estimated(message)) == {
-        "vertices": [[0.1, 0.2]],
-        "deviation": [1e-5],
-        "prediction_only": True,
-        "unmeasured_for": 0.5,
-        "hidden": 1.0,
-        "disturbances": [
-            {
-                "position": [0.3, 0.0],
-                "direction": [-1.0, 0.0],
-                "force": 2e-4,
-                "text": "held at 31 mm of the thread: 0.2 mN to the left",
-            }
-        ],
-    }
-    message.deviation = []
-    with pytest.raises(InvalidInputError, match="a deviation for each position"):
-        messages.estimated(message)
 
 
 def test_the_forecast_has_ghosts_and_what_happens_first():
@@ -121,30 +74,3 @@ def test_of_each_node_the_least_clearance_of_wall_and_shapes():
 def test_margins_of_a_node_that_no_thread_has_are_refused(node: int):
     with pytest.raises(InvalidInputError, match="less than 2001"):
         messages.margins(SafetyMargins(valid=True, node=[node], barrier=[0], clearance=[0.0]))
-
-
-def test_a_scene_that_was_read_is_shown_as_one_that_was_heard():
-    scene = read_scene("hernia_ring")
-    heard = messages.scene(wire.scene_message(STAMP, scene))
-    assert messages.shown_scene(scene) == heard
-    assert len(json.dumps(heard)) < 10_000  # 30 times a second, for every page
-
-
-def test_the_bridge():
-    message = CoilBridgeState(
-        state=CoilBridgeState.STATE_FAULT,
-        emergency_stopped=True,
-        reasons=["fault: emergency stop"],
-        driver="roboclaw",
-        driver_warnings=["hot"],
-        current=[1.0, 2.0],
-        measured_current=[0.9],
-        refused=3,
-    )
-    told = plain(messages.bridge(message))
-    assert told["state"] == "fault"
-    assert told["emergency_stopped"]
-    assert not told["armed"]
-    assert told["reasons"] == ["fault: emergency stop"]
-    assert (told["current"], told["measured_current"], told["refused"]) == ([1.0, 2.0], [0.9], 3)
-    assert told["driver_warnings"] == ["hot"]

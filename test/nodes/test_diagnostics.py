@@ -6,25 +6,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import diagnostics, topics
-from magnetosuture_thread.nodes.diagnostics import Health
-
-
-def test_a_change_is_said_at_once_and_the_state_once_a_second(graph):
-    said = graph.listen_later(topics.DIAGNOSTICS)
-    health = Health(graph.probe)
-    graph.wait(lambda: graph.matched(topics.DIAGNOSTICS), "the match")
-    health.ok("all well", speed=3)
-    graph.wait(lambda: any(d.status[0].message == "all well" for d in said), "the change")
-    count = len(said)
-    graph.wait(lambda: len(said) > count, "the next second")
-    status = said[-1].status[0]
-    assert status.level == DiagnosticStatus.OK
-    assert status.name == "probe: state"
-    assert {value.key: value.value for value in status.values} == {
-        "speed": "3",
-        "refused": "0",
-        "last refusal": "none",
-    }
+from magnetosuture_thread.nodes.node import Health
 
 
 def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,32 +38,16 @@ from test.nodes.bridge import (
     reasons,
     stage,
 )
+from test.nodes.programs import TIMEOUT, Program
 
 LAST = (topics.CURRENTS, topics.RIG_CURRENTS, topics.NEEDLE_SETPOINT, topics.BRIDGE_STATE)
-TIMEOUT = 60.0  # s for a process on a busy machine
 
 
-@pytest.fixture(autouse=True)
-def _terminal() -> Iterator[None]:
-    """Let what is started hear of SIGHUP, also where the tests run under nohup, which has it ignored."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
-@contextmanager
-def process(graph, **parameters: Any) -> Iterator[subprocess.Popen[bytes]]:
+def process(graph, programs, **parameters: Any) -> Program:
     """Start a bridge as a process in the test's graph, whose wires end at the test."""
     given = {"driver": "simulated", **READY, **LONG, **parameters}
-    command = [sys.executable, "-m", "magnetosuture_thread.nodes.coil_bridge", "--ros-args"]
-    for name, value in given.items():
-        command += ["-p", f"{name}:={value}"]
-    ended = subprocess.Popen(command, env=graph_environment(graph.domain))
-    try:
-        yield ended
-    finally:
-        ended.kill()
-        ended.wait()
+    arguments = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
+    return programs.start("coil_bridge", *arguments, environment=graph_environment(graph.domain))
 
 
 def last(graph) -> dict[str, list[Any]]:
@@ -118,22 +100,24 @@ def armed_and_driving(graph, heard: dict[str, list[Any]], moves: Callable[[], bo
     "signals",
     [(signal.SIGTERM,), (signal.SIGINT,), (signal.SIGHUP,), (signal.SIGINT, signal.SIGTERM, signal.SIGINT)],
 )
-def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(graph, signals: tuple[signal.Signals, ...]):
+def test_the_last_messages_of_a_bridge_that_is_ended_are_zeros_and_why(
+    graph, programs, signals: tuple[signal.Signals, ...]
+):
     heard = last(graph)
-    with process(graph) as bridge:
-        armed_and_driving(graph, heard)
-        for which in signals:
-            bridge.send_signal(which)
-        assert bridge.wait(TIMEOUT) == 0
+    bridge = process(graph, programs)
+    armed_and_driving(graph, heard)
+    for which in signals:
+        bridge.send_signal(which)
+    assert bridge.wait() == 0
     graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
 
 
-def test_a_bridge_that_is_shut_down_by_its_lifecycle_ends_its_process(graph):
+def test_a_bridge_that_is_shut_down_by_its_lifecycle_ends_its_process(graph, programs):
     heard = last(graph)
-    with process(graph) as bridge:
-        armed_and_driving(graph, heard)
-        assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-        assert bridge.wait(TIMEOUT) == 0
+    bridge = process(graph, programs)
+    armed_and_driving(graph, heard)
+    assert change(graph, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert bridge.wait() == 0
     graph.wait(lambda: says(heard, "finalized"), f"zeros: {[heard[topic.name][-1] for topic in LAST]}")
 
 
@@ -178,51 +162,49 @@ def test_an_emergency_stop_outlives_the_bridge(graph):
     assert armed(graph, **LONG).system.latch.armed
 
 
-def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph):
+def test_a_bridge_that_was_killed_while_armed_waits_for_a_reset(graph, programs):
     heard = last(graph)
     states = heard[topics.BRIDGE_STATE.name]
-    with process(graph, autostart="armed") as bridge:
-        armed_and_driving(graph, heard)
-        bridge.kill()
-        bridge.wait()
+    bridge = process(graph, programs, autostart="armed")
+    armed_and_driving(graph, heard)
+    bridge.kill()
     states.clear()
-    with process(graph, autostart="armed") as bridge:
-        # The last message of the one before may still be on its way.
-        graph.wait(lambda: bool(states) and UNCLEAN_END in reasons(states), "the fault", TIMEOUT)
-        graph.wait(lambda: bool(states[-1].driver_ready), "the driver", TIMEOUT)
-        assert states[-1].state == CoilBridgeState.STATE_FAULT
-        assert not arm(graph).success
-        assert press(graph, EMERGENCY_STOP).success
-        bridge.kill()  # at once after the answer
-        bridge.wait()
+    bridge = process(graph, programs, autostart="armed")
+    # The last message of the one before may still be on its way.
+    graph.wait(lambda: bool(states) and UNCLEAN_END in reasons(states), "the fault", TIMEOUT)
+    graph.wait(lambda: bool(states[-1].driver_ready), "the driver", TIMEOUT)
+    assert states[-1].state == CoilBridgeState.STATE_FAULT
+    assert not arm(graph).success
+    assert press(graph, EMERGENCY_STOP).success
+    bridge.kill()  # at once after the answer
     states.clear()
-    with process(graph, autostart="armed") as bridge:
-        graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", TIMEOUT)
-        assert states[-1].emergency_stopped
-        assert not any(state.armed for state in states)
-        assert press(graph, RESET).success
-        armed_and_driving(graph, heard)
+    process(graph, programs, autostart="armed")
+    graph.wait(lambda: bool(states) and states[-1].driver_ready, "the bridge", TIMEOUT)
+    assert states[-1].emergency_stopped
+    assert not any(state.armed for state in states)
+    assert press(graph, RESET).success
+    armed_and_driving(graph, heard)
 
 
-def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, tmp_path: Path):
+def test_a_bridge_that_was_frozen_while_it_drove_is_in_fault(graph, programs, tmp_path: Path):
     """Its boards, on pseudo-terminals, stop by themselves meanwhile; a person has to look where the needle is."""
     heard, ports = last(graph), [str(tmp_path / "a"), str(tmp_path / "b")]
     states = heard[topics.BRIDGE_STATE.name]
     boards = {"power_stage": "roboclaw", "power_stage_ports": ports, "scene": READY["scene"], "frame_rate": 5.0}
     rig = graph.add(RigSimulatorNode, **boards).rig
     given = {"roboclaw_ports": f"[{', '.join(ports)}]", "roboclaw_addresses": "[128, 129]"}
-    with process(graph, driver="roboclaw", **given) as bridge:
-        armed_and_driving(graph, heard, lambda: bool(np.abs(rig.currents).max() > 0.1))
-        bridge.send_signal(signal.SIGSTOP)
-        graph.wait(lambda: bool(np.abs(rig.currents).max() < 1e-3), "the boards to stop")
-        states.clear()
-        bridge.send_signal(signal.SIGCONT)
+    bridge = process(graph, programs, driver="roboclaw", **given)
+    armed_and_driving(graph, heard, lambda: bool(np.abs(rig.currents).max() > 0.1))
+    bridge.send_signal(signal.SIGSTOP)
+    graph.wait(lambda: bool(np.abs(rig.currents).max() < 1e-3), "the boards to stop")
+    states.clear()
+    bridge.send_signal(signal.SIGCONT)
 
-        def is_in_fault() -> bool:
-            assert np.abs(rig.currents).max() < 1e-3  # from the first moment on
-            return bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT
+    def is_in_fault() -> bool:
+        assert np.abs(rig.currents).max() < 1e-3  # from the first moment on
+        return bool(states) and states[-1].state == CoilBridgeState.STATE_FAULT
 
-        graph.wait(is_in_fault, "the fault", TIMEOUT)
+    graph.wait(is_in_fault, "the fault", TIMEOUT)
 
 
 def test_a_scene_that_waited_while_the_bridge_was_frozen_hides_no_fault(graph, monkeypatch: pytest.MonkeyPatch):
@@ -259,15 +241,6 @@ def test_a_barrier_is_imported_when_the_bridge_starts_or_not_at_all(
     assert "late_barriers" not in sys.modules
 
 
-def test_two_bridges_of_other_names_keep_their_own(graph, tmp_path: Path):
-    node = graph.add(CoilBridgeNode, stop_file=str(tmp_path / "left.stop"), **READY)
-    assert press(graph, EMERGENCY_STOP).success
-    graph.remove(node)
-    graph.remove(graph.add(CoilBridgeNode, stop_file=str(tmp_path / "right.stop"), **READY))
-    assert (tmp_path / "left.stop").read_text() == "stopped\n"
-    assert (tmp_path / "right.stop").read_text() == "disarmed\n"
-
-
 @pytest.mark.parametrize("file", ["/dev/full", "/proc/nowhere/bridge.stop", "/dev"])
 def test_a_stop_that_cannot_be_kept_is_an_error_at_configure(graph, file: str):
     with pytest.raises(InvalidInputError, match=r"coil_bridge\.stop_file: got .*, expected a file that can"):
@@ -280,7 +253,7 @@ def test_a_full_disk_holds_up_no_stop(graph, monkeypatch: pytest.MonkeyPatch):
     graph.wait(lambda: driven(node), "a current")
     seen: list[bool] = []
 
-    def full() -> None:
+    def full(**_: bool) -> None:
         seen.append(bool(applied(node)[-1].any()))
         raise InvalidInputError("stop_file", "No space left on device", "a file that can be written")
 

@@ -27,15 +27,12 @@ from type_description_interfaces.srv import GetTypeDescription
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.node import MAX_REQUEST_ENTRIES
-from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
-from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from test.nodes import wire
-from test.nodes.bridge import LONG, armed, call, drive, driven
+from test.nodes.bridge import LONG, armed, drive, driven
 
-EVERY = (CoilBridgeNode, ThreadModelNode, VisionTrackerNode, RigSimulatorNode, PathFollowerNode, SceneServerNode)
+EVERY = (CoilBridgeNode, ThreadModelNode, RigSimulatorNode)  # two lifecycle nodes, and one without
 HOSTILE_NAMES = ("", " ", "no_such_parameter", "a..b", "\x1b[2J", "x" * 10_000, "use_sim_time.deep")
 HOSTILE_VALUES = (
     ParameterValue(type=200),
@@ -53,51 +50,43 @@ def node(request, graph) -> Any:
     return graph.add(request.param, scene="dish_35mm")
 
 
-def ask(graph, node: Any, kind: Any, name: str, **fields: Any) -> Any:
-    """Call one of the services that rclpy makes for a node."""
-    return call(graph, kind, f"{node.get_name()}/{name}", kind.Request(**fields))
-
-
 def test_requests_that_rclpy_cannot_answer_are_refused(graph, node):
     known = next(iter(node.get_parameters_by_prefix("")))
     hostile = [Parameter(name=name, value=value) for name in (*HOSTILE_NAMES, known) for value in HOSTILE_VALUES]
-    results = ask(graph, node, SetParameters, "set_parameters", parameters=hostile).results
+    results = graph.call(SetParameters, f"{node.get_name()}/set_parameters", parameters=hostile).results
     assert len(results) == len(hostile)
     accepted = [each for each, result in zip(hostile, results, strict=True) if result.successful and each.name != known]
     assert not accepted, [(each.name[:20], each.value.type) for each in accepted]
     assert not any(result.successful for result in results[-len(HOSTILE_VALUES) :][:2])
     assert all(result.reason and len(result.reason) <= 1000 for result in results if not result.successful)
     for each in hostile[::5]:
-        refused = ask(graph, node, SetParametersAtomically, "set_parameters_atomically", parameters=[each]).result
+        refused = graph.call(
+            SetParametersAtomically, f"{node.get_name()}/set_parameters_atomically", parameters=[each]
+        ).result
         assert each.name == known or not refused.successful
     for kind, name in (
         (DescribeParameters, "describe_parameters"),
         (GetParameters, "get_parameters"),
         (GetParameterTypes, "get_parameter_types"),
     ):
-        ask(graph, node, kind, name, names=list(HOSTILE_NAMES))
-        ask(graph, node, kind, name, names=[known] * (MAX_REQUEST_ENTRIES + 1))
-    ask(graph, node, ListParameters, "list_parameters", prefixes=list(HOSTILE_NAMES), depth=2**64 - 1)
-    ask(graph, node, GetTypeDescription, "get_type_description", type_name="no/msg/Such", type_hash="RIHS01_0")
-    answer = ask(graph, node, GetParameters, "get_parameters", names=["use_sim_time"])
+        graph.call(kind, f"{node.get_name()}/{name}", names=list(HOSTILE_NAMES))
+        graph.call(kind, f"{node.get_name()}/{name}", names=[known] * (MAX_REQUEST_ENTRIES + 1))
+    graph.call(ListParameters, f"{node.get_name()}/list_parameters", prefixes=list(HOSTILE_NAMES), depth=2**64 - 1)
+    graph.call(
+        GetTypeDescription, f"{node.get_name()}/get_type_description", type_name="no/msg/Such", type_hash="RIHS01_0"
+    )
+    answer = graph.call(GetParameters, f"{node.get_name()}/get_parameters", names=["use_sim_time"])
     assert answer.values[0].type == ParameterType.PARAMETER_BOOL
-
-
-def test_one_bad_parameter_does_not_hide_what_became_of_the_others(graph):
-    node = graph.add(ThreadModelNode)
-    good = Parameter(name="viscosity", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=2.0))
-    asked = [good, Parameter(name="viscosity", value=ParameterValue(type=200))]
-    results = ask(graph, node, SetParameters, "set_parameters", parameters=asked).results
-    assert [result.successful for result in results] == [True, False]
-    assert node.get_parameter("viscosity").value == 2.0
 
 
 def test_an_armed_bridge_drives_on(graph):
     node = armed(graph, **LONG)
     drive(graph)
     graph.wait(lambda: driven(node), "a current")
-    ask(graph, node, SetParameters, "set_parameters", parameters=[Parameter(name="x", value=HOSTILE_VALUES[0])])
-    assert not ask(graph, node, ChangeState, "change_state", transition=Transition(id=200)).success
+    graph.call(
+        SetParameters, f"{node.get_name()}/set_parameters", parameters=[Parameter(name="x", value=HOSTILE_VALUES[0])]
+    )
+    assert not graph.call(ChangeState, f"{node.get_name()}/change_state", transition=Transition(id=200)).success
     assert node.system.latch.armed
     told = len(node.system.driver.applied)
     graph.wait(lambda: len(node.system.driver.applied) > told, "more steps")
@@ -107,8 +96,8 @@ def test_the_clock_of_a_node_stays_the_one_that_it_was_started_with(graph, node)
     value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
     asked = [Parameter(name="use_sim_time", value=value)]
     for result in (
-        ask(graph, node, SetParameters, "set_parameters", parameters=asked).results[0],
-        ask(graph, node, SetParametersAtomically, "set_parameters_atomically", parameters=asked).result,
+        graph.call(SetParameters, f"{node.get_name()}/set_parameters", parameters=asked).results[0],
+        graph.call(SetParametersAtomically, f"{node.get_name()}/set_parameters_atomically", parameters=asked).result,
     ):
         assert not result.successful
         assert "use_sim_time" in result.reason

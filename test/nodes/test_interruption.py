@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -58,16 +57,3 @@ def test_what_is_raised_already_stays(heeded):
     with pytest.raises(ValueError, match="mine"):
         kept(signal.SIGINT, [], error=ValueError("mine"))
     assert {number: signal.getsignal(number) for number in heeded} == heeded
-
-
-def test_in_another_thread_signals_stay_as_they_are(heeded):
-    found: list[object] = []
-
-    def work() -> None:
-        with Interruption():
-            found.append(signal.getsignal(signal.SIGINT))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert found == [heeded[signal.SIGINT]]

@@ -13,13 +13,12 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion
 from hypothesis import given
 from hypothesis import strategies as st
-from magnetosuture_msgs.msg import CoilBridgeState, PredictedThread, SafetyMargins, ThreadMaterial, TrackerState
+from magnetosuture_msgs.msg import SafetyMargins, TrackerState
 from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.coils.latch import ArmingState
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.geometry.camera import DishView
@@ -31,7 +30,6 @@ from magnetosuture_thread.nodes.topics import topic_of
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import Prediction
-from magnetosuture_thread.thread_model.settings import parse_material
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.look import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
@@ -150,32 +148,6 @@ def test_what_is_packed_is_what_rosbags_and_rclpy_make_of_the_same_message(name:
     assert str(topic_of(channel).decode(serialize_message(message))) == str(message)  # NaN is not equal to itself
 
 
-def test_a_prediction_says_what_it_is_of():
-    message = topics.PREDICTED_THREAD.decode(packing.packed_prediction(7, prediction((0, 3)), "silk", step_time=1e-4))
-    assert (message.formulation, message.scene_version, message.material) == ("rod", "a1", "silk")
-    assert [(point.x, point.y) for point in message.positions] == list(map(tuple, POINTS.tolist()))
-    assert (list(message.contact_nodes), [force.y for force in message.contact_forces]) == ([0, 3], [1e-6, 1e-6])
-    assert (message.needle_force.x, message.needle_force.y, message.needle_moment) == (1e-6, -2e-6, 3e-9)
-    free, stuck, sliding = (
-        PredictedThread.FRICTION_FREE,
-        PredictedThread.FRICTION_STUCK,
-        PredictedThread.FRICTION_SLIDING,
-    )
-    assert list(message.friction_states) == [free, stuck, stuck, stuck, sliding]
-    assert (message.interval, message.substeps, message.residual, message.step_time) == (0.015, 2, 1e-9, 1e-4)
-
-
-def test_an_estimate_says_what_disturbs_the_thread():
-    estimate = an_estimate(2)
-    message = topics.ESTIMATED_THREAD.decode(packing.packed_estimate(7, estimate))
-    assert message.covariance.tolist() == estimate.covariance.ravel().tolist()
-    assert [(each.position.x, each.force, each.since.sec) for each in message.disturbances] == [
-        (0.0, 2e-4, 11),
-        (1.0, 2e-4, 12),
-    ]
-    assert (list(message.problems), message.prediction_only, message.converged) == (["a", "of two words"], False, True)
-
-
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))
 def test_a_pose_goes_there_and_back_also_without_a_message(angle: float, x: float, y: float):
     tail, heading, covariance = (
@@ -192,33 +164,17 @@ def test_a_pose_goes_there_and_back_also_without_a_message(angle: float, x: floa
     assert handed.heading.tobytes() == found.heading.tobytes()
 
 
-def _set_covariance(message: Any) -> None:
-    message.pose.covariance[-1] = math.pi**2
-
-
-def _stand_upright(message: Any) -> None:
-    message.pose.pose.orientation = Quaternion(y=math.sqrt(0.5), w=math.sqrt(0.5))
-
-
 def _orientation(axis: str, value: float) -> Callable[[Any], None]:
     return lambda message: setattr(message.pose.pose.orientation, axis, value)
-
-
-def _stamp(message: Any) -> None:
-    message.header.stamp = Time(sec=2**31 - 1, nanosec=2**32 - 1)
 
 
 @pytest.mark.parametrize(
     ("harm", "problem"),
     [
-        (_set_covariance, "the heading is unknown"),
-        (_stand_upright, "an x axis in the dish plane"),
-        (_stamp, r"header\.stamp\.nanosec"),
-        *(
-            (_orientation(axis, value), "a unit quaternion")
-            for axis in "xw"
-            for value in (0.5, 1e308, math.inf, math.nan)
-        ),
+        (lambda m: m.pose.covariance.__setitem__(-1, math.pi**2), "the heading is unknown"),
+        (lambda m: setattr(m.pose.pose, "orientation", Quaternion(y=0.5**0.5, w=0.5**0.5)), "an x axis in the dish"),
+        (lambda m: setattr(m.header, "stamp", Time(sec=2**31 - 1, nanosec=2**32 - 1)), r"header\.stamp\.nanosec"),
+        *((_orientation("w", value), "a unit quaternion") for value in (0.5, 1e308, math.inf, math.nan)),
     ],
 )
 def test_a_pose_that_is_none_is_refused(harm: Callable[[Any], None], problem: str):
@@ -247,41 +203,25 @@ def test_an_observation_goes_there_and_back():
         np.testing.assert_array_equal(outline, shape)
 
 
-def _broken(message: Any, name: str) -> None:
-    """Make a message one that is refused."""
-    piece = message.pieces[0]
-    if name == "few points":
-        piece.points = piece.points[:1]
-    elif name == "other deviations":
-        piece.deviation = piece.deviation[:-1]
-    elif name == "a point that is none":
-        piece.points[1].x = math.nan
-    elif name == "an end that is none":
-        piece.last_end = 9
-    elif name == "half an interval":
-        piece.arc_length_min, piece.arc_length_max = 0.003, math.nan
-    elif name == "no confidence":
-        piece.confidence = math.nan
-    elif name == "complete in two pieces":
-        message.complete = True
-    elif name == "too many pieces":
-        message.pieces = [piece] * (reading.MAX_PIECES + 1)
-    elif name == "an outline that is none":
-        message.hidden[0].corners = message.hidden[0].corners[:2]
-    else:
-        message.header.frame_id = "camera"
+BROKEN: dict[str, Callable[[Any], None]] = {
+    "few points": lambda m: setattr(m.pieces[0], "points", m.pieces[0].points[:1]),
+    "other deviations": lambda m: setattr(m.pieces[0], "deviation", m.pieces[0].deviation[:-1]),
+    "a point that is none": lambda m: setattr(m.pieces[0].points[1], "x", math.nan),
+    "an end that is none": lambda m: setattr(m.pieces[0], "last_end", 9),
+    "half an interval": lambda m: setattr(m.pieces[0], "arc_length_max", math.nan),
+    "no confidence": lambda m: setattr(m.pieces[0], "confidence", math.nan),
+    "complete in two pieces": lambda m: setattr(m, "complete", True),
+    "too many pieces": lambda m: setattr(m, "pieces", m.pieces[:1] * (reading.MAX_PIECES + 1)),
+    "an outline that is none": lambda m: setattr(m.hidden[0], "corners", m.hidden[0].corners[:2]),
+    "another frame": lambda m: setattr(m.header, "frame_id", "camera"),
+}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("few points", "other deviations", "a point that is none", "an end that is none", "half an interval"),
-        *("no confidence", "complete in two pieces", "too many pieces", "an outline that is none", "another frame"),
-    ],
-)
+@pytest.mark.parametrize("name", BROKEN)
 def test_an_observation_that_is_not_valid_is_refused(name: str):
     message = wire.observation_message(STAMP, observation(4, 5))
-    _broken(message, name)
+    message.pieces[0].arc_length_min, message.pieces[0].arc_length_max = 0.003, 0.004
+    BROKEN[name](message)
     with pytest.raises(InvalidInputError, match="thread/observation"):
         reading.thread_observation(message)
 
@@ -332,30 +272,17 @@ def test_the_minimum_of_every_barrier_is_written_beside_its_node():
     assert {each.ns for each in hidden.markers} == {"thread"}
 
 
-def test_a_material_becomes_parameters():
-    """Plain numbers: of arrays, as messages have them, no parameter is made."""
-    assert parse_material(ThreadMaterial()) == {}
-    message = ThreadMaterial(name="silk_6_0", viscosity=0.9, attachment_offset=[1e-3, 0.0], rest_curvature=[0.0])
-    values = parse_material(message)
-    assert (values["material"], values["viscosity"], values["attachment_offset"]) == ("silk_6_0", 0.9, [1e-3, 0.0])
-    assert {type(value) for value in values.values()} == {str, float, list}
-
-
-def test_the_numbers_of_states_and_markers_are_those_of_the_messages():
-    for name, number in packing.STATES.items():
-        assert getattr(TrackerState, f"STATE_{name}") == number
-    assert CoilBridgeState.STATE_UNCONFIGURED == packing.UNCONFIGURED
-    for name, number in packing.CONDITIONS.items():
-        assert getattr(CoilBridgeState, f"STATE_{name}") == number
-    assert set(packing.STATES) == {state.name for state in State}
-    assert set(packing.CONDITIONS) == {condition.name for condition in ArmingState}
-    kinds = (Marker.ARROW, Marker.CYLINDER, Marker.LINE_STRIP, Marker.SPHERE_LIST, Marker.TEXT_VIEW_FACING)
-    assert kinds == (markers.ARROW, markers.CYLINDER, markers.LINE_STRIP, markers.SPHERE_LIST, markers.TEXT)
-    assert (Marker.TRIANGLE_LIST, Marker.DELETEALL) == (markers.TRIANGLE_LIST, markers.DELETE_ALL)
-
-
 def test_the_bags_and_the_graph_have_the_same_own_messages():
     """The same bytes mean the same in both: a type that was rebuilt in one place only would differ."""
     for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS):
         fields = [name for name, _ in typestore().fielddefs[topic.channel.type_name][1]]
         assert fields == list(topic.message().get_fields_and_field_types())
+
+
+def test_the_numbers_of_states_and_markers_are_those_of_the_messages():
+    for state in State:
+        message = topics.TRACKER_STATE.decode(packing.packed_tracker_state(7, no_pose(state, "", VIEW)))
+        assert message.state == getattr(TrackerState, f"STATE_{state.name}")
+    for kind in markers.MarkerType:
+        assert kind == getattr(Marker, kind.name)
+    assert (markers.ADD, markers.LINE_STRIP) == (Marker.ADD, Marker.LINE_STRIP)

@@ -39,7 +39,6 @@ from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.safety.kinematics import NeedleKinematics
 from magnetosuture_thread.scene import Scene, SceneShape, read_scene
 from test.nodes import wire
-from test.nodes.bridge import applied, armed, reasons
 from test.nodes.scenes import scene_told
 
 NEEDLE = NeedleKinematics(0.0025)
@@ -218,15 +217,6 @@ def test_what_cannot_be_executed_is_aborted_at_once_with_the_reason(graph, make_
     assert not bench.node._session.is_active
 
 
-def test_a_second_procedure_is_refused_while_one_is_executed(graph, make_bench):
-    bench = make_bench()
-    first = bench.run()
-    status, result = bench.result(bench.send(NEAR))
-    assert status == GoalStatus.STATUS_ABORTED
-    assert "none while another is executed" in result.reason
-    assert bench.result(first)[0] == GoalStatus.STATUS_SUCCEEDED
-
-
 def test_a_cancel_brings_the_needle_to_rest_and_another_while_cancelling_does_no_harm(graph, make_bench):
     bench = make_bench()
     goal = bench.run()
@@ -394,15 +384,3 @@ def test_a_node_that_ends_gives_up_and_stops_the_needle(graph, make_bench):
         bench.node.finish()
     graph.wait(lambda: bench.is_in(ProcedureState.STATE_FAILED, "the needle planner has ended"), "the end")
     graph.wait(lambda: not bench.is_commanded(), "the needle to be stopped")
-
-
-def test_a_planner_that_is_killed_leaves_the_needle_at_rest(graph, make_bench):
-    bridge = armed(graph, needle_length=NEEDLE.length, keep_out=2.5e-4, pose_timeout=1.0, prediction_timeout=5.0)
-    bench = make_bench()
-    states = graph.listen(topics.BRIDGE_STATE)
-    bench.real_time = True
-    bench.run()
-    bench.until(lambda: any(currents.any() for currents in applied(bridge)[-3:]), "currents")
-    graph.remove(bench.node)  # without its `finish`, as a crash ends it
-    graph.wait(lambda: "no command for" in reasons(states), "the bridge to miss its commands")
-    assert not applied(bridge)[-1].any()

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
-import rclpy
-from rcl_interfaces.srv import GetParameters
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.nodes import parameter_files
+from magnetosuture_thread.nodes.parameters import init
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 from magnetosuture_thread.resources import find_setup_file
+from test.nodes.programs import TIMEOUT
 
 COMMON = "/**: {ros__parameters: {needle_length: 0.006, thread_length: 0.05}}\n"
 OWN = "/**/path_follower: {ros__parameters: {speed: 0.004}}\n"
@@ -46,7 +44,7 @@ def followed(tmp_path: Path, domain: int):
         given = [part for file in files for part in ("--params-file", str(file))]
         context, node = Context(), None
         try:
-            parameter_files.init(["program", "--ros-args", *given, *arguments], context)
+            init(["program", "--ros-args", *given, *arguments], context)
             cli_args = ["--ros-args", *own] if own else None
             node = PathFollowerNode(context=context, cli_args=cli_args, namespace=namespace)
             speed, length = (float(node.get_parameter(name).value) for name in ("speed", "needle_length"))
@@ -138,48 +136,13 @@ def test_sections_of_others_do_not_matter(followed):
     assert followed([OWN + text], LAB1)[1] == 0.004
 
 
-# As processes, as launch starts them.
-
-
-def started(node: str, *arguments: str) -> subprocess.Popen[str]:
-    """Start a node."""
-    command = [sys.executable, "-m", f"magnetosuture_thread.nodes.{node}", "--ros-args", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def parameters_of(node: str, names: Sequence[str], process: subprocess.Popen[str]) -> dict[str, object]:
-    """Ask a node for its parameters, once it answers."""
-    context = Context()
-    rclpy.init(context=context, args=[])
-    asker = rclpy.create_node("asker", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(asker)
-    try:
-        client = asker.create_client(GetParameters, f"{node}/get_parameters")
-        deadline = time.monotonic() + 120.0
-        while not client.wait_for_service(0.2):
-            assert process.poll() is None, process.communicate()
-            assert time.monotonic() < deadline
-        answer = None
-        while answer is None:  # the node may have found the request's reader before that of the answer
-            assert time.monotonic() < deadline
-            future = client.call_async(GetParameters.Request(names=list(names)))
-            executor.spin_until_future_complete(future, 5.0)
-            answer = future.result()
-        return dict(zip(names, map(parameter_value_to_python, answer.values), strict=True))
-    finally:
-        executor.shutdown()
-        asker.destroy_node()
-        context.try_shutdown()
-
-
-@pytest.mark.parametrize("name", ["coil_bridge", "left_bridge"])
-def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(domain: int, name: str, tmp_path: Path):
+def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(graph, programs, tmp_path: Path):
     """Found from outside: it was active with no obstacles, another dish and another needle, without a warning."""
     extra = tmp_path / "launch.yaml"  # what launch writes of parameters that it is given itself
     extra.write_text("/**: {ros__parameters: {use_sim_time: false, max_speed: 0.011}}")
     files = ("--params-file", str(find_setup_file("hernia_ring")), "--params-file", str(extra))
-    process = started("coil_bridge", "-r", f"__node:={name}", "-r", "__ns:=/lab1", *files)
+    names = ("-r", "__node:=left_bridge", "-r", "__ns:=/lab1")
+    programs.start("coil_bridge", *names, *files, environment=graph_environment(graph.domain))
     expected = {
         "scene": "hernia_ring",
         "needle_length": 0.0025,
@@ -188,35 +151,18 @@ def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(domain: int, nam
         "max_speed": 0.011,
         "driver": "recording",
     }
-    try:
-        assert parameters_of(f"/lab1/{name}", list(expected), process) == expected
-    finally:
-        process.terminate()
-        process.communicate(timeout=20)
+    client = AsyncParameterClient(graph.probe, "/lab1/left_bridge")
+    graph.wait(client.services_are_ready, "the parameter services", TIMEOUT)
+    answers: list[Any] = []
 
+    def answered() -> bool:
+        # The node may have found the request's reader before that of the answer.
+        if not answers or (not answers[-1].done() and time.monotonic() > asked[0] + 1.0):
+            asked[0] = time.monotonic()
+            answers.append(client.get_parameters(list(expected)))
+        return any(answer.done() for answer in answers)
 
-@pytest.mark.parametrize(
-    ("node", "text", "words"),
-    [
-        ("coil_bridge", "coil_bridge: {ros__parameters: {max_speed: 0.01}}", "got 'coil_bridge', expected one for"),
-        ("thread_model", "/thread_model: {ros__parameters: {segments: 20}}", "got 'thread_model', expected one for"),
-        ("console", "console: {ros__parameters: {port: 0}}", "expected one for /lab1/console: "),
-        ("rig_simulator", "/**/thread_model: {ros__parameters: {segments: 20}}", "got '/**/thread_model', expected"),
-        ("vision_tracker", "", "parameter file: got None, expected sections by node"),
-        ("path_follower", None, "parameter file: got 'No such file or directory', expected a readable YAML file"),
-    ],
-)
-def test_a_node_of_whose_file_nothing_applies_does_not_start(
-    domain: int, node: str, text: str | None, words: str, tmp_path: Path
-):
-    file = tmp_path / "old.yaml"
-    if text is not None:
-        file.write_text(text)
-    process = started(node, "-r", "__ns:=/lab1", "--params-file", str(file))
-    _, said = process.communicate(timeout=300)
-    assert process.returncode == 1
-    errors = [line for line in said.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1, said
-    assert errors[0].startswith(f"error: {file}: ")
-    assert words in errors[0]
-    assert "Traceback" not in said
+    asked = [0.0]
+    graph.wait(answered, "an answer")
+    answer = next(each.result() for each in answers if each.done())
+    assert dict(zip(expected, map(parameter_value_to_python, answer.values), strict=True)) == expected

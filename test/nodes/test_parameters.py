@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pytest
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.nodes.parameters import Changeable, declare
+from magnetosuture_thread.nodes.lifecycle import ManagedNode
+from magnetosuture_thread.nodes.parameters import plain_value
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings
@@ -50,6 +50,7 @@ class Oven(Configuration):
     trays: int = quantity(2, "how many", minimum=0, maximum=10)
     dishes: tuple[float, ...] = quantity((), "weight of each", unit="kg", minimum=0.0, maximum=9.0)
     owners: tuple[str, ...] = quantity((), "names")
+    autostart: str = quantity("active", "state that it enters by itself")
 
     def check(self) -> None:
         """Refuse a cold fire."""
@@ -57,36 +58,58 @@ class Oven(Configuration):
             raise ConfigurationError("oven.temperature", self.temperature, "at least 300 K when lit")
 
 
-class Kitchen:
-    """Oven settings that a node's parameters change, and what came of it."""
+class OvenNode(ManagedNode[Oven]):
+    """A node whose oven can be changed while it is configured, but for the trays."""
 
-    def __init__(self, node: Node) -> None:
-        self.node, self.in_force, self.refusal = node, Oven(), ""
-        declare(node, Oven, read_only=False)
-        self.changeable = Changeable(node, self.in_force, self._prepare)
+    def __init__(self, **options: Any) -> None:
+        super().__init__("oven", Oven, fixed={"trays": "they are counted once"}, **options)
+        self.in_force = Oven()
+        self.start()
 
-    def _prepare(self, settings: Oven) -> Callable[[], None]:
-        if self.refusal:
-            raise ConfigurationError("oven.dishes", list(settings.dishes), self.refusal)
+    def allocate(self, settings: Oven) -> None:
+        """Take the settings."""
+        self.in_force = settings
+
+    def activate(self) -> None:
+        """Do nothing."""
+
+    def deactivate(self) -> None:
+        """Do nothing."""
+
+    def release(self) -> None:
+        """Do nothing."""
+
+    def prepare(self, settings: Oven) -> Callable[[], None]:
+        """Return what changes the oven; eight kilogrammes do not fit."""
+        if sum(settings.dishes) > 8.0:
+            raise ConfigurationError("oven.dishes", list(settings.dishes), "at most 8 kg together")
         return lambda: setattr(self, "in_force", settings)
+
+
+class Kitchen:
+    """An oven that is changed as by its parameter services."""
+
+    def __init__(self, graph: Any) -> None:
+        self.node = graph.add(OvenNode)
+
+    @property
+    def in_force(self) -> Oven:
+        """The settings in force, which the parameters are."""
+        told = {about.name: plain_value(self.node.get_parameter(about.name)) for about in configuration_fields(Oven)}
+        assert told == to_mapping(self.node.in_force) == to_mapping(self.node.settings)
+        return self.node.in_force
 
     def set(self, **values: Any) -> str:
         """Set parameters at once; return why they were refused."""
-        given = [Parameter(name, value=value) for name, value in values.items()]
-        result = self.node.set_parameters_atomically(given)
-        assert self.changeable.settings == self.in_force
-        told = {about.name: self.node.get_parameter(about.name).value for about in configuration_fields(Oven)}
-        assert {name: list(v) if hasattr(v, "typecode") else v for name, v in told.items()} == to_mapping(self.in_force)
+        result = self.node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
         assert result.successful == (not result.reason)
         return str(result.reason)
 
 
 @pytest.fixture
-def kitchen(graph):
+def kitchen(graph) -> Kitchen:
     """An oven in a graph."""
-    made = Kitchen(graph.probe)
-    yield made
-    graph.probe._on_set_parameters_callbacks.clear()
+    return Kitchen(graph)
 
 
 def test_a_change_is_in_force_at_once(kitchen):
@@ -120,6 +143,8 @@ def test_whole_numbers_and_empty_lists_are_taken_as_in_a_file(kitchen):
         ({"dishes": [1.0] * 5000}, "oven.dishes: got '5000 entries', expected at most 1000"),
         ({"lit": True}, "at least 300 K when lit; what belongs together is set at once"),
         ({"lit": True, "temperature": 299.0}, "at least 300 K when lit$"),
+        ({"dishes": [4.5, 4.5]}, "oven.dishes: got .4.5, 4.5., expected at most 8 kg together"),
+        ({"trays": 3}, "oven.trays: got 3, expected its value in force, until the node is cleaned up"),
         ({"dishes": [99.0] * 1000}, r"^oven.dishes: got \[99.0.*…, expected a list from 0 to 9 kg$"),
     ],
 )

@@ -58,31 +58,6 @@ def test_a_pose_that_was_long_on_its_way_gives_no_command(graph):
     graph.wait(lambda: bool(commands), "a command")
 
 
-def test_at_the_end_it_says_done(graph):
-    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.0071, 0.0], tolerance=0.0002)
-    graph.listen(topics.NEEDLE_COMMAND)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-    seconds = 5.0
-
-    def done() -> bool:
-        nonlocal seconds
-        seconds += 1 / 60
-        graph.publish(topics.NEEDLE_POSE, pose(seconds, 0.0))
-        return any(d.status[0].message == "done" for d in diagnostics)
-
-    graph.wait(done, "the end of the path")
-
-
-def test_it_does_not_begin_before_anybody_takes_its_commands(graph):
-    graph.add(PathFollowerNode, settle=0.0, waypoints=[0.02, 0.0])
-    setpoints, diagnostics = graph.listen(topics.TIP_SETPOINT), graph.listen(topics.DIAGNOSTICS)
-    graph.publish(topics.NEEDLE_POSE, pose(5.0, 0.0))
-    graph.wait(
-        lambda: any(d.status[0].message == "no subscriber to velocity commands" for d in diagnostics), "the reason"
-    )
-    assert setpoints == []
-
-
 def test_a_path_that_another_scene_blocks_is_not_followed_until_it_is_free_again(graph):
     graph.add(PathFollowerNode, settle=0.0, waypoints=[0.012, 0.0], scene="dish_35mm")
     commands, diagnostics = graph.listen(topics.NEEDLE_COMMAND), graph.listen(topics.DIAGNOSTICS)

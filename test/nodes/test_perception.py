@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import time
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,11 +13,10 @@ from rclpy.parameter import Parameter
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.perception import perception
-from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
+from magnetosuture_thread.nodes.processes import reserved_domain
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from test.nodes.conftest import Graph, own_context
-from test.nodes.test_run import heard as is_heard
 from test.nodes.test_vision_tracker import compressed
 
 FRAMES = 8
@@ -99,73 +93,3 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
     apart, joined = said
     assert len(apart[0]) == FRAMES - 2
     assert apart == joined
-
-
-SETUP = """
-/**:
-  ros__parameters:
-    scene: dish_35mm
-/**/vision_tracker:
-  ros__parameters:
-    thread_length: {tracker}
-/**/thread_model:
-  ros__parameters:
-    thread_length: {model}
-    segments: 12
-"""
-
-
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
-def test_perception_process_ends_on_a_signal(tmp_path: Path, end: signal.Signals):
-    path = tmp_path / "setup.yaml"
-    path.write_text(SETUP.format(tracker=0.018, model=0.018))
-    with reserved_domain() as domain, (tmp_path / "log").open("wb") as log:
-        environment = graph_environment(domain)
-        command = [sys.executable, "-m", "magnetosuture_thread.nodes.perception", "--ros-args"]
-        process = subprocess.Popen(
-            [*command, "--params-file", str(path), "-r", "__ns:=/lab1"], env=environment, stdout=log, stderr=log
-        )
-        try:
-            assert is_heard("lab1/vision_tracker", environment)
-            assert is_heard("lab1/thread_model", environment)
-            deadline = time.monotonic() + 60.0  # a node is heard while it still loads its kernels
-            while "ready: 12 segments" not in (tmp_path / "log").read_text() and time.monotonic() < deadline:
-                time.sleep(0.05)
-            process.send_signal(end)
-            assert process.wait(20) == 0
-        finally:
-            process.kill()
-    said = (tmp_path / "log").read_text()
-    assert "Traceback" not in said
-    assert "ready: 12 segments" in said
-
-
-@pytest.mark.parametrize(
-    ("tracker", "model", "arguments", "words"),
-    [
-        (0.018, 18.0, (), "thread_model.thread_length: got 18.0, expected a number from"),
-        (18.0, 0.018, (), "vision_tracker.thread_length: got 18.0, expected a number from"),
-        (0.018, 0.018, ("-r", "__node:=both"), "two nodes cannot both be named both"),
-    ],
-)
-def test_a_node_that_cannot_start_ends_the_program_with_one_line(
-    tmp_path: Path, tracker: float, model: float, arguments: tuple[str, ...], words: str
-):
-    path = tmp_path / "setup.yaml"
-    text = SETUP if not arguments else ""
-    path.write_text(text.format(tracker=tracker, model=model))
-    given = ["--params-file", str(path)] if text else []
-    with reserved_domain() as domain:
-        ended = subprocess.run(
-            [sys.executable, "-m", "magnetosuture_thread.nodes.perception", "--ros-args", *given, *arguments],
-            env=graph_environment(domain),
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-    assert ended.returncode == 1
-    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1
-    assert words in errors[0]
-    assert "Traceback" not in ended.stderr

@@ -1,24 +1,28 @@
-"""Every node as its program: a terminal's Ctrl-C reaches it twice, at any time, and it ends in order."""
+"""Every node as its program: it starts, ends in order at any time, and says in one line what it cannot start with."""
 
 from __future__ import annotations
 
 import random
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.nodes.processes import graph_environment, reserved_domain
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.program import MAKERS
+from magnetosuture_thread.nodes.run import raise_priority
+from test.nodes.programs import TIMEOUT
 
 ROOT = Path(__file__).parent.parent.parent
-PROGRAMS = re.findall(
-    r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', (ROOT / "pyproject.toml").read_text(), re.M
-)
+PROGRAMS = (*MAKERS, "console")
 # As an installed script does. It says when it loads: while Python itself starts, nobody can catch a signal.
 SCRIPT = """
 import sys
@@ -31,81 +35,206 @@ def reported(name):
 program.import_module = reported
 sys.exit(program.main())
 """
-WITHIN = 4.0  # s after the beginning: amid imports, the making of a node, or its work
-TIMEOUT = 90.0  # s
-# A compiler that lets no handler of Python run for hours; it says so once it is at work.
+SETUP = """
+/**: {{ros__parameters: {{scene: dish_35mm}}}}
+/**/vision_tracker: {{ros__parameters: {{thread_length: {tracker}}}}}
+/**/thread_model: {{ros__parameters: {{thread_length: {model}, segments: 12}}}}
+"""
 
 
-@pytest.fixture
-def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """An environment on a domain of its own."""
-    with reserved_domain() as domain:
-        yield {**graph_environment(domain), "XDG_STATE_HOME": str(tmp_path)}
+def test_the_installed_programs_are_those_that_can_be_run():
+    text = (ROOT / "pyproject.toml").read_text()
+    assert set(re.findall(r'^(\w+) = "magnetosuture_thread\.nodes\.program:main"$', text, re.M)) == set(PROGRAMS)
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
+@pytest.mark.parametrize("name", ["coil_bridge", "console"])
 def test_two_interruptions_at_any_time_end_a_node_in_order(name: str, environment: dict[str, str]):
+    """As a terminal's Ctrl-C, which comes from launch too: amid imports, the making of a node, or its work."""
     moments = random.Random(name)
-    for _ in range(2):
-        command = [sys.executable, "-c", SCRIPT, name, "--ros-args", "-p", "scene:=dish_35mm"]
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+    command = [sys.executable, "-c", SCRIPT, name, "--ros-args", "-p", "scene:=dish_35mm"]
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == "begins\n"
-            time.sleep(moments.uniform(0.0, WITHIN))
+            time.sleep(moments.uniform(0.0, 4.0))
             process.send_signal(signal.SIGINT)
             time.sleep(moments.uniform(0.0, 0.5))
             process.send_signal(signal.SIGINT)
             output, _ = process.communicate(timeout=TIMEOUT)
         finally:
             process.kill()
-        assert process.returncode == 0, output
-        assert "Traceback" not in output
-
-
-def ended(command: list[str], environment: dict[str, str], word: str, which: signal.Signals) -> tuple[int, str]:
-    """Start a node, send it a signal as soon as it logs a word, and return its exit code and what it logged."""
-    arguments = ["--ros-args", "-p", "scene:=dish_35mm"]
-    process = subprocess.Popen(
-        [sys.executable, *command, *arguments],
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        before = ""
-        while word not in before:
-            line = process.stdout.readline()
-            assert line, before
-            before += line
-        process.send_signal(which)
-        output, _ = process.communicate(timeout=TIMEOUT)
-    finally:
-        process.kill()
-    return process.returncode, before + output
-
-
-@pytest.mark.parametrize("name", ["vision_tracker", "coil_bridge"])
-@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_compiles_ends_in_order(name: str, which: signal.Signals, environment, tmp_path: Path):
-    without_cache = {**environment, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    code, output = ended(["-m", f"magnetosuture_thread.nodes.{name}"], without_cache, "compiling", which)
-    assert code == 0, output
+    assert process.returncode == 0, output
     assert "Traceback" not in output
-    assert "ready" not in output
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_without_ros_a_node_ends_with_one_line_that_names_it(name: str):
+@pytest.mark.parametrize(
+    ("name", "which"),
+    [*((name, signal.SIGINT) for name in PROGRAMS), *((name, signal.SIGTERM) for name in ("perception", "console"))],
+)
+def test_a_node_reports_and_ends_when_it_is_asked_to(graph, programs, name: str, which: signal.Signals):
+    reports = graph.listen_later(topics.DIAGNOSTICS)
+    given = ["-p", "port:=0"] if name == "console" else []
+    environment = graph_environment(graph.domain)
+    process = programs.start(name, "-r", "__ns:=/lab1", "-p", "scene:=dish_35mm", *given, environment=environment)
+    nodes = ("vision_tracker", "thread_model") if name == "perception" else (name,)
+
+    def heard(node: str) -> bool:
+        assert process.poll() is None, process.output
+        return any(report.status[0].name == f"lab1/{node}: state" for report in reports)
+
+    graph.wait(lambda: all(map(heard, nodes)), "its reports", TIMEOUT)
+    process.send_signal(which)
+    process.send_signal(which)
+    assert process.wait() == 0, process.output
+    assert "Traceback" not in process.output
+
+
+def test_a_node_that_compiles_ends_in_order(programs, environment: dict[str, str], tmp_path: Path):
+    command = [sys.executable, "-m", "magnetosuture_thread.nodes.program", "coil_bridge"]
+    without_cache = {**environment, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    with subprocess.Popen(
+        command, env=without_cache, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            output = ""
+            while "compiling" not in output:
+                line = process.stdout.readline()
+                assert line, output
+                output += line
+            process.send_signal(signal.SIGTERM)
+            output += process.communicate(timeout=TIMEOUT)[0]
+        finally:
+            process.kill()
+    assert process.returncode == 0, output
+    assert "Traceback" not in output
+
+
+def test_without_ros_a_node_ends_with_one_line_that_names_it():
     without = "import sys; sys.modules['rclpy'] = None; sys.argv[0] = sys.argv[1]; " + (
         "from magnetosuture_thread.nodes.program import main; sys.exit(main())"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", without, name], capture_output=True, text=True, timeout=TIMEOUT, check=False
-    )
+    command = [sys.executable, "-c", without, "thread_model"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, check=False)
     assert run.returncode == 1
     assert re.fullmatch(r"error: .*rclpy.*; nodes and the live graph need ROS 2 Jazzy: .*\n", run.stderr)
+
+
+LAB1 = ("-r", "__ns:=/lab1")
+REFUSED: list[tuple[str, str | None, tuple[str, ...], str]] = [  # program, parameter file, arguments, words
+    ("vision_tracker", "vision_tracker: {ros__parameters: {needle_width: 35.0}}", (), "needle_width: got 35.0"),
+    ("thread_model", "thread_model: {ros__parameters: {segmens: 20}}", (), "thread_model.segmens: got 20"),
+    ("coil_bridge", "coil_bridge: {ros__parameters: {max_speed: [oops}}", (), "expected valid YAML"),
+    ("coil_bridge", "coil_bridge: {ros__parameters: {rate: 50.0}}", LAB1, "got 'coil_bridge', expected one for"),
+    ("console", "console: {ros__parameters: {port: 0}}", LAB1, "expected one for /lab1/console: "),
+    ("rig_simulator", "/**/thread_model: {ros__parameters: {segments: 20}}", LAB1, "got '/**/thread_model', expected"),
+    ("vision_tracker", "", LAB1, "parameter file: got None, expected sections by node"),
+    ("path_follower", None, LAB1, "parameter file: got 'No such file or directory', expected a readable YAML file"),
+    ("perception", SETUP.format(tracker=0.018, model=18.0), (), "thread_model.thread_length: got 18.0, expected a"),
+    ("perception", SETUP.format(tracker=18.0, model=0.018), (), "vision_tracker.thread_length: got 18.0, expected a"),
+    ("perception", SETUP.format(tracker=0.018, model=0.018), ("-r", "__node:=both"), "cannot both be named both"),
+    ("scene_server", "/**: {ros__parameters: {scene: nowhere}}", (), "scene: got 'nowhere', expected a YAML"),
+    ("console", "/**: {ros__parameters: {scene: nowhere}}", (), "scene: got 'nowhere', expected a YAML"),
+    ("console", "/**: {ros__parameters: {address: 0.0.0.0}}", (), "a token, as 0.0.0.0 can be reached"),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "arguments", "words"), REFUSED)
+def test_what_a_node_cannot_start_with_is_said_in_one_line(
+    programs, environment, tmp_path: Path, name: str, text: str | None, arguments: tuple[str, ...], words: str
+):
+    path = tmp_path / "setup.yaml"
+    if text is not None:
+        path.write_text(text)
+    process = programs.start(name, "--params-file", str(path), *arguments, environment=environment)
+    assert process.wait() == 1
+    assert len(process.errors) == 1, process.output
+    assert words in process.errors[0]
+    assert "Traceback" not in process.output
+
+
+def test_a_node_that_ends_is_noticed_with_its_last_words(tmp_path: Path, environment: dict[str, str]):
+    path = tmp_path / "bad.yaml"
+    path.write_text("thread_model: {ros__parameters: {thread_length: 19.0}}\n")
+    arguments, words = ["--params-file", str(path)], r"thread_model ended with exit code 1: error: thread_model\.thread"
+
+    def watch(nodes: NodeProcesses) -> None:
+        deadline = time.monotonic() + TIMEOUT
+        while time.monotonic() < deadline:
+            nodes.check()
+            time.sleep(0.02)
+
+    with (
+        NodeProcesses(["thread_model"], arguments, environment, tmp_path / "logs") as nodes,
+        pytest.raises(GraphError, match=words),
+    ):
+        watch(nodes)
+
+
+def test_processes_are_ended_whatever_happens(tmp_path: Path, environment: dict[str, str]):
+    nodes = NodeProcesses(["coil_bridge", "thread_model"], [], environment, tmp_path / "logs")
+
+    def interrupted() -> None:
+        with nodes:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    with pytest.raises(GraphError, match="ended"):
+        nodes.check()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_nodes_end_when_their_parent_is_killed(tmp_path: Path, environment: dict[str, str]):
+    program = f"""
+import os, time
+from pathlib import Path
+from magnetosuture_thread.nodes.processes import NodeProcesses
+with NodeProcesses(["coil_bridge"], [], dict(os.environ), Path({str(tmp_path)!r})) as nodes:
+    print(next(iter(nodes._processes.values())).pid, flush=True)
+    time.sleep(60)
+"""
+    parent = subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    child = Path(f"/proc/{parent.stdout.readline().strip()}")
+    until(lambda: "driver" in (tmp_path / "coil_bridge.log").read_text())
+    assert child.exists()
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    until(lambda: not child.exists())
+
+
+def test_a_process_that_has_ended_or_may_not_be_raised_is_no_error():
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    assert raise_priority(3, process.pid).startswith("ordinary; real-time priority 3 refused (No such file")
+    assert raise_priority(0) == "ordinary"
+
+
+def test_a_domain_is_given_once_and_not_where_somebody_is():
+    with reserved_domain() as first, reserved_domain() as second:
+        assert first != second
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+            somebody.bind(("127.0.0.1", 7400 + 250 * (second % 100 + 1) + 10 + 2 * 119))
+            with reserved_domain() as third:
+                assert third not in (first, second, second % 100 + 1)
+
+
+def test_nothing_leads_the_graph_out_of_this_machine(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ROS_STATIC_PEERS", "192.0.2.1")
+    monkeypatch.setenv("ROS_DISCOVERY_SERVER", "192.0.2.1:11811")
+    environment = graph_environment(7)
+    assert "ROS_STATIC_PEERS" not in environment
+    assert "ROS_DISCOVERY_SERVER" not in environment
+    assert environment["ROS_DOMAIN_ID"] == "7"
+    assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"

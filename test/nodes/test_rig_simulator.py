@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
-from std_srvs.srv import SetBool
 
-from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
-from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.interface import PAUSE_RIG
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
@@ -141,68 +135,6 @@ def test_a_fault_can_be_asked_for_now(graph):
     graph.publish(topics.FAULT_REQUEST, String(data="sunshine 60"))
     graph.wait(lambda: any("expected KIND DURATION" in text for text in refusals(diagnostics)), "a refusal")
     assert [fault.kind for fault in node.rig.faults.faults] == ["glare"]
-
-
-def test_a_driver_moves_the_needle_through_simulated_boards(graph, tmp_path):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    ports = (str(tmp_path / "a"), str(tmp_path / "b"))
-    node = graph.add(RigSimulatorNode, power_stage="roboclaw", power_stage_ports=list(ports), **SMALL)
-    driver = RoboClawDriver(CoilBridgeSettings(roboclaw_ports=ports, roboclaw_addresses=(128, 129)))
-    driver.open()
-    try:
-        graph.wait(lambda: driver.state().ready and len(needles) > 3, "the boards")
-        assert needles[-1].pose.position.x == pytest.approx(0.003, abs=1e-8)
-
-        def pulled() -> bool:
-            driver.apply(np.array([5.0, 0.0, -2.0, 0.0]), time.monotonic())
-            return bool(needles[-1].pose.position.x > 0.0035)
-
-        graph.wait(pulled, "the needle to move")
-    finally:
-        driver.close()
-    graph.wait(lambda: bool(np.abs(node.rig.currents).max() < 1e-3), "the currents to go")
-    graph.remove(node)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_paused_rig_stands_still_and_goes_on_from_there_with_stamps_of_now(graph):
-    needles = graph.listen_later(topics.GROUND_TRUTH_NEEDLE)
-    node = graph.add(RigSimulatorNode, **SMALL)
-    console = graph.probe.create_client(SetBool, PAUSE_RIG)
-
-    def pulled(distance: float) -> bool:
-        graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
-        return bool(needles and needles[-1].pose.position.x > 0.003 + distance)
-
-    def pause(still: bool) -> None:
-        answer = console.call_async(SetBool.Request(data=still))
-        graph.wait(answer.done, "an answer")
-        assert answer.result().success
-
-    graph.wait(console.service_is_ready, "the service")
-    graph.wait(lambda: pulled(2e-4), "the needle to move")
-    pause(True)
-    elapsed, taken = node.time.elapsed(), node.rig.time
-    graph.wait(lambda: len(needles) == later(graph, needles), "no more frames")
-    paused_at, where = graph.probe.get_clock().now().nanoseconds, needles[-1].pose.position.x
-    graph.publish(topics.RIG_CURRENTS, currents(graph, 5, 0, -2, 0))
-    graph.wait(lambda: graph.probe.get_clock().now().nanoseconds - paused_at > 3e8, "a while")
-    count = len(needles)
-    assert (node.time.elapsed(), node.rig.time) == (elapsed, pytest.approx(taken, abs=0.1))
-    pause(False)
-    graph.wait(lambda: len(needles) > count, "frames again")
-    first = needles[count]
-    assert first.pose.position.x == pytest.approx(where, abs=5e-4)
-    assert nanoseconds(first.header.stamp) > paused_at + 2e8
-    assert nanoseconds(first.header.stamp) <= graph.probe.get_clock().now().nanoseconds
-    graph.wait(lambda: pulled(8e-4), "the needle to move on")
-
-
-def later(graph, needles) -> int:
-    """Return how many there are once three frames more could have come."""
-    until = graph.probe.get_clock().now().nanoseconds + 1e8
-    graph.wait(lambda: graph.probe.get_clock().now().nanoseconds > until, "three frames' time")
-    return len(needles)
 
 
 def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):

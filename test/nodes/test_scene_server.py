@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-import pytest
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
 from magnetosuture_thread.scene.editing import MAX_SHAPE_CHARS
@@ -41,15 +36,11 @@ class Server:
         self.scenes = graph.listen(topics.SCENE)
         self.markers = graph.listen(topics.SCENE_MARKERS)
         self.reports = graph.listen(topics.DIAGNOSTICS)
-        self.clients = {name: graph.probe.create_client(kind, service) for name, (service, kind) in SERVICES.items()}
 
     def ask(self, name: str, /, **fields: str) -> Any:
         """Call a service and return its answer."""
-        client = self.clients[name]
-        self.graph.wait(client.service_is_ready, f"the service {name}")
-        answer = client.call_async(SERVICES[name][1].Request(**fields))
-        self.graph.wait(answer.done, f"the answer of {name}")
-        return answer.result()
+        service, kind = SERVICES[name]
+        return self.graph.call(kind, service, **fields)
 
     def change(self, name: str, /, **fields: str) -> Any:
         """Call a service that shall succeed, and return the scene that is then published."""
@@ -106,15 +97,10 @@ def test_without_a_scene_only_loading_one_is_possible(graph):
 
 HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dead_end"),
-    ("load", {"file": "/dev/zero"}, "scene: got '/dev/zero', expected a YAML or GeoJSON file"),
     ("load", {"file": "FIFO"}, "scene: got '"),
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
-    ("load", {"file": "../../etc/nowhere"}, "scene: got '../../etc/nowhere', expected a YAML or GeoJSON file"),
     ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
-    ("add", {"name": "x" * 65, "shape": DISC}, "name: got '65 characters', expected at most 64"),
-    ("add", {"name": "a\nb", "shape": DISC}, "shapes: got 'a\\nb', expected names of"),
     ("add", {"name": "post", "shape": DISC}, "post: got 'a name given twice', expected a name of its own"),
-    ("add", {"name": "a", "shape": ""}, "a: got None, expected a shape, one of disc"),
     (
         "add",
         {"name": "a", "shape": "{disc: {center: [1, 2], radius: 0.5}"},
@@ -123,7 +109,6 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
     ("add", {"name": "a", "shape": "{disc: {center: [1, 1], radius: 0.1}}"}, "a: got 'a shape outside of the dish"),
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: -0.1}"}, "a.friction: got -0.1"),
-    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: 1e9}"}, "a.friction: got 1"),
     ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
     ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
     (
@@ -132,7 +117,6 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
         "shape: got '300001 characters', expected at most 300",
     ),
     ("replace", {"name": "none", "shape": DISC}, "shape.name: got 'none', expected one of post"),
-    ("remove", {"name": "none"}, "shape.name: got 'none', expected one of post"),
     ("remove", {"name": "x" * 100_000}, "shape.name: got 'xxxxxxxx"),
 ]
 
@@ -152,14 +136,3 @@ def test_hostile_requests_are_answered_in_one_line_and_change_nothing(graph, tmp
     graph.wait(lambda: server.said("refused: shape.name: got 'xxx"), "the last refusal on /diagnostics")
     assert server.change("remove", name="post").names == ()
     assert len(server.scenes) == 2
-
-
-def test_a_scene_that_cannot_be_read_does_not_start_the_node(graph):
-    with pytest.raises(ConfigurationError, match="scene: got 'nowhere'"):
-        graph.add(SceneServerNode, scene="nowhere")
-    command = [sys.executable, "-m", "magnetosuture_thread.nodes.scene_server", "--ros-args", "-p", "scene:=nowhere"]
-    environment = graph_environment(graph.domain)
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment, check=False)
-    assert ended.returncode == 1
-    assert "error: scene: got 'nowhere', expected a YAML or GeoJSON file, or one of dead_end" in ended.stderr
-    assert ended.stderr.count("\n") == 1

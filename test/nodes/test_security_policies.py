@@ -16,10 +16,9 @@ from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import PROCESSES, RIG_NODES, SCENE_SERVER
 from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.nodes.console.graph import ConsoleGraph
-from magnetosuture_thread.nodes.diagnostics import Health
+from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
-from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.nodes.node import GuardedNode, Health
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.nodes.scene_server import SceneServerNode

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
 from magnetosuture_msgs.msg import SafetyMargins
 
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.thread.prediction import NeedlePose
@@ -116,18 +114,6 @@ def test_every_frame_has_an_estimate_beside_the_prediction(bench: Bench):
     bench.graph.wait(bench.hears("predicting"), "the state")
 
 
-def test_a_frame_without_an_observation_is_only_predicted_and_says_since_when(bench: Bench):
-    bench.show(0)
-    for k in (1, 2, 45):
-        bench.pose(k)
-        bench.wait_for_estimate(k)
-        message = bench.estimated[-1]
-        assert (message.prediction_only, message.hidden, message.points) == (True, 1.0, 0)
-        assert message.unmeasured_for == pytest.approx(k / 30.0, abs=1e-6)
-        assert message.innovation_degrees == 0
-    bench.graph.wait(bench.hears("only a prediction since 1 s"), "a warning")
-
-
 def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(bench: Bench):
     for k in range(3):
         bench.show(k)
@@ -147,56 +133,27 @@ def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(benc
     assert not bench.estimated[-1].prediction_only
 
 
-def test_what_holds_the_thread_unknown_to_the_model_is_reported(bench: Bench):
-    disc, way = Disc((0.0, -2.2e-3), 1.7e-3), poses(150, turn=-0.9)
-    held = true_shapes(thread_of(), way, (disc,))
-    gap = np.linalg.norm(held - np.array(disc.centre), axis=2).min(axis=1) - disc.radius
-    contact = int(np.flatnonzero(gap < 5e-5)[0])
-    for k in range(contact + 16):
-        message = bench.show(k, whole(held[k], k), way[k])
-        if message.disturbances:
-            break
-    assert contact <= k <= contact + 15  # within half a second
-    found = message.disturbances[0]
-    assert math.hypot(found.position.x - disc.centre[0], found.position.y - disc.centre[1]) < 4e-3
-    assert found.force > 0.0
-    bench.graph.wait(bench.hears("held at"), "a warning")
-    warned = next(each.status[0] for each in bench.reports if "held at" in each.status[0].message)
-    assert warned.level == DiagnosticStatus.WARN
-    assert "N " in warned.message.split("held at")[1]  # so many mN or uN to a side
-
-
 def spoiled(name: str) -> tuple[float, ThreadObservation]:
     """Return when an observation that cannot be used is stamped, in frames after the third, and it."""
     good = piece_of(NODES[3], 3)
-    if name in ("doubled", "future", "long ago"):
-        return {"doubled": -1.0, "future": 1800.0, "long ago": -20.0}[name], whole(NODES[3], 3)
+    if name == "future":
+        return 1800.0, whole(NODES[3], 3)
     if name == "not finite":
         points = good.points.copy()
         points[3, 0] = math.nan
         return 0.0, ThreadObservation((replace(good, points=points),))
-    if name == "another thread":
-        off = good.points + np.array([0.0, 8e-3])
-        loose = replace(good, points=off, first_end=PieceEnd.UNKNOWN, last_end=PieceEnd.UNKNOWN)
-        return 0.0, ThreadObservation((replace(loose, arc_length=(math.nan, math.nan)),))
-    if name == "pieces doubled":
-        return 0.0, ThreadObservation((good, replace(good)))
-    assert name == "ten thousand points"
-    count = 10_000
-    many = np.column_stack([np.interp(np.linspace(0, 25, count), np.arange(26), NODES[3, :, axis]) for axis in (0, 1)])
-    return 0.0, ThreadObservation((replace(good, points=many, deviation=np.full(count, 2e-5)),))
+    assert name == "another thread"
+    off = good.points + np.array([0.0, 8e-3])
+    loose = replace(good, points=off, first_end=PieceEnd.UNKNOWN, last_end=PieceEnd.UNKNOWN)
+    return 0.0, ThreadObservation((replace(loose, arc_length=(math.nan, math.nan)),))
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("doubled", "second observation of the same frame"),
         ("future", "after the last pose"),
-        ("long ago", "the stamp of a pose that is kept"),
         ("not finite", "thread/observation"),
         ("another thread", "it is of another one"),
-        ("pieces doubled", "another one shows the thread already"),
-        ("ten thousand points", "2 to 4096"),
     ],
 )
 def test_an_observation_that_cannot_be_used_is_survived_and_reported(bench: Bench, name: str, words: str):

@@ -77,12 +77,6 @@ def forecast_after(bench: Any, forecasts: list[Any]) -> Any:
     return forecasts[-1]
 
 
-def test_without_a_horizon_nothing_is_forecast(graph: Any, monkeypatch: pytest.MonkeyPatch):
-    bench = counting(monkeypatch, graph, scene="dish_150mm")
-    bench.show(0)
-    assert not bench.node.get_publishers_info_by_topic(bench.node.resolve_topic_name(topics.FORECAST.name))
-
-
 def test_message_and_markers_say_what_happens_when():
     where = Scene.create(shapes={"post": Disc((-0.004, 0.002), 0.001)})
     thread = Thread.of(MATERIALS["polyamide_7_0"], length=0.012, segments=40, attachment=Attachment.PINNED)
@@ -104,24 +98,17 @@ def test_message_and_markers_say_what_happens_when():
     assert math.isnan(topics.FORECAST.decode(packed_forecast(stamp(0), still)).contact_time)
 
 
-def ask(graph: Any, **fields: Any) -> Any:
-    """Return the answer of the service that forecasts along a path."""
-    client = graph.probe.create_client(ForecastPath, FORECAST_PATH)
-    graph.wait(client.service_is_ready, "the service")
-    future = client.call_async(ForecastPath.Request(**fields))
-    graph.wait(future.done, "the answer", timeout=60.0)
-    return future.result()
-
-
 def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: pytest.MonkeyPatch):
     bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
     forecasts = graph.listen(topics.FORECAST)
     heading, tail = WAY[0].heading, WAY[0].tail
     ahead = [Point(x=x, y=y) for x, y in (tail + np.outer([0.012, 0.03], heading)).tolist()]
-    assert "no estimate yet" in ask(graph, path=ahead, speed=0.004, horizon=1.0).message
+    assert (
+        "no estimate yet" in graph.call(ForecastPath, FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.0).message
+    )
     bench.show(0)
     graph.wait(lambda: len(forecasts) == 1, "a forecast")
-    answer = ask(graph, path=ahead, speed=0.004, horizon=1.2)
+    answer = graph.call(ForecastPath, FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.2)
     assert (answer.success, answer.message) == (True, "")
     found = answer.forecast
     assert found.header.stamp == stamp(0)

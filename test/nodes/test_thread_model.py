@@ -18,7 +18,6 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread import rod
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.examples import FOLDER
 from test.nodes import wire
 from test.thread.worlds import scene_with
@@ -115,44 +114,6 @@ def test_friction_slows_the_needle_and_is_shown(graph):
     assert len(markers[-2].markers[1].points) == count
 
 
-def test_half_of_a_thread_is_not_started_from_where_observations_come(graph):
-    graph.add(ThreadModelNode)
-    predicted, margins = graph.listen(topics.PREDICTED_THREAD), graph.listen(topics.MARGINS)
-    whole = np.column_stack([-np.linspace(0.0, 0.019, 60), np.zeros(60)])
-
-    def observed(seconds: float, count: int, last: PieceEnd) -> ThreadObservation:
-        piece = ThreadPiece(whole[:count], np.full(count, 1e-5), PieceEnd.TAIL, last, (0.0, 0.0))
-        seen_now = ThreadObservation((piece,), complete=last is PieceEnd.FREE)
-        return wire.observation_message(stamp(seconds), seen_now)
-
-    graph.publish(topics.THREAD_OBSERVATION, observed(1.0, 30, PieceEnd.COVERED))
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: len(margins) == 1, "that it waits")
-    graph.publish(topics.MEASURED_THREAD, seen(1.1))  # for viewers
-    graph.publish(topics.NEEDLE_POSE, pose(1.1))
-    graph.wait(lambda: len(margins) == 2, "that it still waits")
-    assert not predicted
-    graph.publish(topics.THREAD_OBSERVATION, observed(1.2, 60, PieceEnd.FREE))
-    graph.publish(topics.NEEDLE_POSE, pose(1.2))
-    graph.wait(lambda: len(predicted) == 1, "the start")
-
-
-def test_shapes_give_margins_and_contact(graph):
-    # A disc that node 12 rests against.
-    scene = place(graph, Disc((-12 * 0.00076, 0.002 + 30e-6 + 1e-6), 0.002))
-    node = graph.add(ThreadModelNode, initial_shape="straight")
-    graph.wait(lambda: node._session.scene_version == scene.version, "the scene")
-    margins = graph.listen(topics.MARGINS)
-    graph.publish(topics.NEEDLE_POSE, pose(1.0))
-    graph.wait(lambda: bool(margins), "margins")
-    assert margins[0].contact_state == SafetyMargins.CONTACT_IN_CONTACT
-    assert list(margins[0].contact_nodes) == [12]
-    least = next(entry for entry in margins[0].minimum if entry.barrier == "obstacle")
-    assert least.obstacle == 0
-    assert least.node == 12
-    assert least.clearance == pytest.approx(1e-6, abs=1e-9)
-
-
 def test_a_barrier_of_ones_own_has_margins_on_the_topic(graph, tmp_path, monkeypatch: pytest.MonkeyPatch):
     source = (FOLDER / "barriers/tip_keep_in.py").read_text()
     (tmp_path / "barriers_of_a_laboratory.py").write_text(source)
@@ -209,16 +170,6 @@ def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):
     graph.wait(lambda: len(predicted) == 2, "the next prediction")
     assert np.isfinite([v.x for v in predicted[1].positions]).all()
     assert predicted[1].interval == pytest.approx(0.2)
-
-
-def test_time_set_back_starts_anew(graph):
-    graph.add(ThreadModelNode, initial_shape="straight")
-    predicted = graph.listen(topics.PREDICTED_THREAD)
-    graph.publish(topics.NEEDLE_POSE, pose(100.0))
-    graph.wait(lambda: len(predicted) == 1, "the start")
-    graph.publish(topics.NEEDLE_POSE, pose(1.0, 0.002))
-    graph.wait(lambda: len(predicted) == 2, "the new start")
-    assert predicted[1].solver_status == "started"
 
 
 def test_a_step_that_did_not_converge_gives_no_margin(graph, monkeypatch):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import TrackerState
 from sensor_msgs.msg import CameraInfo, CompressedImage
 
@@ -61,29 +60,6 @@ def test_a_frame_becomes_a_pose_and_a_centreline_with_its_stamp(graph, camera, t
     assert covariance[2, 2] == 0.0
 
 
-def test_every_frame_gets_a_state_and_a_pose_comes_once_three_agree(graph, camera, thread_arc):
-    graph.add(VisionTrackerNode, scene="dish_35mm")
-    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
-    image = frame(camera, thread_arc)
-    for index in range(4):
-        graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=index * 16_000_000)))
-        graph.wait(lambda n=index: len(tracking) > n, "a state")
-    searching, tracked = TrackerState.STATE_SEARCHING, TrackerState.STATE_TRACKED
-    assert [state.state for state in tracking] == [searching, searching, tracked, tracked]
-    assert "1 of 3 frames" in tracking[0].reason
-    assert tracking[0].confidence == 0.0
-    assert tracking[3].reason == ""
-    assert 0.3 < tracking[3].confidence <= 1.0
-    assert abs(tracking[3].curvature) < 5.0
-    assert 0.0 < tracking[3].processing_time < 10.0
-    graph.wait(lambda: len(poses) == 2, "poses of the frames that were tracked")
-    assert poses[0].header.stamp == tracking[2].header.stamp
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(0 * image, Time(sec=5, nanosec=64_000_000)))
-    graph.wait(lambda: len(tracking) > 4, "a state")
-    assert tracking[4].state == TrackerState.STATE_LOST
-    assert len(poses) == 2
-
-
 def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
@@ -126,24 +102,6 @@ def test_a_camera_that_falls_silent_is_noticed(graph, camera, thread_arc):
     assert tracking[-1].state == TrackerState.STATE_LOST
     graph.wait(lambda: any(text.startswith("no camera frame for") for text in states(diagnostics)), "a warning")
     assert len(poses) == 1
-
-
-def test_a_frame_with_an_impossible_stamp_is_refused(graph, camera, thread_arc):
-    """Nothing that is published could be stamped by it."""
-    graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
-    poses, tracking = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.TRACKER_STATE)
-    diagnostics = graph.listen(topics.DIAGNOSTICS)
-    image = frame(camera, thread_arc)
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=5, nanosec=1_000_000_000)))
-    graph.publish(topics.COMPRESSED_IMAGE, compressed(image, Time(sec=6, nanosec=0)))
-    graph.wait(lambda: bool(poses and tracking), "the second frame")
-    assert [pose.header.stamp for pose in poses] == [state.header.stamp for state in tracking] == [Time(sec=6)]
-
-    def is_reported() -> bool:
-        values = [value for array in diagnostics for value in array.status[0].values]
-        return any(value.key == "last refusal" and "nanosec" in value.value for value in values)
-
-    graph.wait(is_reported, "the refusal")
 
 
 def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_not_used(graph):

@@ -49,17 +49,6 @@ def test_what_is_certified_keeps_clear_and_little_more_would_not(seed: int):
     assert tight > 0
 
 
-@pytest.mark.parametrize("curvature", [0.0, 250.0, -250.0])
-def test_the_kinematics_are_those_of_a_body(curvature: float):
-    needle, kinematics = Needle(0.007, curvature, 0.001 + 0.002j, 0.4), NeedleKinematics(0.007, curvature)
-    tail, heading = needle.pose()
-    along, across = kinematics.body_velocity(heading, np.array([0.004, -0.011]))
-    moved = kinematics.moved(tail, heading, along, across, 0.7)
-    expected = needle.moved(0.004 - 0.011j, 0.7).pose()
-    np.testing.assert_allclose(moved[0], expected[0], atol=1e-14)
-    np.testing.assert_allclose(moved[1], expected[1], atol=1e-12)
-
-
 def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
     """A quarter of a turn away from the tip, and beyond half a turn from the tail."""
     post = SceneShape("post", "instrument", Disc((0.0, 0.0051), 0.001))
@@ -86,25 +75,6 @@ def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
         assert filtered.safe_share(np.array([0.0, -0.001]), at, EAST)[0] == 1.0
         if y < 0.0:
             assert filtered.safe_share(np.array([0.001, 0.0]), at, EAST)[0] == 1.0
-
-
-def test_one_who_is_too_near_to_a_post_or_the_wall_may_leave_and_goes_no_nearer():
-    post = SceneShape("post", "instrument", Disc((0.002, 0.0), 0.001))
-    filtered = safety(Scene(Dish(0.05), (post,)), 0.0)
-    for at in ((0.0007, 0.0), (0.0015, 0.0), (-0.0248, 0.0)):  # before the post, inside, and before the wall
-        inwards = 0.001 * EAST if at[0] > 0.0 else -0.001 * EAST
-        assert filtered.safe_share(inwards, np.array(at), EAST)[0] < 1e-6
-        assert filtered.safe_share(-inwards, np.array(at), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.0007, 0.0]), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.002, 0.0]), EAST)[0] == 1.0
-
-
-def test_a_point_that_comes_from_beyond_an_edges_end_meets_the_edge():
-    wall = SceneShape("block", "wall", Polygon(((0.0, 0.001), (0.01, 0.001), (0.01, 0.003), (0.0, 0.003))))
-    share, _ = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(
-        np.array([0.03, 0.005]), np.array([-0.002, 0.0]), EAST
-    )
-    assert share * HOLD == pytest.approx(0.1, rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -68,24 +68,6 @@ def test_towards_the_wall_it_slows_down_and_says_by_what():
     assert (found.active, found.reason) == (("wall",), "")
 
 
-@pytest.mark.parametrize("shape", [POST, BLOCK])
-def test_a_shape_limits_the_speed_before_the_hold_would(shape: SceneShape):
-    """Of a point 9.7 mm before its bound, at a rate of 1 /s: all of the hold would allow 48 mm/s."""
-    gap = 9.7e-3 + KEEP + BAND
-    at = np.array([0.006, 0.002 - gap]) if shape is POST else np.array([0.0, -gap])
-    found = needle_filter(shape, length=0.0, approach_rate=1.0).filter(0.01 * NORTH, at, EAST)
-    assert found.filtered.tolist() == pytest.approx([0.0, 9.7e-3], abs=1e-6)
-    assert found.active == (shape.name,)
-
-
-def test_what_is_left_of_a_command_that_is_next_to_nothing_is_rest():
-    safety = needle_filter(max_speed=0.02)
-    tail = np.array([0.0175 - KEEP - LENGTH - BAND - 1e-6, 0.0])
-    found = safety.filter(0.03 * EAST, tail, EAST)
-    assert found.filtered.tolist() == [0.0, 0.0]
-    assert (found.active, found.reason) == (("speed", "wall"), "stopped by wall")
-
-
 def test_a_point_slides_along_a_block_and_leaves_it():
     point = needle_filter(BLOCK, length=0.0)
     at = (np.array([0.0, -KEEP - BAND]), EAST)
@@ -181,15 +163,6 @@ def test_through_the_channel_of_the_hernia_nothing_is_taken_off():
             assert found.filtered.tolist() == (speed * NORTH).tolist()
 
 
-def test_clearance_is_that_of_the_closest_point_from_wall_and_shapes():
-    tail, heading = np.array([0.001, 0.002]), np.array([0.6, 0.8])
-    tip = tail + LENGTH * heading
-    assert needle_filter().clearance(tail, heading) == pytest.approx(0.0175 - math.hypot(*tip))
-    beside = tail + 0.5 * LENGTH * heading + 0.003 * np.array([-0.8, 0.6])
-    post = SceneShape("post", "instrument", Disc((float(beside[0]), float(beside[1])), 0.001))
-    assert needle_filter(post).clearance(tail, heading) == pytest.approx(0.002)
-
-
 def test_a_dish_barely_larger_than_the_needle_is_accepted():
     NeedleSafetyFilter(Scene(Dish(LENGTH + 2.0 * KEEP + 1e-6)), keep_out=KEEP, needle_length=LENGTH)
     with pytest.raises(ConfigurationError, match="room for the needle"):
@@ -205,20 +178,6 @@ def test_the_distance_from_a_shape_of_many_edges_is_that_of_the_nearest():
         at = shapely.Point(x, y)
         expected = exact.exterior.distance(at) * (-1.0 if exact.contains(at) else 1.0)
         assert point.clearance(np.array([x, y]), EAST) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("curvature", [5.0, -200.0])
-def test_between_two_points_of_a_curved_needle_nothing_gets_closer_than_keep_out(curvature: float):
-    """What is as close to two points as may be is as close to the arc between them on either side."""
-    data = needle_filter(length=0.008, keep_out=1e-3, needle_curvature=curvature).compiled_data()
-    radius, turn = 1.0 / abs(curvature), abs(curvature) * 0.008 / (len(data.body.points) - 1)
-    middle, half = radius * math.cos(0.5 * turn), radius * math.sin(0.5 * turn)  # of the points' chord
-    for side in (1.0, -1.0):
-        corner = middle + side * math.sqrt(data.keep**2 - half**2)
-        assert abs(corner - radius) >= 1e-3
-    assert data.keep < 1.04e-3
-    bulge = radius - middle  # towards the wall
-    assert 1e-3 <= data.keep_wall - bulge < 1.001e-3
 
 
 def test_shapes_are_named_right_whatever_kinds_come_before_them():

@@ -9,8 +9,6 @@ import pytest
 
 from magnetosuture_thread import (
     Barrier,
-    ConfigurationError,
-    Disc,
     Gradient,
     InvalidInputError,
     NeedleSafetyFilter,
@@ -133,17 +131,6 @@ def test_the_share_that_the_bridge_asks_for_knows_added_barriers():
     assert safety.safe_share(np.array([0.0, -0.02]), np.array([0.0, 0.0]), np.array([0.0, 1.0])) == (1.0, "")
 
 
-def test_shapes_wall_and_added_barriers_are_named_apart():
-    scene = Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, -0.003), 0.001)})
-    safety = needle(HalfPlane(0.0), scene=scene)
-    heading = np.array([1.0, 0.0])
-    assert safety.filter(np.array([0.0, 0.01]), np.array([0.0, -1e-7]), heading).active == ("half_plane",)
-    assert safety.filter(np.array([0.0, -0.01]), np.array([-0.001, -0.0014]), heading).active == ("post",)
-    assert safety.filter(np.array([0.01, 0.0]), np.array([0.0143, -0.001]), heading).active == ("wall",)
-    with pytest.raises(ConfigurationError, match="a name that no other barrier has"):
-        needle(HalfPlane(), HalfPlane())
-
-
 def test_the_share_that_keeps_an_added_barrier_includes_the_drift():
     safety = needle(HalfPlane(0.001))
     tail, east, drift = np.array([0.0, 0.0008]), np.array([1.0, 0.0]), 2e-3
@@ -189,17 +176,6 @@ def test_a_barrier_that_appears_within_the_hold_is_kept_too():
     found = safety.filter(np.array([0.0, 0.01]), tail, EAST, time=0.0)  # 2 mm in the hold
     assert found.active == ("half_plane",)
     assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
-
-
-def test_with_added_barriers_the_share_is_still_that_of_the_wall_and_no_older_reason_is_named():
-    safety, east = needle(MovingHalfPlane(0.002, rate=-0.01)), np.array([0.01, 0.0])
-    at_wall = np.array([0.0175 - LENGTH - 0.0015, -0.002])
-    safety.filter(east, np.zeros(2), EAST, time=0.0)
-    share, name = safety.safe_share(east, at_wall, EAST)
-    assert name == "wall"
-    assert 0.3 < share < 0.6
-    assert safety.filter(east, at_wall, EAST, time=0.0).active == ("wall",)
-    assert safety.filter(np.array([0.0, 0.01]), np.zeros(2), EAST, time=0.15).active == ("half_plane",)
 
 
 PERIOD, CLEARANCE = 0.05, 1e-4  # s and m

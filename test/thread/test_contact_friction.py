@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.friction import DIAMETER, DRAG, EAST, POST, RATE, SPEED, capstan, stiff_capstan
-from magnetosuture_thread import ConfigurationError, Disc, NeedlePose, ThreadPredictor, Workspace
+from benchmarks.friction import DIAMETER, EAST, POST, RATE, SPEED, capstan, capstan_error, stiff_capstan
+from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.thread.formulations import make_formulation
 from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 from magnetosuture_thread.thread.program import ChainProgram, Solution, Vector
-from magnetosuture_thread.thread.rod_step import FRICTION_TOLERANCE, MAX_FRICTION_SOLVES
+from magnetosuture_thread.thread.rod import FRICTION_TOLERANCE, MAX_FRICTION_SOLVES
 from magnetosuture_thread.thread.solvers import BandedSolver, OsqpSolver
 
 
@@ -26,23 +26,7 @@ def thread_of(length: float, segments: int, medium: Medium, bending_stiffness: f
 @pytest.mark.parametrize("friction", [0.1, 0.3, 0.5])
 def test_a_flexible_thread_around_a_post_has_the_tensions_of_a_capstan(friction: float, angle: float):
     """T_2 = T_1 exp(mu theta) + f r (exp(mu theta) - 1) / mu, with the drag f per length of the part on the post."""
-    predictor, nodes = capstan(friction, angle, 120)
-    radius, ratios = POST + 0.5 * DIAMETER, []
-    for k in range(1, 26):
-        prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST))
-        assert prediction.converged
-        assert prediction.residual < 1e-6
-        forces, along = prediction.forces, np.diff(prediction.positions, axis=0)
-        assert forces is not None
-        touching = np.flatnonzero(forces.friction_use > 0.0)
-        first, last = touching[0] - 1, touching[-1]  # segments before and behind the post
-        theta = np.ptp(np.unwrap(np.arctan2(along[:, 1], along[:, 0]))[first : last + 1])
-        gain = math.exp(friction * theta)
-        wanted = forces.tension[last] * gain + DRAG * SPEED * radius * (gain - 1.0) / friction
-        ratios.append(forces.tension[first] / wanted)
-        if k > 15:
-            assert {forces.friction_states[node] for node in touching} == {FrictionState.SLIDING}
-    assert np.mean(ratios[15:]) == pytest.approx(1.0, abs=0.02)
+    assert abs(capstan_error(friction, angle, 120)) < 2.0
 
 
 class RecordingSolver:
@@ -98,6 +82,9 @@ def test_friction_is_within_its_cone_and_opposes_the_slip_as_a_general_solver_ha
         found = OsqpSolver(1e-10).solve(program, solution.velocities, solution.multipliers)
         assert found.residuals.largest < 1e-5
         np.testing.assert_allclose(found.velocities, solution.velocities, atol=1e-5)
+    forces = prediction.forces
+    assert forces is not None
+    assert FrictionState.SLIDING in forces.friction_states
     assert sliding > 100
     assert settled > 10
 
@@ -124,11 +111,3 @@ def test_a_thread_held_by_friction_does_not_creep(friction: float, held: bool):
     predictor.start(rest, path, strict=False)
     along = [predictor.step(NeedlePose(0.1 * k, rest.tail, rest.heading)).positions[-1, 0] for k in range(1, 151)]
     assert (abs(along[-1] - along[75]) < 1e-7) == held
-
-
-@pytest.mark.parametrize("value", [-0.1, 2.1, math.nan, math.inf])
-def test_a_coefficient_out_of_bounds_is_refused(value: float):
-    with pytest.raises(ConfigurationError, match="friction: got"):
-        Workspace((Disc((0.0, 0.0), 1e-3),), 1e-3, friction=(value,))
-    with pytest.raises(ConfigurationError, match="wall_friction"):
-        Workspace((), 1e-3, wall_friction=value)

@@ -11,8 +11,6 @@ import pytest
 from magnetosuture_thread import Disc, NeedlePose, NeedleSafetyFilter, Polygon, Scene, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.scene import Dish, SceneShape
-from magnetosuture_thread.thread_model.session import ThreadSession
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 RATE = 60.0
 DEPTH = 1.01e-7  # m; the tolerance to which a step ends
@@ -80,25 +78,3 @@ def test_on_random_motions_no_chord_is_in_a_shape(name: str, friction: float):
     assert done.depth <= DEPTH + dip
     assert done.residual < 1e-6
     assert done.unconverged == 0
-
-
-@pytest.mark.parametrize("friction", [0.0, 2.0])
-def test_a_shape_that_appears_around_a_moving_node_pushes_it_out_or_no_margin_is_published(friction: float):
-    settings = ThreadModelSettings(initial_shape="straight", estimator=False, thread_length=0.019, segments=25)
-    session = ThreadSession(settings, scene_of())
-    proven, depths, node = [], [], np.zeros(2)
-    for k in range(1, 121):
-        if k == 60:
-            x, y = (node + np.array([2e-4, 3e-4])).tolist()
-            session.change(settings, scene_of(Disc((x, y), 1.5e-3), friction=friction))
-        pose = NeedlePose(k / RATE, np.array([2e-3 * k / RATE, 0.0]), EAST)
-        result = session.on_pose(round(1e9 * k / RATE), pose)
-        assert result.prediction is not None
-        node = result.prediction.positions[12]
-        proven.append(result.margins is not None)
-        if k >= 60 and proven[-1]:
-            assert result.margins is not None
-            depths.append(-result.margins["obstacle"].value.min(initial=np.inf))
-    assert proven[-1]
-    assert max(depths) < DEPTH
-    assert all(proven[:59])

@@ -22,20 +22,6 @@ CONNECTIVITY = rows("connectivity", [1, 2, 3], [NO_OBSTACLE] * 3, [1e-9, -1e-9, 
 OBSTACLE = rows("obstacle", [3, 7, 7, 5], [0, 0, 1, 2], [4e-5, 2e-3, 5e-5, -1e-6])
 
 
-def test_barriers_are_found_by_their_names_in_their_order():
-    found = Margins.of([CONNECTIVITY, OBSTACLE], 5e-5)
-    assert list(found) == ["connectivity", "obstacle"]
-    assert found["connectivity"].node.tolist() == [1, 2, 3]
-    assert found["obstacle"].node.tolist() == [3, 7, 7, 5]
-    assert found["connectivity"].obstacle.tolist() == [-1, -1, -1]
-    assert found["obstacle"].obstacle.tolist() == [0, 0, 1, 2]
-    np.testing.assert_array_equal(found["obstacle"].value, 2.0 * found["obstacle"].clearance)
-    assert found["connectivity"].clearance.tolist() == [1e-9, -1e-9, 0.0]
-    assert found["obstacle"].clearance.tolist() == [4e-5, 2e-3, 5e-5, -1e-6]
-    with pytest.raises(KeyError):
-        found["no_such_barrier"]
-
-
 def test_the_minimum_of_each_barrier_is_named():
     found = Margins.of([CONNECTIVITY, OBSTACLE], 5e-5)
     connectivity, obstacle = found.minima

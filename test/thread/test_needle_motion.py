@@ -10,7 +10,6 @@ import pytest
 
 from magnetosuture_thread import NeedlePose
 from magnetosuture_thread.thread.needle_motion import (
-    MAX_INTERVAL,
     NeedleMotionFilter,
 )
 from magnetosuture_thread.thread_model.session import ThreadSession
@@ -79,18 +78,6 @@ def test_poses_whose_deviation_is_not_known_are_as_they_were():
     assert motion.update(on_circle(20 / RATE)).motion is None  # and ends what was known
     pose = measured(on_circle(21 / RATE), random)
     assert motion.update(pose) is pose
-
-
-def test_after_a_gap_or_out_of_order_a_pose_stays_as_it_was():
-    random, motion = np.random.default_rng(5), NeedleMotionFilter()
-    for k in range(20):
-        motion.update(measured(on_circle(k / RATE), random))
-    late = measured(on_circle(10 / RATE), random)
-    assert motion.update(late) is late
-    after = motion.update(measured(on_circle(20 / RATE), random))
-    assert after.motion is not None
-    far = measured(on_circle(20 / RATE + 1.01 * MAX_INTERVAL), random)
-    assert motion.update(far) is far
 
 
 def test_the_pull_of_a_session_is_that_of_the_needle_and_not_of_noise():

@@ -35,15 +35,6 @@ def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, 
     return predictor
 
 
-def test_the_thread_starts_on_the_centreline_with_full_length(thread_arc):
-    seen = thread_arc(np.zeros(2), 3.0, 60.0, length=0.015)
-    prediction = new().start(pose(1.0), seen, strict=False)
-    assert np.abs(prediction.strain).max() < 1e-3  # a chord is shorter than its arc
-    assert prediction.positions.shape == (26, 2)
-    assert np.linalg.norm(seen - prediction.positions[10], axis=1).min() < 1e-4
-    assert prediction.interval == 0.0
-
-
 def test_steps_are_bounded_whatever_the_interval():
     predictor = started()
     assert predictor.step(pose(1.0 / 66.0)).substeps == 1
@@ -101,16 +92,6 @@ def test_a_start_needs_a_centreline():
         with pytest.raises(InvalidInputError, match=f"centreline.*{words}"):
             predictor.start(pose(0.0), centreline)
     assert not predictor.started
-
-
-def test_warming_up_leaves_no_trace():
-    warm, cold = new(), new()
-    warm.warm_up()
-    assert not warm.started
-    for predictor in (warm, cold):
-        predictor.start(pose(5.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
-    first, second = warm.step(pose(5.1, 1e-4)), cold.step(pose(5.1, 1e-4))
-    np.testing.assert_allclose(first.positions, second.positions, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.thread.osqp_solver import as_quadratic_program
 from magnetosuture_thread.thread.program import ChainProgram, no_far_rows, residuals_of
 
 
@@ -151,27 +150,3 @@ def test_a_bound_that_is_no_number_is_never_met(bound: str):
     program = one_node()
     broken = program._replace(**{bound: np.array([1.0, np.nan])})
     assert residuals_of(broken, at(0.0, 0.0), np.zeros(2)).largest == np.inf
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("soft", [False, True])
-def test_both_forms_are_the_same_program(dimension: int, soft: bool):
-    program = random_program(1, dimension=dimension, soft=soft)
-    general = as_quadratic_program(program)
-    random = np.random.default_rng(5)
-    u = random.normal(size=program.linear.shape)
-    u[program.known] = 0.0
-    slack = random.normal(size=len(general.q) - len(general.unknown))
-    x = np.concatenate([u.ravel()[general.unknown], slack])
-    dense = general.P.toarray()
-    value = 0.5 * x @ (dense + dense.T - np.diag(np.diag(dense))) @ x + general.q @ x
-    nodes = len(u)
-    expected = 0.5 * float(slack @ slack) + float((program.linear * u).sum())
-    expected += 0.5 * float(np.einsum("iab,ia,ib->", program.blocks, u, u))
-    for apart in range(1, 4):
-        expected += float((program.couplings[apart - 1, : nodes - apart, None] * u[:-apart] * u[apart:]).sum())
-    assert value == pytest.approx(expected)
-    image = np.einsum("rkd,rkd->r", program.gradient, u[program.first[:, None] + np.arange(3)])
-    image[program.compliance > 0.0] += np.sqrt(program.compliance[program.compliance > 0.0]) * slack
-    np.testing.assert_allclose(general.A @ x, image, atol=1e-12)
-    assert (len(slack) > 0) == soft

@@ -141,12 +141,6 @@ def test_several_barriers_hold_together_beside_the_wall_and_a_post():
     assert list(held[-1].margins) == ["connectivity", "compression", "obstacle", "wall", "tip_keep_in", "moving_disc"]
 
 
-def test_the_banded_and_a_general_solver_find_the_same_thread():
-    barrier, way = WAYS[0]
-    banded, general = (predicted(barrier, way=way, solver=solver)[-1].positions for solver in ("banded", "osqp"))
-    np.testing.assert_allclose(banded, general, atol=1e-8)
-
-
 def test_a_failed_row_leaves_the_thread_where_it_was():
     class Fragile(MovingDisc):  # type: ignore[misc, valid-type]
         broken = False

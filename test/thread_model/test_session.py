@@ -11,7 +11,7 @@ import pytest
 
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
@@ -75,16 +75,6 @@ def test_a_pose_waits_for_the_thread_of_its_frame():
     assert [outcome.stamp for outcome in found] == [1_100_000_000, 1_200_000_000, 1_300_000_000]
     assert [predicted(outcome).status for outcome in found] == ["started", "solved", "solved"]
     assert predicted(go(session, 1.4, 4e-4)).interval == pytest.approx(0.1)
-
-
-def test_a_thread_that_cannot_be_the_needles_is_refused_and_waited_for_anew():
-    session = ThreadSession(made(), None)
-    go(session, 1.0)
-    go(session, 1.1)
-    found = list(session.on_measured_thread(SECOND, seen(y=5e-3)))
-    assert "from the needle's tail" in str(found[0].problem)
-    assert found[1].waiting
-    assert predicted(next(iter(session.on_measured_thread(1_100_000_000, seen())))).status == "started"
 
 
 @pytest.mark.parametrize("offset", [[], [1e-3, 0.0]])
@@ -281,20 +271,6 @@ def test_other_segments_lie_along_the_thread_before(values: dict[str, Any]):
     assert np.linalg.norm(np.diff(after, axis=0), axis=1) == pytest.approx(session.thread.segment_length, rel=5e-3)
 
 
-def test_a_thread_in_air_keeps_its_speed():
-    air = {"medium": "air", "air_drag": 0.0, "initial_shape": "straight"}
-    session, other = ThreadSession(made(**air), None), ThreadSession(made(**air), None)
-    for one in (session, other):
-        for k in range(10):
-            predicted(go(one, 1.0 + k / 100.0, 1e-3 * k))
-    session.change(made(**air, margin_range=1e-2), None)
-    same, kept = (predicted(go(one, 1.1, 1e-2)).positions for one in (session, other))
-    np.testing.assert_allclose(same, kept, atol=1e-7)
-    session.change(made(**air, segments=50), None)
-    finer, kept = (predicted(go(one, 1.11, 1.1e-2)).positions for one in (session, other))
-    np.testing.assert_allclose(finer[::2], kept, atol=1e-5)
-
-
 def test_tissue_that_takes_hold_later_holds_where_the_thread_is_then():
     session = straight()
     before = on_a_curve(session, 0, 30)[-1].positions
@@ -326,48 +302,6 @@ def test_settings_that_cannot_be_used_leave_those_before_in_force(values: dict[s
     assert one.scene is None
     for first, second in zip(on_a_curve(one, 20, 30), on_a_curve(other, 20, 30), strict=True):
         np.testing.assert_array_equal(first.positions, second.positions)
-
-
-def test_a_change_while_the_thread_is_waited_for_loses_no_pose():
-    session = ThreadSession(made(), None)
-    for k in range(3):
-        go(session, 1.0 + 0.1 * k)
-    session.change(made(material="silk_6_0"), None)
-    assert [predicted(outcome).stamp for outcome in session.on_measured_thread(SECOND, seen())] == pytest.approx(
-        [1.0, 1.1, 1.2]
-    )
-
-
-@pytest.mark.parametrize("formulation", ["rod", "paper"])
-@pytest.mark.parametrize(
-    "obstacle",
-    [
-        Disc((-0.01, 1e-4), 0.001),  # upon the thread, a little to one side
-        Disc((-0.01, 0.0), 0.001),  # upon it: no side is nearer
-        Disc((0.0, 0.0), 0.005),  # upon the needle
-        Disc((-0.01, 0.0), 0.03),  # upon everything
-        polygon(-0.012, -0.001, -0.006, -0.001, -0.006, 0.002, -0.012, 0.002),
-    ],
-)
-def test_of_an_obstacle_upon_the_thread_no_margin_is_too_good(formulation: str, obstacle: Disc | Polygon):
-    """It pushes the thread out; where that is not possible, the step says so and its margins are not valid."""
-    session = straight(formulation=formulation)
-    go(session, 1.0)
-    settings = session.settings
-    session.change(settings, scene_with(obstacle))
-    proven = 0
-    for k in range(1, 15):
-        prediction = go(session, 1.0 + k / 30.0, 1e-4 * k).prediction
-        if prediction is None or not prediction.converged:
-            continue
-        proven += 1
-        margins = prediction.margins["obstacle"]
-        if isinstance(obstacle, Disc):
-            distance = obstacle.signed_distance(prediction.positions)[0] - 30e-6
-            np.testing.assert_allclose(margins.value, distance[margins.node], atol=1e-12)
-        assert margins.value.min(initial=0.0) > -1e-7
-        assert (margins.clearance <= margins.value).all()
-    assert (proven > 0) == (isinstance(obstacle, Polygon) or obstacle == Disc((-0.01, 1e-4), 0.001))
 
 
 @pytest.mark.parametrize("formulation", ["rod", "paper"])
@@ -454,13 +388,6 @@ def observed(*, complete: bool, first: PieceEnd = PieceEnd.TAIL) -> ThreadObserv
     last = PieceEnd.FREE if complete else PieceEnd.COVERED
     piece = ThreadPiece(points, np.full(len(points), 1e-5), first, last, (0.0, 0.0))
     return ThreadObservation((piece,), complete)
-
-
-def test_the_model_starts_from_all_of_the_thread_at_once():
-    session = ThreadSession(made(), None)
-    go(session, 1.0)
-    (outcome,) = session.on_observation(SECOND, observed(complete=True))
-    assert predicted(outcome).status == "started"
 
 
 def test_the_model_waits_for_the_rest_of_the_thread_before_it_starts_from_a_part():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.configuration import from_mapping
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
+from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.estimator import ThreadEstimate
 from magnetosuture_thread.estimator.session import EstimationResult
 from magnetosuture_thread.geometry.obstacles import Disc
@@ -168,24 +168,6 @@ def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
     assert error_percent(found.positions, NODES[-1]) < 0.1
 
 
-def test_the_first_frame_after_a_long_pause_is_estimated():
-    session = ThreadSession(made(), None)
-    follow(session, 0, 5)
-    stamp = stamp_of(WAY[5]) + 20_000_000_000
-    assert not list(session.on_observation(stamp, whole(NODES[5], 5)))
-    assert not session.late_estimates()
-    estimate = estimated(session.on_pose(stamp, replace(WAY[5], stamp=stamp * 1e-9)))
-    assert estimate.corrected
-    assert error_percent(estimate.positions, NODES[5]) < 0.2
-
-
-def test_time_set_back_restarts_the_estimate():
-    session = ThreadSession(made(), None)
-    follow(session, 40, 45)
-    again = follow(session, 0, 5)
-    assert error_percent(estimated(again[-1]).positions, NODES[4]) < 0.1
-
-
 @pytest.mark.parametrize(
     "values", [{"viscosity": 1.1}, {"segments": 40}, {"estimator_history": 2.0}, {"thread_length": 0.0191}]
 )
@@ -220,11 +202,6 @@ def test_what_is_learned_of_the_thread_is_kept_in_another_scene_and_not_of_anoth
     anew = estimated(session.on_pose(stamp_of(WAY[31]), at(WAY[31])))
     told = session.thread.bending_stiffness / session.thread.medium.drag_across
     assert anew.slow_parameters[0].value == pytest.approx(told, rel=1e-6)
-
-
-def test_a_slow_parameter_that_is_none_is_refused():
-    with pytest.raises(ConfigurationError, match=r"thread_model\.estimator_slow_parameters.*stiffness_over_drag"):
-        made(estimator_slow_parameters=["length"])
 
 
 def test_a_scene_that_appears_pushes_the_estimate_out():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.configuration import from_mapping
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.margins import Friction, FrictionState
@@ -40,10 +39,6 @@ def drive(session: ThreadSession, first: int, last: int, speed: float = 3e-3, x:
     return at, outcome.margins.friction
 
 
-def test_a_free_thread_slows_nothing():
-    assert drive(session(), 0, 5)[1] == Friction(FrictionState.FREE, (), 1.0)
-
-
 def test_friction_slows_a_needle_that_pulls_and_no_other():
     model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
     x, pulled = drive(model, 0, 5)
@@ -51,20 +46,6 @@ def test_friction_slows_a_needle_that_pulls_and_no_other():
     assert 0.5 < pulled.slowdown < 1.0
     _, resting = drive(model, 5, 10, speed=0.0, x=x)
     assert (resting.state, resting.slowdown) == (FrictionState.STUCK, 1.0)
-
-
-def test_margins_contain_the_friction_state():
-    model = session(GATE, friction_threshold=1.2e-3, friction_averaging=0.0)
-    x, _ = drive(model, 0, 5)
-    states = []
-    for k, at in ((5, x + 1e-4), (6, x + 1e-4)):
-        pose = NeedlePose(1.0 + k * PERIOD * 1e-9, np.array([at, 0.0]), EAST)
-        margins = model.on_pose(SECOND + k * PERIOD, pose).margins
-        assert margins is not None
-        states.append(margins.friction)
-    assert [friction.state for friction in states] == [FrictionState.SLIDING, FrictionState.STUCK]
-    assert states[0].nodes == states[1].nodes
-    assert len(states[0].nodes) >= 2
 
 
 def test_a_change_of_settings_does_not_bring_the_thread_to_rest():
@@ -75,8 +56,3 @@ def test_a_change_of_settings_does_not_bring_the_thread_to_rest():
     model.change(from_mapping(ThreadModelSettings, {**values, "contact_tolerance": 2e-5}), GATE)
     _, after = drive(model, 9, 10, speed=0.0, x=x)  # averaged, it still moves
     assert after.slowdown == pytest.approx(before.slowdown, rel=0.2)
-
-
-def test_a_threshold_that_the_barriers_do_not_reach_is_refused():
-    with pytest.raises(ConfigurationError, match=r"thread_model\.friction_threshold"):
-        from_mapping(ThreadModelSettings, {"friction_threshold": 6e-3})

@@ -11,13 +11,12 @@ from typing import Any
 import pytest
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.workers import WorkerDiedError
-from magnetosuture_thread.workers.pool import ONE_THREAD, WorkerPool
+from magnetosuture_thread.workers import ONE_THREAD, WorkerDiedError, WorkerPool
 
 SOURCE = """
 import os
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.workers.pool import ONE_THREAD
+from magnetosuture_thread.workers import ONE_THREAD
 
 def work(task, log, progress):
     log(f"task {task}")

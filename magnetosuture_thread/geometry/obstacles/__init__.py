@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles.contacts import (
-    FRICTION,
+    MAX_FRICTION,
     WALL,
-    WorkspaceData,
+    Contacts,
+    Workspace,
     find_contacts,
     wall_contact,
 )
+from magnetosuture_thread.geometry.obstacles.distances import WorkspaceData
 from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distances
-from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon, Triangulation, triangulate
-from magnetosuture_thread.geometry.obstacles.workspace import MAX_FRICTION, Contacts, Workspace
+from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon, triangulate
 
 __all__ = [
-    "FRICTION",
     "MAX_FRICTION",
     "WALL",
     "Contacts",
     "Disc",
     "Obstacle",
     "Polygon",
-    "Triangulation",
     "Workspace",
     "WorkspaceData",
     "find_contacts",

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.contacts import BALL, WorkspaceData, cell_of
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
-from magnetosuture_thread.geometry.obstacles.search import Vector
+from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
+
+Vector = tuple[float, float, float]
+"""A point or a direction; its third coordinate is 0 in the plane."""
 
 CONE = 0.25
 """Sine of the angle by which a segment may lie flatter than what is next to a corner: on a rounded one that is made
@@ -55,11 +56,6 @@ class ChordContacts(NamedTuple):
 @compiled_inline
 def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@compiled_inline
-def _at(numbers: NDArray[np.float64], k: int) -> Vector:
-    return numbers[k], numbers[k + 1], numbers[k + 2]
 
 
 @compiled_inline
@@ -159,7 +155,7 @@ def find_chord_contacts(
     Returns:
         The number of contacts with those before; -1 when there are more than the arrays have room for.
     """
-    reach = REACH * data.reach
+    reach, discs = REACH * data.reach, len(data.discs)
     for i in range(len(points) - 1):
         if clearance[i] >= data.reach and clearance[i + 1] >= data.reach:
             continue
@@ -170,29 +166,29 @@ def find_chord_contacts(
         if not 0.0 < length < MAX_ELONGATION * segment or clearance[i] + clearance[i + 1] - length > 2.0 * reach:
             continue
         chord = Chord(start, (x / length, y / length, z / length), length)
-        middle = start[0] + 0.5 * x, start[1] + 0.5 * y, start[2] + 0.5 * z
-        cell = cell_of(middle, 0, data)
-        if cell < 0:
-            continue
-        for slot in range(data.entries[cell], data.entries[cell + 2]):
-            o = int(data.entries[slot])
-            kind, frame, table = data.tables[o + 1, 0], data.frames[o + 1], data.tables[o + 1]
-            if kind == BALL:
-                place, distance, normal = _round(chord, _at(frame, 0), frame[5] + reach)
+        # A corner beside the chord is no farther from its middle than this.
+        far = 0.5 * length + max(reach, 0.5 * length)
+        x, y = start[0] + 0.5 * x, start[1] + 0.5 * y
+        for o in range(len(data.order)):
+            s = data.order[o]
+            if s < discs:
+                disc = data.discs[s]
+                place, distance, normal = _round(chord, (disc[0], disc[1], disc[3]), disc[2] + reach)
                 if place >= 0.0:
-                    outer = frame[5] + radius
+                    outer = disc[2] + radius
                     most = outer * (1.0 - math.cos(min(0.5 * segment / outer, 1.5)))
-                    distance += min(_bulge(points, i, place, normal), most) - frame[5]
+                    distance += min(_bulge(points, i, place, normal), most) - disc[2]
                     count = _write(count, place, distance, normal, i, o, to)
                 continue
-            own = cell_of(middle, o + 1, data)
-            if own < 0:
-                continue
-            for entry in range(data.entries[own], data.entries[own + 2]):
-                k = table[6] + EDGE_WIDTH * data.entries[entry]
-                place, distance, normal = _corner(chord, data.numbers, k, reach)
-                if place >= 0.0:
-                    count = _write(count, place, distance, normal, i, o, to)
+            for block in range(data.polygons[s - discs, 0], data.polygons[s - discs, 1]):
+                dx, dy, near = x - data.circles[block, 0], y - data.circles[block, 1], far + data.circles[block, 2]
+                if dx * dx + dy * dy > near * near:
+                    continue
+                first = data.ranges[block, 0]
+                for edge in range(first, first + data.ranges[block, 1]):
+                    place, distance, normal = _corner(chord, data.edges, edge * EDGE_WIDTH, reach)
+                    if place >= 0.0:
+                        count = _write(count, place, distance, normal, i, o, to)
         if count < 0:
             return -1
     return count

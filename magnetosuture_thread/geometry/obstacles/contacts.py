@@ -1,88 +1,33 @@
-"""Contacts of points with all obstacles and the wall, compiled."""
+"""Workspace: the dish wall and all obstacles, and the contacts of points with them."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.search import ContactRows, Nearest, Vector, add_row, search_edges
+from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.obstacles.distances import (
+    ContactRows,
+    WorkspaceData,
+    add_row,
+    nearest_edge,
+    pack_obstacles,
+    polygon_rows,
+)
+from magnetosuture_thread.geometry.obstacles.shapes import MIN_EXTENT, Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
 
-FRICTION = 6
-"""Column of `WorkspaceData.frames` with the coefficient of friction."""
-BALL, EDGES = range(2)
-"""Kinds of obstacles."""
 WALL = -1
 """Index of the dish wall in place of an obstacle's."""
-
-
-class WorkspaceData(NamedTuple):
-    """All obstacles, packed into few arrays: each costs time when compiled code is entered. Not to be written to.
-
-    Row 0 of `frames` and `tables` is the grid over all obstacles; row o + 1 belongs to obstacle o.
-
-    Attributes:
-        reach: greatest distance of a contact [m].
-        wall_radius: inner radius of the round wall about the origin, inf without a wall [m].
-        frames: shape (o + 1, 7): low corner of the grid (3) [m], 1 / cell size [1/m], growth [m], 0; of a
-            ball its centre (3) [m], 0, 0, its radius [m]; then the coefficient of friction, in row 0 the wall's.
-        tables: shape (o + 1, 7): kind, n_x, n_y, n_z of the grid, where its cells begin in `entries`, number of
-            edges, where they begin in `numbers`.
-        numbers: edges, flat.
-        entries: cells and their entries, flat. A cell is two integers: where its entries begin (they end where those of
-            the next cell begin), and whether it is inside where no edge is near.
-    """
-
-    reach: float
-    wall_radius: float
-    frames: NDArray[np.float64]
-    tables: NDArray[np.int64]
-    numbers: NDArray[np.float64]
-    entries: NDArray[np.int32]
-
-
-@compiled_inline
-def cell_of(point: Vector, row: int, data: WorkspaceData) -> int:
-    """Return where the cell of a point is in `entries`, or -1 when it is outside of the grid, or not a number."""
-    x, y, z = point
-    frame, table = data.frames[row], data.tables[row]
-    i, j, k = (x - frame[0]) * frame[3], (y - frame[1]) * frame[3], (z - frame[2]) * frame[3]
-    if not (0.0 <= i < table[1] and 0.0 <= j < table[2] and 0.0 <= k < table[3]):
-        return -1
-    return int(table[4] + 2 * (int(i) + table[1] * (int(j) + table[2] * int(k))))
-
-
-@compiled_inline
-def nearest_of(
-    point: Vector,
-    reach: float,
-    obstacle: int,
-    first: int,
-    last: int,
-    data: WorkspaceData,
-    count: int,
-    rows: ContactRows,
-) -> Nearest:
-    """Return the nearest boundary point of a polygon; see `search_edges` for the arguments."""
-    base = data.tables[obstacle + 1, 6]
-    x, y, _ = point
-    return search_edges(x, y, reach, data.numbers, base, data.entries, first, last, count, rows.distance, rows.normal)
-
-
-@compiled_inline
-def _ball_contact(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
-    """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
-    frame = data.frames[obstacle + 1]
-    rx, ry, rz = point[0] - frame[0], point[1] - frame[1], point[2] - frame[2]
-    length = math.sqrt(rx * rx + ry * ry + rz * rz)
-    if length - frame[5] > data.reach:
-        return count
-    direction = (rx / length, ry / length, rz / length) if length > 0.0 else (1.0, 0.0, 0.0)
-    return add_row(count, count, length - frame[5], direction, rows)
+MAX_FRICTION = 2.0  # a coefficient
+_ROWS_A_POINT = 16  # contacts that `near` has room for at first; a point in a narrow corner has two of one shape
 
 
 @compiled_inline
@@ -100,33 +45,40 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
 
 
 @compiled_inline
-def _shape_contacts(point: Vector, obstacle: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
+def _ball_contact(x: float, y: float, z: float, s: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
+    """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
+    disc = data.discs[s]
+    rx, ry, rz = x - disc[0], y - disc[1], z - disc[3]
+    length = math.sqrt(rx * rx + ry * ry + rz * rz)
+    if length - disc[2] > data.reach:
+        return count
+    direction = (rx / length, ry / length, rz / length) if length > 0.0 else (1.0, 0.0, 0.0)
+    return add_row(count, count, length - disc[2], direction, rows)
+
+
+@compiled_uncounted
+def _polygon_contacts(x: float, y: float, polygon: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the rows of a polygon at one point; return the new count, -1 when they are too many."""
-    cell = cell_of(point, obstacle + 1, data)
-    if cell < 0:
+    box, reach = data.boxes[polygon], data.reach
+    if not (box[0] - reach <= x <= box[2] + reach and box[1] - reach <= y <= box[3] + reach):
         return count
-    first, last, inside = data.entries[cell], data.entries[cell + 2], data.entries[cell + 1]
-    if first == last and inside == 0:
-        return count
-    start = count
-    found = nearest_of(point, data.reach, obstacle, first, last, data, count, rows)
-    if math.sqrt(found.square) > data.frames[obstacle + 1, 4]:
-        # Nothing of the boundary within the growth, so none within the cell: all of it is on one side.
-        if inside == 0:
+    start, found = count, polygon_rows(x, y, polygon, reach, data, count, rows)
+    if found.square > reach * reach:
+        # No edge is within reach: the point is far outside, or deep inside.
+        if not (box[0] <= x <= box[2] and box[1] <= y <= box[3]):
             return count
-        features = int(data.tables[obstacle + 1, 5])
-        found = nearest_of(point, -1.0, obstacle, -1, features, data, count, rows)
-        return add_row(start, start, -math.sqrt(found.square), (found.x, found.y, found.z), rows)
+        found = nearest_edge(x, y, polygon, found.block, data)
+        return count if found.signed > 0.0 else add_row(start, start, found.signed, (found.x, found.y, 0.0), rows)
     if found.signed < 0.0:
-        return add_row(start, start, found.signed, (found.x, found.y, found.z), rows)
-    if found.rows < 0 or found.signed > data.reach:
+        return add_row(start, start, found.signed, (found.x, found.y, 0.0), rows)
+    if found.rows < 0:
         return found.rows
     least = np.inf
     for row in range(start, found.rows):
         least = min(least, rows.distance[row])
     if least > found.signed * (1.0 + 1e-9) + 1e-12:
         # Between two features that rounding gave to neither.
-        return add_row(start, found.rows, found.signed, (found.x, found.y, found.z), rows)
+        return add_row(start, found.rows, found.signed, (found.x, found.y, 0.0), rows)
     return found.rows
 
 
@@ -154,13 +106,12 @@ def find_contacts(
     Returns:
         The number of contacts, or -1 when there are more than the arrays have room for.
     """
-    count, rows = 0, ContactRows(distance, normal)
+    count, rows, discs = 0, ContactRows(distance, normal), len(data.discs)
     # Nearer to the centre than this, a point has no contact with the wall: most points pay for one comparison.
     inner = data.wall_radius - data.reach
     inner_square = inner * inner if inner > 0.0 else -1.0
     for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
-        point = (x, y, points[i, 2] if points.shape[1] == 3 else 0.0)
+        x, y, z = points[i, 0], points[i, 1], points[i, 2] if points.shape[1] == 3 else 0.0
         if inner_square <= x * x + y * y < np.inf:
             wall_distance, wall_x, wall_y = wall_contact(x, y, data.wall_radius)
             before = count
@@ -168,16 +119,14 @@ def find_contacts(
             if count < 0:
                 return -1
             node[before], obstacle[before], nearest[before] = i, WALL, True
-        cell = cell_of(point, 0, data)
-        if cell < 0:
+        if not math.isfinite(x + y + z):
             continue
-        for slot in range(data.entries[cell], data.entries[cell + 2]):
-            o = int(data.entries[slot])
-            start = count
-            if data.tables[o + 1, 0] == BALL:
-                count = _ball_contact(point, o, data, count, rows)
+        for o in range(len(data.order)):
+            start, s = count, data.order[o]
+            if s < discs:
+                count = _ball_contact(x, y, z, s, data, count, rows)
             else:
-                count = _shape_contacts(point, o, data, count, rows)
+                count = _polygon_contacts(x, y, s - discs, data, count, rows)
             if count < 0:
                 return -1
             best = start
@@ -188,3 +137,118 @@ def find_contacts(
             if count > start:
                 nearest[best] = True
     return count
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Where points are near obstacles or the dish wall: k rows, in the order of nodes, then obstacles.
+
+    Attributes:
+        node: index of the point, shape (k,).
+        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
+        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
+        normal: gradient of the signed distance, unit vectors, shape (k, d).
+        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
+    """
+
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: NDArray[np.float64]
+    normal: Points
+    nearest: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.node)
+
+
+class Workspace:
+    """Obstacles that do not move and the round wall of the dish about the origin, and what of them is near.
+
+    Args:
+        shapes: the obstacles: discs, which are balls in space, and polygons, in the plane only.
+        reach: greatest distance at which a boundary is near, not negative [m].
+        dimension: 2 or 3.
+        wall_radius: inner radius of the wall, in space a cylinder along z; inf without a wall [m].
+        friction: Coulomb's coefficient of each shape, none for no friction; in the plane only.
+        wall_friction: the same of the wall.
+
+    Attributes:
+        shapes: the obstacles.
+        reach: greatest distance at which a boundary is near [m].
+        dimension: 2 or 3.
+        wall_radius: inner radius of the wall [m].
+        friction: of each shape.
+        wall_friction: of the wall.
+        data: the same for compiled code, see `find_contacts`.
+
+    Raises:
+        ConfigurationError: when a shape is not of this dimension, or a number is not in its bounds.
+    """
+
+    @checked_arguments("workspace")
+    def __init__(
+        self,
+        shapes: Sequence[Obstacle],
+        reach: Annotated[float, bounded("m", 0.0, 100.0)],
+        dimension: Annotated[int, bounded("", 2, 3)] = 2,
+        wall_radius: Annotated[float, bounded("m", MIN_EXTENT, 10.0, unlimited=True)] = math.inf,
+        friction: Annotated[Sequence[float], bounded("", 0.0, MAX_FRICTION)] = (),
+        wall_friction: Annotated[float, bounded("", 0.0, MAX_FRICTION)] = 0.0,
+    ) -> None:
+        self.shapes, self.reach, self.dimension, self.wall_radius = tuple(shapes), reach, dimension, wall_radius
+        for i, shape in enumerate(self.shapes):
+            _check(f"workspace.shapes[{i}]", shape, dimension)
+        self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
+        _check_friction(self.friction, wall_friction, len(self.shapes), dimension)
+        self.data = pack_obstacles(self.shapes, wall_radius, reach, (wall_friction, *self.friction))
+
+    def near(self, points: Points) -> Contacts:
+        """Return the contacts of points: every local minimum of the distance to an obstacle's boundary.
+
+            outward = grad sd(x),    closest point = x - sd(x) outward
+
+        A point outside has a row for every boundary point that is closer to it than the boundary around,
+        within reach: one at a straight wall of many edges, two in a corner that reaches around it. A point
+        inside has one row, the nearest, however deep it is. Exactly on the boundary the distance is 0 and
+        the direction the normal. A point that is not a number has no row.
+
+        The wall has one row for each point within reach, and for each beyond it, before those of the obstacles.
+
+        Args:
+            points: shape (m, d) [m].
+
+        Raises:
+            ValueError: when points are not of this dimension.
+
+        Source: J. A. Baerentzen, H. Aanaes 2005, sign by pseudo-normals.
+        """
+        points = np.array(points, dtype=np.float64, order="C")
+        if points.ndim != 2 or points.shape[1] != self.dimension:
+            raise ValueError(f"points of shape {points.shape}, expected (m, {self.dimension})")
+        room, count = _ROWS_A_POINT * (len(points) + 1), -1
+        while count < 0:  # in a scene of many shapes a point may be near all of them
+            room *= 2
+            node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
+            distance, normal = np.empty(room), np.empty((room, self.dimension))
+            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
+        found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
+        for array in found:
+            array.setflags(write=False)
+        return Contacts(*found)
+
+
+def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: int, dimension: int) -> None:
+    if len(friction) != shapes:
+        raise ConfigurationError("workspace.friction", f"{len(friction)} values", f"one for each of {shapes} shapes")
+    for name, value in (("wall_friction", wall_friction), *((f"friction[{i}]", mu) for i, mu in enumerate(friction))):
+        if value > 0.0 and dimension != 2:
+            raise ConfigurationError(f"workspace.{name}", value, "0 in space: friction is of the plane")
+
+
+def _check(name: str, shape: Obstacle, dimension: int) -> None:
+    if isinstance(shape, Disc):
+        if len(shape.centre) != dimension:
+            raise ConfigurationError(f"{name}.centre", shape.centre, f"{dimension} coordinates [m]")
+    elif dimension != 2:
+        raise ConfigurationError(name, "a polygon", "a disc with three coordinates, which is a ball, in space")

@@ -8,133 +8,86 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.contacts import (
-    BALL,
-    WALL,
+from magnetosuture_thread.geometry.obstacles.contacts import WALL, Contacts, wall_contact
+from magnetosuture_thread.geometry.obstacles.distances import (
+    EDGE_WIDTH,
     WorkspaceData,
-    cell_of,
-    nearest_of,
-    wall_contact,
+    closest_on_segment,
+    nearest_edge,
 )
-from magnetosuture_thread.geometry.obstacles.features import EDGE_WIDTH
-from magnetosuture_thread.geometry.obstacles.search import ContactRows, Vector, closest_on_segment
-from magnetosuture_thread.geometry.obstacles.workspace import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
 TOLERANCE = 1e-7
 """By how much a distance may be given too short; it is never too long but for rounding [m]."""
-
 _MAX_BISECTIONS = 500  # of a half segment that is inside; what is left then has its lower bound
-_NO_ROWS = -1.0  # in place of a reach
 
 
 @compiled_inline
-def _along(start: Vector, end: Vector, s: float) -> Vector:
-    return (
-        start[0] + s * (end[0] - start[0]),
-        start[1] + s * (end[1] - start[1]),
-        start[2] + s * (end[2] - start[2]),
-    )
-
-
-@compiled_inline
-def _from_edge(point: Vector, k: int, numbers: NDArray[np.float64]) -> float:
+def _from_edge(x: float, y: float, k: int, edges: NDArray[np.float64]) -> float:
     """Return the distance of a point from the edge whose numbers begin at k."""
-    x, y, _ = closest_on_segment(point[0], point[1], numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3])
-    return math.hypot(point[0] - x, point[1] - y)
-
-
-@compiled_uncounted
-def _between(start: Vector, end: Vector, k: int, numbers: NDArray[np.float64]) -> float:
-    """Return the distance of a straight line from an edge: 0 where they cross, else that of one of the four ends."""
-    ax, ay, bx, by = numbers[k], numbers[k + 1], numbers[k + 2], numbers[k + 3]
-    ux, uy, dx, dy = end[0] - start[0], end[1] - start[1], bx - ax, by - ay
-    first, second = (ax - start[0]) * uy - (ay - start[1]) * ux, (bx - start[0]) * uy - (by - start[1]) * ux
-    third, fourth = (start[0] - ax) * dy - (start[1] - ay) * dx, (end[0] - ax) * dy - (end[1] - ay) * dx
-    if first * second < 0.0 and third * fourth < 0.0:
-        return 0.0
-    least = min(_from_edge(start, k, numbers), _from_edge(end, k, numbers))
-    for x, y in ((ax, ay), (bx, by)):
-        qx, qy, _ = closest_on_segment(x, y, start[0], start[1], end[0], end[1])
-        least = min(least, math.hypot(x - qx, y - qy))
-    return least
-
-
-@compiled_uncounted
-def _nearest_edge(point: Vector, base: int, first: int, last: int, data: WorkspaceData) -> int:
-    """Return where the numbers of the nearest of some edges begin."""
-    best, at = np.inf, base
-    for slot in range(max(first, 0), last):
-        k = base + EDGE_WIDTH * (data.entries[slot] if first >= 0 else slot)
-        distance = _from_edge(point, k, data.numbers)
-        if distance < best:
-            best, at = distance, k
-    return at
+    qx, qy, _ = closest_on_segment(x, y, edges[k], edges[k + 1], edges[k + 2], edges[k + 3])
+    return math.hypot(x - qx, y - qy)
 
 
 @compiled
-def _deepest(start: Vector, end: Vector, obstacle: int, first: int, last: int, data: WorkspaceData) -> float:
-    """Return the least signed distance on a line that is inside in part, a lower bound within the tolerance.
+def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: WorkspaceData) -> float:
+    """Return the least signed distance on a line ab that is inside in part, a lower bound within the tolerance.
 
     The depth of a point is at most its distance from any edge, which is convex, so between two points at most the
     greater of theirs; and it changes by no more than the way. Intervals are halved where this is not enough.
     """
-    rows, base = ContactRows(np.empty(0), np.empty((0, 2))), int(data.tables[obstacle + 1, 6])
-    length = math.hypot(end[0] - start[0], end[1] - start[1])
-    lows, highs = np.empty(64), np.empty(64)
-    lows[0], highs[0], pending = 0.0, 1.0, 1
-    best = min(
-        nearest_of(start, _NO_ROWS, obstacle, first, last, data, 0, rows).signed,
-        nearest_of(end, _NO_ROWS, obstacle, first, last, data, 0, rows).signed,
-    )
-    lowest, halvings = best, 0
+    length, edges = math.hypot(bx - ax, by - ay), data.edges
+    intervals = np.empty((64, 2))  # halved depth first
+    intervals[0, 0], intervals[0, 1], pending, halvings = 0.0, 1.0, 1, 0
+    best = min(nearest_edge(ax, ay, polygon, -1, data).signed, nearest_edge(bx, by, polygon, -1, data).signed)
+    lowest = best
     while pending > 0:
         pending -= 1
-        low, high = lows[pending], highs[pending]
-        p, q = _along(start, end, low), _along(start, end, high)
-        before = nearest_of(p, _NO_ROWS, obstacle, first, last, data, 0, rows).signed
-        after = nearest_of(q, _NO_ROWS, obstacle, first, last, data, 0, rows).signed
-        best = min(best, before, after)
-        bound = 0.5 * (before + after - (high - low) * length)
-        if bound < best - TOLERANCE:
-            for point in (p, q):
-                k = _nearest_edge(point, base, first, last, data)
-                bound = max(bound, -max(_from_edge(p, k, data.numbers), _from_edge(q, k, data.numbers)))
-        if bound >= best - TOLERANCE or halvings >= _MAX_BISECTIONS or pending + 2 > len(lows):
+        low, high = intervals[pending, 0], intervals[pending, 1]
+        px, py, qx, qy = ax + low * (bx - ax), ay + low * (by - ay), ax + high * (bx - ax), ay + high * (by - ay)
+        before, after = nearest_edge(px, py, polygon, -1, data), nearest_edge(qx, qy, polygon, -1, data)
+        best = min(best, before.signed, after.signed)
+        bound = 0.5 * (before.signed + after.signed - (high - low) * length)
+        for k in (before.edge, after.edge):
+            bound = max(bound, -max(_from_edge(px, py, k, edges), _from_edge(qx, qy, k, edges)))
+        if bound >= best - TOLERANCE or halvings >= _MAX_BISECTIONS:
             lowest = min(lowest, bound)
             continue
         middle, halvings = 0.5 * (low + high), halvings + 1
-        lows[pending], highs[pending] = low, middle
-        lows[pending + 1], highs[pending + 1] = middle, high
+        intervals[pending, 0], intervals[pending, 1] = low, middle
+        intervals[pending + 1, 0], intervals[pending + 1, 1] = middle, high
         pending += 2
     return min(lowest, best)
 
 
 @compiled_uncounted
-def _from_polygon(start: Vector, end: Vector, signed: float, obstacle: int, data: WorkspaceData) -> float:
-    """Return the least signed distance on a line from a polygon; `signed` is that of its start."""
-    table = data.tables[obstacle + 1]
-    length = math.hypot(end[0] - start[0], end[1] - start[1])
-    cell, first, last = cell_of(start, obstacle + 1, data), -1, int(table[5])
-    if cell >= 0 and abs(signed) + 2.0 * length <= data.frames[obstacle + 1, 4]:
-        first, last = int(data.entries[cell]), int(data.entries[cell + 2])  # what is near to any point of the line
-    best = abs(signed)
-    for slot in range(max(first, 0), last):
-        k = int(table[6]) + EDGE_WIDTH * (data.entries[slot] if first >= 0 else slot)
-        if _from_edge(start, k, data.numbers) < best + length:
-            best = min(best, _between(start, end, k, data.numbers))
-    if signed > 0.0 and best > TOLERANCE:
-        return best
-    return _deepest(start, end, obstacle, first, last, data)
+def _from_polygon(
+    ax: float, ay: float, bx: float, by: float, signed: float, polygon: int, data: WorkspaceData
+) -> float:
+    """Return the least signed distance on a line ab from a polygon; `signed` is that of a.
 
-
-@compiled_inline
-def _from_ball(start: Vector, end: Vector, centre: NDArray[np.float64], radius: float) -> float:
-    x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
-    rx, ry, rz = centre[0] - start[0], centre[1] - start[1], centre[2] - start[2]
-    square = x * x + y * y + z * z
-    s = min(max((rx * x + ry * y + rz * z) / square, 0.0), 1.0) if square > 0.0 else 0.0
-    return math.sqrt((rx - s * x) ** 2 + (ry - s * y) ** 2 + (rz - s * z) ** 2) - radius
+    Outside it is that of an end, or that of a corner of the polygon from the line.
+    """
+    ux, uy, edges = bx - ax, by - ay, data.edges
+    least, length = min(signed, nearest_edge(bx, by, polygon, -1, data).signed), math.hypot(ux, uy)
+    for block in range(data.polygons[polygon, 0], data.polygons[polygon, 1]):
+        if least <= TOLERANCE:
+            break
+        far = signed + length + data.circles[block, 2]
+        if math.hypot(ax - data.circles[block, 0], ay - data.circles[block, 1]) > far:
+            continue
+        first = data.ranges[block, 0]
+        for edge in range(first, first + data.ranges[block, 1]):
+            k = edge * EDGE_WIDTH
+            cx, cy, dx, dy = edges[k], edges[k + 1], edges[k + 2], edges[k + 3]
+            qx, qy, _ = closest_on_segment(cx, cy, ax, ay, bx, by)
+            least = min(least, math.hypot(cx - qx, cy - qy))
+            first_side, second_side = (cx - ax) * uy - (cy - ay) * ux, (dx - ax) * uy - (dy - ay) * ux
+            third_side = (ax - cx) * (dy - cy) - (ay - cy) * (dx - cx)
+            fourth_side = (bx - cx) * (dy - cy) - (by - cy) * (dx - cx)
+            if first_side * second_side < 0.0 and third_side * fourth_side < 0.0:
+                least = 0.0  # they cross
+    return least if least > TOLERANCE else _deepest(ax, ay, bx, by, polygon, data)
 
 
 @compiled_uncounted
@@ -148,24 +101,29 @@ def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, 
         signed: distance of the node from it [m].
         data: `Workspace.data`.
     """
-    space, least = points.shape[1] == 3, signed
-    start = (points[i, 0], points[i, 1], points[i, 2] if space else 0.0)
+    least, discs, dimension = signed, len(data.discs), points.shape[1]
+    ax, ay, az = points[i, 0], points[i, 1], points[i, 2] if dimension == 3 else 0.0
     for j in (i - 1, i + 1):
         if not 0 <= j < len(points):
             continue
-        end = _along(start, (points[j, 0], points[j, 1], points[j, 2] if space else 0.0), 0.5)
+        bx, by = 0.5 * (ax + points[j, 0]), 0.5 * (ay + points[j, 1])
+        bz = 0.5 * (az + points[j, 2]) if dimension == 3 else 0.0
         if obstacle == WALL:
-            found, _, _ = wall_contact(end[0], end[1], data.wall_radius)
-        elif data.tables[obstacle + 1, 0] == BALL:
-            found = _from_ball(start, end, data.frames[obstacle + 1], data.frames[obstacle + 1, 5])
+            found, _, _ = wall_contact(bx, by, data.wall_radius)
+        elif data.order[obstacle] < discs:
+            disc = data.discs[data.order[obstacle]]
+            x, y, z, rx, ry, rz = bx - ax, by - ay, bz - az, disc[0] - ax, disc[1] - ay, disc[3] - az
+            square = x * x + y * y + z * z
+            s = min(max((rx * x + ry * y + rz * z) / square, 0.0), 1.0) if square > 0.0 else 0.0
+            found = math.sqrt((rx - s * x) ** 2 + (ry - s * y) ** 2 + (rz - s * z) ** 2) - disc[2]
         else:
-            found = _from_polygon(start, end, signed, obstacle, data)
+            found = _from_polygon(ax, ay, bx, by, signed, data.order[obstacle] - discs, data)
         least = min(least, found)
     return least
 
 
 @compiled
-def _write(
+def _lower(
     points: Points,
     data: WorkspaceData,
     node: NDArray[np.int64],
@@ -191,5 +149,5 @@ def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contac
         contacts: of these nodes with it.
     """
     distance: NDArray[np.float64] = contacts.distance.copy()
-    _write(np.ascontiguousarray(points, dtype=np.float64), data, contacts.node, contacts.obstacle, distance)
+    _lower(np.ascontiguousarray(points, dtype=np.float64), data, contacts.node, contacts.obstacle, distance)
     return distance

@@ -111,9 +111,14 @@ class Polygon:
         return [np.array(ring, dtype=np.float64) for ring in (self.outline, *self.holes)]
 
     @property
+    def solid(self) -> shapely.Polygon:
+        """The same for shapely."""
+        return shapely.Polygon(self.outline, self.holes)
+
+    @property
     def area(self) -> float:
         """Area of the solid, holes taken off [m^2]."""
-        return sum(_signed_area(ring) for ring in (self.outline, *self.holes))
+        return float(self.solid.area)
 
     def can_contain(self, radius: float) -> bool:
         """Return whether a disc of this radius fits into the solid somewhere, to `_FIT_TOLERANCE` of it [m].
@@ -121,8 +126,7 @@ class Polygon:
         An offset outline would say it too, but of a comb it takes minutes: each corner meets every other.
         """
         tolerance = _FIT_TOLERANCE * radius
-        solid = shapely.Polygon(self.outline, self.holes)
-        return bool(shapely.maximum_inscribed_circle(solid, tolerance).length >= radius - tolerance)
+        return bool(shapely.maximum_inscribed_circle(self.solid, tolerance).length >= radius - tolerance)
 
     def smoothed(self, radius: float, angle: float = math.pi / 6, step: float = math.pi / 18) -> Polygon:
         """Return the polygon with its sharp corners rounded by arcs tangent to both edges.
@@ -218,26 +222,19 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
     solid = shapely.Polygon(outline)
     shapes = [shapely.Polygon(hole) for hole in holes]
     for i, shape in enumerate(shapes):
-        name = f"polygon.holes[{i}]"
+        problem, expectation = "", "a hole inside the outline, apart from it"
         if not solid.intersects(shape):
-            raise ConfigurationError(name, "a hole outside the outline", "a hole inside the outline", source)
-        if not solid.contains_properly(shape):
+            problem = "a hole outside the outline"
+        elif not solid.contains_properly(shape):
             where = solid.exterior.intersection(shape.exterior)
-            value = (
-                "a hole around the outline"
-                if where.is_empty
-                else f"a hole that meets the outline at {_position_text(where)}"
-            )
-            raise ConfigurationError(name, value, "a hole inside the outline, apart from it", source)
+            meets = "around the outline" if where.is_empty else f"that meets the outline at {_position_text(where)}"
+            problem = f"a hole {meets}"
         for j, other in enumerate(shapes[:i]):
-            if shape.intersects(other):
-                where = shape.intersection(other)
-                raise ConfigurationError(
-                    name,
-                    f"a hole that meets holes[{j}] at {_position_text(where)}",
-                    "holes apart from each other",
-                    source,
-                )
+            if not problem and shape.intersects(other):
+                problem = f"a hole that meets holes[{j}] at {_position_text(shape.intersection(other))}"
+                expectation = "holes apart from each other"
+        if problem:
+            raise ConfigurationError(f"polygon.holes[{i}]", problem, expectation, source)
 
 
 def _position_text(shape: shapely.Geometry) -> str:
@@ -246,15 +243,9 @@ def _position_text(shape: shapely.Geometry) -> str:
     return f"({point.x:.6g}, {point.y:.6g})"
 
 
-def _signed_area(ring: Ring) -> float:
-    """Return the area of a ring, positive when counter-clockwise [m^2]."""
-    x, y = (np.array(ring) - ring[0]).T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-
-
 def _oriented(ring: Ring, counter_clockwise: bool) -> Ring:
     """Return a ring in the wanted direction, with the same first vertex."""
-    return ring if (_signed_area(ring) > 0.0) == counter_clockwise else (ring[0], *ring[:0:-1])
+    return ring if shapely.is_ccw(shapely.LinearRing(ring)) == counter_clockwise else (ring[0], *ring[:0:-1])
 
 
 def _turn(before: Vertex, corner: Vertex, after: Vertex) -> float:
@@ -316,87 +307,33 @@ Obstacle = Disc | Polygon
 """Any shape that `Workspace` takes."""
 
 
-@dataclass(frozen=True, eq=False)
-class Triangulation:
-    """A polygon cut into triangles.
+def triangulate(polygon: Polygon) -> NDArray[np.float64]:
+    """Return the triangles of a polygon's constrained Delaunay triangulation, counter-clockwise, shape (t, 3, 2) [m].
 
-    Attributes:
-        vertices: those of the polygon, outline first, then hole by hole, shape (v, 2) [m].
-        triangles: indices of vertices, counter-clockwise, shape (t, 3).
-        boundary: edges of the polygon in order, the solid to their left, shape (v, 2).
-    """
-
-    vertices: Points
-    triangles: NDArray[np.int64]
-    boundary: NDArray[np.int64]
-
-    @property
-    def areas(self) -> NDArray[np.float64]:
-        """Area of each triangle, shape (t,) [m^2]."""
-        a, b, c = np.moveaxis(self.vertices[self.triangles], 1, 0)
-        areas: NDArray[np.float64] = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-        return areas
-
-
-def triangulate(polygon: Polygon) -> Triangulation:
-    """Return the constrained Delaunay triangulation of a polygon, without vertices of its own.
-
-    Every edge of the polygon is an edge of exactly one triangle, every other edge of exactly two, and
-    the areas add up to the polygon's: this is checked.
+    All corners are the polygon's, there are as many triangles as its vertices and holes ask for, and their areas add
+    up to its area: this is checked.
 
     Raises:
         ConfigurationError: with what the triangulation missed.
     """
-    rings = polygon.rings
-    vertices = np.vstack(rings)
-    firsts = np.cumsum([0, *(len(ring) for ring in rings)])
-    boundary = np.vstack(
-        [
-            np.stack([np.arange(len(ring)), np.roll(np.arange(len(ring)), -1)], axis=1) + first
-            for ring, first in zip(rings, firsts[:-1], strict=True)
-        ]
-    )
-    shape = shapely.Polygon(polygon.outline, polygon.holes)
+    expectation = "a shape that can be cut into triangles"
     try:
-        pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
+        pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon.solid))
     except shapely.errors.GEOSException as error:  # corners apart by less than rounding
-        raise _refusal(polygon, str(error)) from error
-    index = {tuple(vertex): i for i, vertex in enumerate(vertices.tolist())}
-    try:
-        triangles = np.array(
-            [[index[corner] for corner in piece.exterior.coords[:3]] for piece in pieces], dtype=np.int64
-        ).reshape(-1, 3)
-    except KeyError as error:
-        raise _refusal(polygon, f"a triangle's corner {error} that is none of the polygon") from error
-    found = Triangulation(vertices, triangles, boundary)
-    clockwise = found.areas < 0.0
-    triangles[clockwise] = triangles[clockwise][:, ::-1]
-    _check(polygon, found)
-    for array in (vertices, triangles, boundary):
-        array.setflags(write=False)
-    return found
-
-
-def _refusal(polygon: Polygon, problem: str) -> ConfigurationError:
-    return ConfigurationError("polygon", problem, "a shape that can be cut into triangles", polygon.source)
-
-
-def _check(polygon: Polygon, found: Triangulation) -> None:
-    """Refuse a triangulation that does not conform to its polygon."""
-    # As one number per directed edge: tail * v + head.
-    v = len(found.vertices)
-    tails, heads = found.triangles.ravel(), np.roll(found.triangles, -1, axis=1).ravel()
-    edges, counts = np.unique(tails * v + heads, return_counts=True)
-    if (counts > 1).any():
-        raise _refusal(polygon, f"triangles that overlap at vertex {edges[counts > 1][0] // v}")
-    wanted = found.boundary[:, 0] * v + found.boundary[:, 1]
-    missing = ~np.isin(wanted, edges)
-    if missing.any():
-        tail, head = found.boundary[np.flatnonzero(missing)[0]].tolist()
-        raise _refusal(polygon, f"the edge from vertex {tail} to {head} lost")
-    inner = np.setdiff1d(edges, wanted)
-    if not np.isin(inner % v * v + inner // v, inner).all():
-        raise _refusal(polygon, "an edge inside that belongs to one triangle only")
-    total, area = float(found.areas.sum()), polygon.area
-    if abs(total - area) > 1e-9 * area + 1e-14 * float(np.ptp(found.vertices, axis=0).max()) ** 2:
-        raise _refusal(polygon, f"triangles of {total:.9g} m^2 in a shape of {area:.9g} m^2")
+        raise ConfigurationError("polygon", str(error), expectation, polygon.source) from error
+    corners = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
+    vertices = np.vstack(polygon.rings)
+    count, area = len(vertices) + 2 * len(polygon.holes) - 2, polygon.area
+    total = float(shapely.area(pieces).sum())
+    rounding = 1e-9 * area + 1e-14 * float(np.ptp(vertices, axis=0).max()) ** 2
+    own = {tuple(vertex) for vertex in vertices.tolist()}
+    problem = ""
+    if len(corners) != count:
+        problem = f"{len(corners)} triangles in place of {count}"
+    elif abs(total - area) > rounding:
+        problem = f"triangles of {total:.9g} m^2 in a shape of {area:.9g} m^2"
+    elif not own.issuperset(map(tuple, corners.reshape(-1, 2).tolist())):
+        problem = "a triangle's corner that is none of the polygon"
+    if problem:
+        raise ConfigurationError("polygon", problem, expectation, polygon.source)
+    return np.ascontiguousarray(corners)

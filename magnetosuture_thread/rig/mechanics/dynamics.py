@@ -7,7 +7,7 @@ needle's, so steps in turn would not be stable.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,15 +16,7 @@ from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
-from magnetosuture_thread.rig.mechanics.field import CoilField
-from magnetosuture_thread.rig.mechanics.needle import (
-    Needle,
-    NeedleBody,
-    add_clamp,
-    add_needle,
-    find_poles,
-    turn_resistance,
-)
+from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, add_clamp, add_needle
 from magnetosuture_thread.rig.mechanics.rod import (
     SLIP_SPEED,
     WIDTH,
@@ -39,6 +31,7 @@ from magnetosuture_thread.rig.mechanics.rod import (
     back_substitute,
     drag_matrices,
     factor,
+    find_contacts,
     find_friction,
 )
 from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, crosses_anew, find_pairs
@@ -49,14 +42,10 @@ MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
 MAX_GROWTH = 2.0  # of a step; the formula is stable up to 1 + sqrt(2)
-MAX_CONTACTS = 48  # points of the needle's outline
+MAX_OUTLINE = 48  # points of the needle's outline that touch
 MAX_ITERATIONS = 60  # of Newton in a step
-PAIRS_PER_NODE = 16  # rows of contact with itself
-MIN_LINE_SEARCH = 1e-6
-MIN_PART, MAX_PART = 2e-3, 0.5  # of a trial of the line search, for the next one
-DESCENT = 1e-4  # of the decrease that the slope promises
-ROUNDING = 1e-10  # of the energy, which is a sum of larger terms
-MIN_ENERGY = 1e-18  # J; of a thread that moves by the tolerance
+CONTACTS_PER_NODE, PAIRS_PER_NODE = 8, 16  # rows of contact with surfaces, and of the thread with itself
+ROUNDING, MIN_ENERGY = 1e-10, 1e-18  # of the energy, a sum of larger terms; and J, of a move by the tolerance
 STALLED = 10.0  # times the tolerance; where the energy tells no better place apart, the last move is rounding
 
 
@@ -68,233 +57,140 @@ class Bodies(NamedTuple):
     shapes: Shapes
 
 
-class NewtonBuffers(NamedTuple):
-    """What a step works in, N = 2n + 3 unknowns.
+class Field(Protocol):
+    """The flux density of coils."""
 
-    Trial state, step, right side, bands, drag, contact rows.
+    def per_current(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return that at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
 
-    Of friction: what rubs, the state that slip is measured from, and the slip that smooths it. Of the thread's contact
-    with itself: the rows of `find_pairs`, their second derivatives, and how many there are.
+
+class StepTerms(NamedTuple):
+    """What one step adds to the elastic energy, N = 2n + 3 unknowns.
+
+    Attributes:
+        begin: state at the start of the step, from which slip is measured, shape (N,) [rad, m].
+        rest: state from which drag is counted, shape (N,).
+        drag: of the thread's nodes, see `drag_matrices`.
+        turned: resistance of the needle to (theta, x, y) in the dish's frame, shape (3, 3).
+        field: flux density at tail and tip, shape (2, 2) [T].
+        friction: see `find_friction`.
+        slip: that smooths it [m].
+        pairs: see `find_pairs`.
     """
 
-    trial: NDArray[np.float64]
-    step: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    band: NDArray[np.float64]
-    chol: NDArray[np.float64]
+    begin: NDArray[np.float64]
     rest: NDArray[np.float64]
     drag: NDArray[np.float64]
     turned: NDArray[np.float64]
-    rows: NDArray[np.float64]
+    field: NDArray[np.float64]
     friction: NDArray[np.float64]
-    begin: NDArray[np.float64]
-    slip: NDArray[np.float64]
+    slip: float
     pairs: NDArray[np.float64]
+
+
+class System(NamedTuple):
+    """Gradient, band of second derivatives, and second derivatives of the rows of self-contact; rows to work in."""
+
+    gradient: NDArray[np.float64]
+    band: NDArray[np.float64]
     second: NDArray[np.float64]
-    paired: NDArray[np.int64]
-
-
-def make_buffers(segments: int, contacts: int) -> NewtonBuffers:
-    """Return memory for a thread of n segments and for so many contacts of one point or segment."""
-    size = 2 * segments + 3
-    return NewtonBuffers(
-        trial=np.zeros(size),
-        step=np.zeros(size),
-        gradient=np.zeros(size),
-        band=np.zeros((size, WIDTH)),
-        chol=np.zeros((size, WIDTH)),
-        rest=np.zeros(size),
-        drag=np.zeros((segments + 1, 3)),
-        turned=np.zeros((3, 3)),
-        rows=np.zeros((contacts, 5)),
-        friction=np.zeros((4 * segments + 1, 5)),
-        begin=np.zeros(size),
-        slip=np.zeros(1),
-        pairs=np.zeros((PAIRS_PER_NODE * (segments + 1), 6)),
-        second=np.zeros(PAIRS_PER_NODE * (segments + 1)),
-        paired=np.zeros(1, dtype=np.int64),
-    )
+    rows: NDArray[np.float64]
 
 
 @compiled
 def _assemble_energy(
-    q: NDArray[np.float64],
-    field: NDArray[np.float64],
-    bodies: Bodies,
-    buffers: NewtonBuffers,
-    driven: bool,
-    convex: bool,
+    q: NDArray[np.float64], bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool
 ) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
     Where the needle is driven, its three unknowns are known: they get no force and no coupling.
     """
     needle, rod, shapes = bodies.needle, bodies.rod, bodies.shapes
-    buffers.gradient[:] = 0.0
-    buffers.band[:, :] = 0.0
-    g, band = buffers.gradient, buffers.band
-    energy = add_drag(q, buffers.rest, buffers.drag, g, band)
+    g, band, second, rows = system
+    g[:] = 0.0
+    band[:, :] = 0.0
+    energy = add_drag(q, terms.rest, terms.drag, g, band)
     energy += add_stretching(q, rod, g, band, convex) + add_bending(q, rod, g, band)
-    energy += add_contact(q, rod, shapes, buffers.rows, g, band, convex)
-    energy += add_friction(q, buffers.begin, buffers.slip[0], buffers.friction, g, band)
+    energy += add_contact(q, shapes.stiffness, rows[: find_contacts(q, rod, shapes, rows)], g, band, convex)
+    energy += add_friction(q, terms.begin, terms.slip, terms.friction, g, band)
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
-    if buffers.paired[0] > 0:
-        pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
-        energy += add_pairs(q, buffers.begin, buffers.slip[0], 2.0 * rod.radius, shapes.stiffness, pairs, second, g)
+    energy += add_pairs(q, terms.begin, terms.slip, 2.0 * rod.radius, shapes.stiffness, terms.pairs, second, g)
     if not driven:
-        rest, turned, rows = buffers.rest, buffers.turned, buffers.rows
-        energy += add_needle(q, field, needle, shapes, rest, turned, rows, g, band, convex)
-        return energy
+        return energy + add_needle(q, terms.field, needle, shapes, terms.rest, terms.turned, g, band, convex)
     for i in range(3):
         g[i] = 0.0
         band[i, :] = 0.0
         band[i, 0] = 1.0
-        for j in range(3, 9):
-            if j - i < band.shape[1] and j < band.shape[0]:
-                band[j, j - i] = 0.0
+        for j in range(3, min(i + WIDTH, q.shape[0])):
+            band[j, j - i] = 0.0
     return energy
 
 
 @compiled
-def _largest(gradient: NDArray[np.float64], arm: float) -> float:
-    """Return the largest force, the needle's torque as one at its tip [N]."""
-    largest = abs(gradient[0]) / arm
-    for i in range(1, gradient.shape[0]):
-        largest = max(largest, abs(gradient[i]))
-    return float(largest)
-
-
-@compiled
-def _shorter(part: float, slope: float, new_slope: float, rise: float) -> float:
-    """Return the next part of a step to try: where the cubic through values and slopes at 0 and `part` is least.
-
-    With slope and new_slope by the part, and rise from 0 to `part`. A new contact begins after a small part of a step,
-    which the cubic finds at once.
-
-    Source: Nocedal and Wright, Numerical Optimization, equation 3.59. Deviation: bounds.
-    """
-    middle = slope + new_slope - 3.0 * rise / part
-    square = middle * middle - slope * new_slope
-    if not square >= 0.0:
-        return MAX_PART * part
-    root = math.sqrt(square)
-    share = 1.0 - (new_slope + root - middle) / (new_slope - slope + 2.0 * root)
-    return part * min(max(share, MIN_PART), MAX_PART)
-
-
-@compiled
-def _minimise(
-    field: NDArray[np.float64],
-    bodies: Bodies,
-    buffers: NewtonBuffers,
-    driven: bool,
-) -> tuple[int, float, float]:
-    """Find in `buffers.trial`, from what is there, where a step's value is least; see `advance`.
+def minimise(trial: NDArray[np.float64], bodies: Bodies, terms: StepTerms, driven: bool) -> tuple[int, float, float]:
+    """Move a state to where a step's value is least.
 
     Newton with a line search, and with the convex part of the second derivatives where they are not positive definite.
-    """
-    trial, step, gradient, size = buffers.trial, buffers.step, buffers.gradient, buffers.trial.shape[0]
-    arm = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)
-    current = trial.copy()
-    energy = _assemble_energy(trial, field, bodies, buffers, driven, False)
-    move, force = np.inf, _largest(gradient, arm)
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        buffers.chol[:, :] = buffers.band
-        if not factor(buffers.chol):
-            _assemble_energy(current, field, bodies, buffers, driven, True)
-            buffers.chol[:, :] = buffers.band
-            if not factor(buffers.chol):
-                return -1, np.inf, force
-        for i in range(size):
-            step[i] = -gradient[i]
-        back_substitute(buffers.chol, step)
-        if buffers.paired[0] > 0:
-            pairs, second = buffers.pairs[: buffers.paired[0]], buffers.second[: buffers.paired[0]]
-            couple(buffers.chol, pairs, second, 3 if driven else 0, step)
-        slope = 0.0
-        move = abs(step[0]) * arm
-        for i in range(size):
-            slope += gradient[i] * step[i]
-            if i > 0:
-                move = max(move, abs(step[i]))
-        if not move < np.inf:
-            return -1, move, force
-        part = 1.0
-        while True:
-            new_slope = 0.0
-            for i in range(size):
-                trial[i] = current[i] + part * step[i]
-            new = _assemble_energy(trial, field, bodies, buffers, driven, False)
-            force = _largest(gradient, arm)
-            if move <= TOLERANCE:
-                return iteration, move, force
-            if new <= energy + DESCENT * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
-                break
-            for i in range(size):
-                new_slope += gradient[i] * step[i]
-            part = _shorter(part, slope, new_slope, new - energy)
-            if part < MIN_LINE_SEARCH:
-                return (iteration if move <= STALLED * TOLERANCE else -1), move, force
-        current[:] = trial
-        energy = new
-    return (MAX_ITERATIONS if move <= STALLED * TOLERANCE else -1), move, force
-
-
-@compiled
-def advance(
-    q: NDArray[np.float64],
-    before: NDArray[np.float64],
-    dt: float,
-    ratio: float,
-    field: NDArray[np.float64],
-    bodies: Bodies,
-    buffers: NewtonBuffers,
-    driven: bool,
-) -> tuple[int, float, float]:
-    """Find the state after a step of the second backward difference formula with variable steps.
-
-        Z(q*) (q - rest) / (beta dt) + dE/dq = 0,    w = dt / dt_before
-        rest = ((1 + w)^2 q_0 - w^2 q_-1) / (1 + 2 w),    beta = (1 + w) / (1 + 2 w),    q* = q_0 + w (q_0 - q_-1)
-
-    which is where E + (q - rest)' Z (q - rest) / (2 beta dt) is least.
 
     Args:
-        q: state at the start, shape (N,); replaced by the state at the end. Of a driven needle its first three
-            values are in `buffers.trial` [rad, m].
-        before: the state one step earlier.
-        dt: step [s].
-        ratio: w, 0 for a first step, which is backward Euler.
-        field: flux density at tail and tip at q*, shape (2, 2) [T].
+        trial: state from which to begin, replaced by the state found, shape (N,) [rad, m].
         bodies: needle, thread, and what they can touch.
-        buffers: to work in.
+        terms: of the step.
         driven: whether the needle's motion is given.
 
     Returns:
         Iterations, or -1 if the last move is more than `TOLERANCE`, or `STALLED` times as much where the energy's
-        rounding ends the search; the last move [m]; the largest force that is left [N].
-
-    Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section III.5. Deviation: none.
+        rounding ends the search; the last move [m]; the largest force that is left, torque as one at the tip [N].
     """
-    trial, size = buffers.trial, q.shape[0]
-    needle, rod, shapes = bodies.needle, bodies.rod, bodies.shapes
-    beta = (1.0 + ratio) / (1.0 + 2.0 * ratio)
-    for i in range(size):
-        buffers.rest[i] = ((1.0 + ratio) ** 2 * q[i] - ratio**2 * before[i]) / (1.0 + 2.0 * ratio)
-        if not driven or i > 2:
-            trial[i] = q[i] + ratio * (q[i] - before[i])
-    drag_matrices(trial, rod, 1.0 / (beta * dt), buffers.drag)
-    turn_resistance(needle, trial[0], 1.0 / (beta * dt), buffers.turned)
-    find_friction(q, rod, shapes, buffers.rows, buffers.friction)
-    buffers.begin[:], buffers.slip[0] = q, SLIP_SPEED * dt
-    buffers.paired[0] = find_pairs(q, rod, shapes, buffers.pairs) if shapes.self_contact else 0
-    if buffers.paired[0] < 0:
-        return -1, np.inf, np.inf
-    done, move, force = _minimise(field, bodies, buffers, driven)
-    if done > 0 and shapes.self_contact and crosses_anew(q, trial):
-        done = -1
-    if done > 0:
-        q[:] = trial
-    return done, move, force
+    size, nodes = trial.shape[0], (trial.shape[0] - 1) // 2
+    system = System(
+        np.empty(size),
+        np.empty((size, WIDTH)),
+        np.zeros(terms.pairs.shape[0]),
+        np.empty((CONTACTS_PER_NODE * nodes, 6)),
+    )
+    gradient = system.gradient
+    scale = np.ones(size)  # of an angle as a way of the tip
+    scale[0] = math.sqrt(bodies.needle.tip[0] ** 2 + bodies.needle.tip[1] ** 2)
+    current, move = trial.copy(), np.inf
+    energy = _assemble_energy(trial, bodies, terms, system, driven, False)
+    force = float(np.max(np.abs(gradient / scale)))
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        chol = system.band.copy()
+        if not factor(chol):
+            _assemble_energy(current, bodies, terms, system, driven, True)
+            chol = system.band.copy()
+            if not factor(chol):
+                return -1, np.inf, force
+        step = -gradient
+        back_substitute(chol, step)
+        couple(chol, terms.pairs, system.second, 3 if driven else 0, step)
+        slope, move = float(np.dot(gradient, step)), float(np.max(np.abs(step * scale)))
+        if not move < np.inf:
+            return -1, move, force
+        part = 1.0
+        while True:
+            trial[:] = current + part * step
+            new = _assemble_energy(trial, bodies, terms, system, driven, False)
+            force = float(np.max(np.abs(gradient / scale)))
+            if move <= TOLERANCE:
+                return iteration, move, force
+            if new <= energy + 1e-4 * part * slope + ROUNDING * abs(energy) + MIN_ENERGY:
+                break
+            # The least of the cubic through the values and slopes at 0 and here (Nocedal and Wright, Numerical
+            # Optimization, equation 3.59), bounded: a new contact begins after a small part of a step.
+            new_slope, share = float(np.dot(gradient, step)), 1.0
+            middle = slope + new_slope - 3.0 * (new - energy) / part
+            square = middle * middle - slope * new_slope
+            if square >= 0.0:
+                root = math.sqrt(square)
+                share = 1.0 - (new_slope + root - middle) / (new_slope - slope + 2.0 * root)
+            part *= min(max(share, 2e-3), 0.5)
+            if part < 1e-6:
+                return (iteration if move <= STALLED * TOLERANCE else -1), move, force
+        current[:] = trial
+        energy = new
+    return (MAX_ITERATIONS if move <= STALLED * TOLERANCE else -1), move, force
 
 
 class RigDynamics:
@@ -322,7 +218,7 @@ class RigDynamics:
         needle: NeedleBody,
         thread: ThreadProperties,
         surface: Surface,
-        field: CoilField | None,
+        field: Field | None,
         tail: ArrayLike,
         heading: float,
         thread_points: Points,
@@ -346,17 +242,17 @@ class RigDynamics:
             0.5 * thread.diameter + surface.skin,
         )
         clamp = thread.bending_stiffness / length**3 if thread.attachment is NeedleJoint.CLAMPED else 0.0
-        touching = min(int(2.0 * needle.length / needle.diameter) + 2, MAX_CONTACTS)
+        touching = min(int(2.0 * needle.length / needle.diameter) + 2, MAX_OUTLINE)
         self._needle = Needle(
-            np.ascontiguousarray(needle.resistance[np.ix_([2, 0, 1], [2, 0, 1])]),
+            needle.resistance,
             needle.tip,
             needle.pole,
             needle.outline(touching),
             0.5 * needle.diameter + surface.skin,
             clamp,
         )
-        self._buffers = make_buffers(thread.segments, _contacts(self._shapes))
-        self._poles, self._flux = np.zeros((2, 3)), np.zeros((2, 2))  # tail and tip, and the field there [T]
+        self._rows = np.empty((CONTACTS_PER_NODE * (thread.segments + 1), 6))
+        self._pairs = np.empty((PAIRS_PER_NODE * (thread.segments + 1), 6))
         self._move, self._held = 0.0, np.zeros(0)
         self.time = self.residual = 0.0
         self.iterations = self.halvings = 0
@@ -411,9 +307,7 @@ class RigDynamics:
 
     def set_surface(self, surface: Surface) -> None:
         """Touch other things from now on; needle and thread must be outside of them."""
-        shapes = surface.packed()
-        self._buffers = make_buffers(self.properties.segments, _contacts(shapes))
-        self._shapes = shapes
+        self._shapes = surface.packed()
         # The last two states may be farther apart than a step that touches something can follow.
         self._before, self._last_dt = self._q.copy(), 0.0
 
@@ -471,9 +365,8 @@ class RigDynamics:
             # What is left is taken whole or in two like steps, never with a sliver at the end.
             if left < 1.5 * h:
                 h = left if left < 1.01 * h else 0.5 * left
-            if goal is not None:
-                self._buffers.trial[:3] = begin + (done + h) / dt * (goal - begin)
-            if self._take(h, currents):
+            pose = None if goal is None else begin + (done + h) / dt * (goal - begin)
+            if self._take(h, currents, pose):
                 done, h, tries = done + h, regular, 0
                 continue
             tries += 1
@@ -483,26 +376,49 @@ class RigDynamics:
             h *= 0.5
         return dt
 
-    def _take(self, h: float, currents: NDArray[np.float64] | None) -> bool:
-        """Take one step; return whether it converged, and change nothing if not."""
-        ratio = h / self._last_dt if self._last_dt > 0.0 else 0.0
+    def _take(self, h: float, currents: NDArray[np.float64] | None, pose: NDArray[np.float64] | None) -> bool:
+        """Take one step of the second backward difference formula; return whether it converged.
+
+            Z(q*) (q - rest) / (beta dt) + dE/dq = 0,    w = dt / dt_before
+            rest = ((1 + w)^2 q_0 - w^2 q_-1) / (1 + 2 w),    beta = (1 + w) / (1 + 2 w),    q* = q_0 + w (q_0 - q_-1)
+
+        which is where E + (q - rest)' Z (q - rest) / (2 beta dt) is least; a first step, with w = 0, is backward Euler.
+
+        Source: Hairer, Norsett, Wanner, Solving Ordinary Differential Equations I, section III.5. Deviation: none.
+
+        Args:
+            h: dt [s].
+            currents: of the coils [A]; None where the needle is driven.
+            pose: of a driven needle at the end of the step, heading, x and y [rad, m].
+        """
+        w = h / self._last_dt if self._last_dt > 0.0 else 0.0
+        q, before, rod, shapes, needle = self._q, self._before, self._rod, self._shapes, self._needle
+        trial = q + w * (q - before)
+        flux = np.zeros((2, 2))
         if currents is not None and self.field is not None:
-            find_poles(self._q, self._before, ratio, self.needle.tip, self._poles)
-            self._flux[:] = (currents @ self.field.per_current(self._poles).reshape(-1, 6)).reshape(2, 3)[:, :2]
-        start = self._q.copy()
-        iterations, self._move, residual = advance(
-            self._q,
-            self._before,
-            h,
-            ratio,
-            self._flux,
-            Bodies(self._needle, self._rod, self._shapes),
-            self._buffers,
-            currents is None,
-        )
-        if iterations < 0:
+            flux = np.array([self.field.per_current(at) @ currents for at in (trial[1:3], self._tip_of(trial))])
+        if pose is not None:
+            trial[:3] = pose
+        c, s = math.cos(trial[0]), math.sin(trial[0])
+        turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+        scale = (1.0 + 2.0 * w) / ((1.0 + w) * h)  # 1 / (beta dt)
+        pairs = find_pairs(q, rod, shapes, self._pairs) if shapes.self_contact else 0
+        if pairs < 0:
             return False
-        self._before[:], self._last_dt = start, h
+        terms = StepTerms(
+            begin=q,
+            rest=((1.0 + w) ** 2 * q - w**2 * before) / (1.0 + 2.0 * w),
+            drag=drag_matrices(trial, rod, scale),
+            turned=scale * turn @ needle.resistance @ turn.T,
+            field=flux,
+            friction=find_friction(self._rows[: find_contacts(q, rod, shapes, self._rows)], shapes),
+            slip=SLIP_SPEED * h,
+            pairs=self._pairs[:pairs],
+        )
+        iterations, self._move, residual = minimise(trial, Bodies(needle, rod, shapes), terms, currents is None)
+        if iterations < 0 or (shapes.self_contact and crosses_anew(q, trial)):
+            return False
+        self._before, self._q, self._last_dt = q, trial, h
         self.time, self.residual, self.iterations = self.time + h, residual, self.iterations + iterations
         return True
 
@@ -513,8 +429,3 @@ class RigDynamics:
     def _turned(q: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
         c, s = math.cos(q[0]), math.sin(q[0])
         return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
-
-
-def _contacts(shapes: Shapes) -> int:
-    """Return with how many things one point can have to do at once at the most."""
-    return len(shapes.discs) + len(shapes.corners) + 2

@@ -1,8 +1,9 @@
-"""The needle as a magnet in a viscous liquid: its shape, its poles, its resistance, and its terms in a step."""
+"""The needle as a magnet in a viscous liquid: shape, poles, resistance and terms in a step; and the coils' field."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -10,10 +11,46 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.coils.field import fields_per_current
 from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
 
 NODES = 16  # of the integration along the body
+MU_0 = 4e-7 * math.pi  # T m/A
+LOOPS = 6  # of current that stand for a coil
+
+
+class CoilField:
+    """The flux density of coils of one uniform layer around the dish, in its plane.
+
+    A coil is a sheet of current, integrated by Gauss and Legendre: loops at the nodes, and turns by the weights. With
+    `LOOPS` of them the field is right to 1e-6 from half a radius off a coil as long as its radius.
+
+    Args:
+        angles: direction of each coil from the dish's centre, and of its field for a positive current [rad].
+        distance: from the dish's centre to the middle of a coil [m].
+        radius: mean radius of the winding [m].
+        length: of the winding along its axis, 0 for a flat coil [m].
+        turns: their number.
+        loops: along the length of a coil.
+    """
+
+    def __init__(
+        self, angles: Sequence[float], distance: float, radius: float, length: float, turns: float, loops: int = LOOPS
+    ) -> None:
+        nodes, weights = np.polynomial.legendre.leggauss(loops if length > 0.0 else 1)
+        away = distance + 0.5 * length * nodes
+        field = 0.5 * weights * turns * MU_0 * radius**2 / (2.0 * (radius**2 + away**2) ** 1.5)
+        each = np.repeat(np.asarray(angles, dtype=np.float64), len(nodes))
+        self._axes = np.array([np.cos(each), np.sin(each)])
+        self._numbers = np.tile(np.array([away, np.full(len(nodes), radius), field]), len(angles))
+        self._shape = 2, len(angles), len(nodes)
+
+    def per_current(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the flux density at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
+        found = fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers)
+        return np.asarray(found.reshape(self._shape).sum(axis=2))
 
 
 @dataclass(frozen=True)
@@ -45,25 +82,11 @@ class NeedleBody:
     @cached_property
     def tip(self) -> NDArray[np.float64]:
         """The tip in the needle's frame, shape (2,) [m]."""
-        return np.asarray(self.points(np.array([self.length]))[0])
-
-    def points(self, along: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return points of the body in its frame.
-
-            x = s sinc(c s),    y = c s^2 / 2 sinc(c s / 2)^2,    sinc(u) = sin(u) / u
-
-        Args:
-            along: arc lengths s from the tail, shape (m,) [m].
-
-        Returns:
-            Shape (m, 2) [m].
-        """
-        turn = self.curvature * along / math.pi
-        return np.column_stack([along * np.sinc(turn), 0.5 * math.pi * turn * along * np.sinc(0.5 * turn) ** 2])
+        return self.outline(2)[1]
 
     def outline(self, count: int) -> NDArray[np.float64]:
         """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""
-        return self.points(np.linspace(0.0, self.length, count))
+        return needle_axis(np.zeros(2), 0.0, self.length, self.curvature, np.linspace(0.0, 1.0, count))[0]
 
     @cached_property
     def drag(self) -> tuple[float, float, float]:
@@ -85,25 +108,23 @@ class NeedleBody:
 
     @cached_property
     def resistance(self) -> NDArray[np.float64]:
-        """Resistance to (v_x, v_y, omega) of the tail in the needle's frame, shape (3, 3).
+        """Resistance to (omega, v_x, v_y) of the tail in the needle's frame, shape (3, 3).
 
-            R = integral over s of J' (along / L t t' + across / L n n') J,    J = [1, 0, -y; 0, 1, x]
+            R = integral over s of J' (along / L t t' + across / L n n') J,    J = [-y, 1, 0; x, 0, 1]
 
-        Force (f_x, f_y) and torque about the tail that move the needle are R (v_x, v_y, omega) [N s/m, N s,
-        N m s]. What the ends add to the turning, turn - across L^2 / 12, is a couple beside it, so that a
-        straight needle has exactly the values of `drag`.
+        Torque about the tail and force (f_x, f_y) that move the needle are R (omega, v_x, v_y) [N m s, N s, N s/m].
+        What the ends add to the turning, turn - across L^2 / 12, is a couple beside it, so that a straight needle has
+        exactly the values of `drag`.
         """
         along, across, turn = self.drag
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
-        s = 0.5 * self.length * (nodes + 1.0)
-        angle = self.curvature * s
-        tangent = np.column_stack([np.cos(angle), np.sin(angle)])
+        points, tangent = needle_axis(np.zeros(2), 0.0, self.length, self.curvature, 0.5 * (nodes + 1.0))
         local = (along - across) * tangent[:, :, None] * tangent[:, None, :] + across * np.eye(2)
         jacobian = np.zeros((NODES, 2, 3))
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-        jacobian[:, 0, 2], jacobian[:, 1, 2] = -self.points(s)[:, 1], self.points(s)[:, 0]
+        jacobian[:, 0, 1] = jacobian[:, 1, 2] = 1.0
+        jacobian[:, 0, 0], jacobian[:, 1, 0] = -points[:, 1], points[:, 0]
         total = np.einsum("s,sia,sij,sjb->ab", 0.5 * weights, jacobian, local, jacobian)
-        total[2, 2] += turn - across * self.length**2 / 12.0
+        total[0, 0] += turn - across * self.length**2 / 12.0
         return np.asarray(total)
 
 
@@ -128,43 +149,6 @@ class Needle(NamedTuple):
 
 
 @compiled
-def find_poles(
-    q: NDArray[np.float64],
-    before: NDArray[np.float64],
-    ratio: float,
-    tip: NDArray[np.float64],
-    poles: NDArray[np.float64],
-) -> None:
-    """Write x and y of tail and tip after a step, as the step before goes on, shape (2, 3) [m].
-
-    Args:
-        q: state, its first three are heading, x and y of the tail [rad, m].
-        before: the state one step earlier.
-        ratio: of the step to the one before.
-        tip: in the needle's frame, shape (2,) [m].
-        poles: written.
-    """
-    heading = q[0] + ratio * (q[0] - before[0])
-    c, s = math.cos(heading), math.sin(heading)
-    poles[0, 0], poles[0, 1] = q[1] + ratio * (q[1] - before[1]), q[2] + ratio * (q[2] - before[2])
-    poles[1, 0], poles[1, 1] = poles[0, 0] + c * tip[0] - s * tip[1], poles[0, 1] + s * tip[0] + c * tip[1]
-
-
-@compiled
-def turn_resistance(needle: Needle, heading: float, scale: float, turned: NDArray[np.float64]) -> None:
-    """Write the resistance to (omega, v_x, v_y) in the dish's frame, times a factor, shape (3, 3)."""
-    c, s = math.cos(heading), math.sin(heading)
-    r = needle.resistance
-    turned[0, 0] = scale * r[0, 0]
-    turned[1, 0] = scale * (c * r[1, 0] - s * r[2, 0])
-    turned[2, 0] = scale * (s * r[1, 0] + c * r[2, 0])
-    turned[1, 1] = scale * (c * c * r[1, 1] - 2.0 * c * s * r[1, 2] + s * s * r[2, 2])
-    turned[2, 2] = scale * (s * s * r[1, 1] + 2.0 * c * s * r[1, 2] + c * c * r[2, 2])
-    turned[2, 1] = scale * (c * s * (r[1, 1] - r[2, 2]) + (c * c - s * s) * r[1, 2])
-    turned[0, 1], turned[0, 2], turned[1, 2] = turned[1, 0], turned[2, 0], turned[2, 1]
-
-
-@compiled
 def add_needle(
     q: NDArray[np.float64],
     field: NDArray[np.float64],
@@ -172,14 +156,24 @@ def add_needle(
     shapes: Shapes,
     rest: NDArray[np.float64],
     turned: NDArray[np.float64],
-    rows: NDArray[np.float64],
     gradient: NDArray[np.float64],
     band: NDArray[np.float64],
     convex: bool,
 ) -> float:
     """Add the needle's terms: drag, poles in a given field, contact of its outline.
 
-    E = q_m B_tail . x_tail - q_m B_tip . x_tip,    x_tip = x_0 + R(theta) tip
+        E = q_m B_tail . x_tail - q_m B_tip . x_tip,    x_tip = x_0 + R(theta) tip
+
+    Args:
+        q: state, its first three are heading, x and y of the tail [rad, m].
+        field: flux density at tail and tip, shape (2, 2) [T].
+        needle: the needle.
+        shapes: what can be touched.
+        rest: state from which the drag is counted.
+        turned: resistance of a step to (theta, x, y) in the dish's frame, shape (3, 3).
+        gradient: added to.
+        band: added to.
+        convex: whether to leave out what makes second derivatives indefinite.
     """
     energy = 0.0
     for i in range(3):
@@ -200,15 +194,15 @@ def add_needle(
     gradient[1] -= lx
     gradient[2] -= ly
     band[0, 0] += max(fx * tx + fy * ty, 0.0) if convex else fx * tx + fy * ty
-    k = shapes.stiffness
+    k, rows = shapes.stiffness, np.empty((shapes.discs.shape[0] + shapes.boxes.shape[0] + 1, 6))
     for i in range(needle.outline.shape[0]):
         ox = c * needle.outline[i, 0] - s * needle.outline[i, 1]
         oy = s * needle.outline[i, 0] + c * needle.outline[i, 1]
-        if clear(q[1] + ox, q[2] + oy, needle.radius, shapes.grid, shapes.clearances):
+        if clear(q[1] + ox, q[2] + oy, needle.radius, shapes):
             continue
         for row in range(point_contacts(q[1] + ox, q[2] + oy, needle.radius, shapes, rows)):
-            depth, nx, ny = rows[row, 0], rows[row, 1], rows[row, 2]
-            bend = -rows[row, 3] * depth
+            depth, nx, ny = rows[row, 2], rows[row, 3], rows[row, 4]
+            bend = -rows[row, 5] * depth
             arm = nx * ox + ny * oy
             if convex:
                 bend, arm = max(bend, 0.0), max(arm, 0.0)

@@ -74,9 +74,8 @@ class Rod(NamedTuple):
     radius: float
 
 
-@compiled
-def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float, drag: NDArray[np.float64]) -> None:
-    """Write each node's drag: half of each segment beside it, so that a free end carries half a cell.
+def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float) -> NDArray[np.float64]:
+    """Return each node's drag: half of each segment beside it, so that a free end carries half a cell.
 
         Z_i = scale sum D / 2 (across I - (across - along) t t')
 
@@ -84,20 +83,19 @@ def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float, drag: NDArray[
         q: where tangents t are taken.
         rod: the thread.
         scale: factor, 1 / (beta dt) in a step.
-        drag: gets Z_xx, Z_xy, Z_yy, shape (n + 1, 3).
+
+    Returns:
+        Z_xx, Z_xy, Z_yy, shape (n + 1, 3).
     """
-    drag[:, :] = 0.0
-    half = 0.5 * rod.segment * scale
-    for i in range(drag.shape[0] - 1):
-        a = 1 + 2 * i
-        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
-        square = ex * ex + ey * ey
-        less = (rod.across - rod.along) / square
-        xx, xy, yy = half * (rod.across - less * ex * ex), -half * less * ex * ey, half * (rod.across - less * ey * ey)
-        for j in range(i, i + 2):
-            drag[j, 0] += xx
-            drag[j, 1] += xy
-            drag[j, 2] += yy
+    t = np.diff(q[1:].reshape(-1, 2), axis=0)
+    t /= np.hypot(t[:, 0], t[:, 1])[:, None]
+    xx, xy, yy = t[:, 0] ** 2, t[:, 0] * t[:, 1], t[:, 1] ** 2
+    less = rod.across - rod.along
+    each = 0.5 * rod.segment * scale * np.column_stack([rod.across - less * xx, -less * xy, rod.across - less * yy])
+    drag = np.zeros((len(each) + 1, 3))
+    drag[:-1] += each
+    drag[1:] += each
+    return drag
 
 
 @compiled
@@ -186,65 +184,81 @@ def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64],
 
 
 @compiled
+def find_contacts(q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArray[np.float64]) -> int:
+    """Write what nodes 1 ... n and segments sink into; return how many.
+
+    Args:
+        q: state, shape (N,).
+        rod: the thread.
+        shapes: what can be touched.
+        rows: gets index of the first unknown, place on the segment (-1 for a node), depth, gradient n_x and n_y of the
+            gap, and the gap's curvature at a node or the gap of a segment, shape (k, 6). What finds no row is left out.
+    """
+    count = 0
+    for a in range(3, q.shape[0] - 1, 2):
+        if not clear(q[a], q[a + 1], rod.radius, shapes):
+            found = point_contacts(q[a], q[a + 1], rod.radius, shapes, rows[count:])
+            for row in range(count, count + found):
+                rows[row, 0], rows[row, 1] = a, -1.0
+            count += found
+    if shapes.discs.shape[0] + shapes.boxes.shape[0] == 0:
+        return count
+    for a in range(1, q.shape[0] - 2, 2):
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        reach = rod.radius + 0.75 * math.sqrt(ex * ex + ey * ey)
+        if not clear(q[a] + 0.5 * ex, q[a + 1] + 0.5 * ey, reach, shapes):
+            found = segment_contacts(q, a, rod.segment, rod.radius, shapes, rows[count:])
+            for row in range(count, count + found):
+                rows[row, 0] = a
+            count += found
+    return count
+
+
+@compiled
 def add_contact(
     q: NDArray[np.float64],
-    rod: Rod,
-    shapes: Shapes,
+    k: float,
     rows: NDArray[np.float64],
     gradient: NDArray[np.float64],
     band: NDArray[np.float64],
     convex: bool,
 ) -> float:
-    """Add k / 2 depth^2 of every contact of nodes 1 ... n and of segments.
+    """Add k / 2 depth^2 of every contact, the rows of `find_contacts`.
 
     For a segment the gap's second derivative is that of the distance between a point and a line.
     """
     energy = 0.0
-    k = shapes.stiffness
-    grid, clearances = shapes.grid, shapes.clearances
-    for a in range(3, q.shape[0] - 1, 2):
-        if clear(q[a], q[a + 1], rod.radius, grid, clearances):
-            continue
-        for row in range(point_contacts(q[a], q[a + 1], rod.radius, shapes, rows)):
-            depth, nx, ny, bend = rows[row, 0], rows[row, 1], rows[row, 2], -rows[row, 3] * rows[row, 0]
+    for row in range(rows.shape[0]):
+        a, s, depth, nx, ny = int(rows[row, 0]), rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
+        energy += 0.5 * k * depth * depth
+        if s < 0.0:
+            bend = -rows[row, 5] * depth
             if convex:
                 bend = max(bend, 0.0)
-            energy += 0.5 * k * depth * depth
             gradient[a] -= k * depth * nx
             gradient[a + 1] -= k * depth * ny
             band[a, 0] += k * (bend + (1.0 - bend) * nx * nx)
             band[a + 1, 1] += k * (1.0 - bend) * nx * ny
             band[a + 1, 0] += k * (bend + (1.0 - bend) * ny * ny)
-    if shapes.discs.shape[0] + shapes.boxes.shape[0] == 0:
-        return energy
-    for a in range(1, q.shape[0] - 2, 2):
-        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
-        size = math.sqrt(ex * ex + ey * ey)
-        if clear(q[a] + 0.5 * ex, q[a + 1] + 0.5 * ey, rod.radius + 0.75 * size, grid, clearances):
             continue
-        count = segment_contacts(q[a], q[a + 1], q[a + 2], q[a + 3], rod.segment, rod.radius, shapes, rows)
-        for row in range(count):
-            depth, nx, ny, gap, s = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-            energy += 0.5 * k * depth * depth
-            w = ((1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny)
-            # Of the second derivative: turning, of the normal and of the place s.
-            tx, ty, turn = ex / (size * size), ey / (size * size), 0.0 if convex else 1.0
-            v = (-nx, -ny, nx, ny)
-            z = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
-            bend = gap / (size * size)
-            for r in range(4):
-                gradient[a + r] -= k * depth * w[r]
-                for c in range(r + 1):
-                    second = turn * (z[r] * v[c] + v[r] * z[c] + bend * v[r] * v[c])
-                    band[a + r, r - c] += k * (w[r] * w[c] + depth * second)
+        ex, ey = q[a + 2] - q[a], q[a + 3] - q[a + 1]
+        square = ex * ex + ey * ey
+        w = ((1.0 - s) * nx, (1.0 - s) * ny, s * nx, s * ny)
+        # Of the second derivative: turning, of the normal and of the place s.
+        tx, ty, turn = ex / square, ey / square, 0.0 if convex else 1.0
+        v = (-nx, -ny, nx, ny)
+        z = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
+        bend = rows[row, 5] / square
+        for r in range(4):
+            gradient[a + r] -= k * depth * w[r]
+            for c in range(r + 1):
+                second = turn * (z[r] * v[c] + v[r] * z[c] + bend * v[r] * v[c])
+                band[a + r, r - c] += k * (w[r] * w[c] + depth * second)
     return energy
 
 
-@compiled
-def find_friction(
-    q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArray[np.float64], friction: NDArray[np.float64]
-) -> None:
-    """Write where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
+def find_friction(contacts: NDArray[np.float64], shapes: Shapes) -> NDArray[np.float64]:
+    """Return where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
 
     A contact that pushes with the force N at the start of a step adds, for its slip s = t . (x - x_start) along it,
 
@@ -253,38 +267,15 @@ def find_friction(
     to the energy of the step: a force of mu N s / sqrt(s^2 + e^2) against the slip.
 
     Args:
-        q: state at the start, shape (N,) [rad, m].
-        rod: the thread.
+        contacts: at the start, the rows of `find_contacts`.
         shapes: what can be touched, with its friction.
-        rows: to work in, see `point_contacts`.
-        friction: gets the index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N]; a last
-            row without a force ends it.
+
+    Returns:
+        Index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N], shape (k, 5).
     """
-    count, most, limit = 0, friction.shape[0] - 1, shapes.friction * shapes.stiffness
-    if limit > 0.0:
-        for a in range(3, q.shape[0] - 1, 2):
-            if clear(q[a], q[a + 1], rod.radius, shapes.grid, shapes.clearances):
-                continue
-            for row in range(point_contacts(q[a], q[a + 1], rod.radius, shapes, rows)):
-                if count < most:
-                    _write_row(friction[count], a, 0.0, rows[row], limit * rows[row, 0])
-                    count += 1
-        for a in range(1, q.shape[0] - 2, 2):
-            x, y = 0.5 * (q[a] + q[a + 2]), 0.5 * (q[a + 1] + q[a + 3])
-            size = math.sqrt((q[a + 2] - q[a]) ** 2 + (q[a + 3] - q[a + 1]) ** 2)
-            if clear(x, y, rod.radius + 0.75 * size, shapes.grid, shapes.clearances):
-                continue
-            found = segment_contacts(q[a], q[a + 1], q[a + 2], q[a + 3], rod.segment, rod.radius, shapes, rows)
-            for row in range(found):
-                if count < most:
-                    _write_row(friction[count], a, rows[row, 4], rows[row], limit * rows[row, 0])
-                    count += 1
-    friction[count, 4] = 0.0
-
-
-@compiled
-def _write_row(friction: NDArray[np.float64], a: int, place: float, row: NDArray[np.float64], limit: float) -> None:
-    friction[0], friction[1], friction[2], friction[3], friction[4] = a, place, -row[2], row[1], limit
+    a, s, depth, nx, ny, _ = contacts.T
+    found = np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
+    return found if shapes.friction > 0.0 else found[:0]
 
 
 @compiled
@@ -299,10 +290,13 @@ def add_friction(
     """Add the friction of a step from `start` to q; `slip` is e [m]."""
     energy = 0.0
     for row in range(friction.shape[0]):
-        limit = friction[row, 4]
-        if limit == 0.0:
-            break
-        a, s, tx, ty = int(friction[row, 0]), friction[row, 1], friction[row, 2], friction[row, 3]
+        a, s, tx, ty, limit = (
+            int(friction[row, 0]),
+            friction[row, 1],
+            friction[row, 2],
+            friction[row, 3],
+            friction[row, 4],
+        )
         w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
         count = 2 if s == 0.0 else 4
         along = 0.0

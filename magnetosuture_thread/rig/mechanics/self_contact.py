@@ -172,6 +172,8 @@ def couple(
         step: corrected, shape (N,).
     """
     rows = np.flatnonzero(second > 0.0)
+    if len(rows) == 0:
+        return
     size, places, weights = len(rows), np.empty(6, dtype=np.int64), np.empty(6)
     columns, matrix, force = np.zeros((size, step.shape[0])), np.zeros((size, size)), np.zeros(size)
     for i in range(size):
@@ -188,15 +190,4 @@ def couple(
                 force[i] += weights[r] * step[places[r]]
                 for j in range(size):
                     matrix[i, j] += weights[r] * columns[j, places[r]]
-    for i in range(size):  # Gauss's elimination; symmetric and positive definite, so that no pivot is sought
-        for j in range(i + 1, size):
-            factor = matrix[j, i] / matrix[i, i]
-            force[j] -= factor * force[i]
-            for k in range(i + 1, size):
-                matrix[j, k] -= factor * matrix[i, k]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            force[i] -= matrix[i, k] * force[k]
-        force[i] /= matrix[i, i]
-        for r in range(step.shape[0]):
-            step[r] -= force[i] * columns[i, r]
+    step -= np.linalg.solve(matrix, force) @ columns

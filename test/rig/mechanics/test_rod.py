@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, polygon_gap, segment_contacts
-from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle, turn_resistance
+from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
     Rod,
     add_bending,
     add_contact,
     add_stretching,
+    find_contacts,
 )
 
 Vector = NDArray[np.float64]
@@ -74,16 +75,20 @@ def check_derivatives(term: Term, q: Vector, step: float = 1e-9) -> None:
 
 
 def contact_term(shapes: Shapes) -> Term:
-    rows = np.zeros((len(shapes.discs) + len(shapes.corners) + 2, 5))
-    return lambda q, gradient, band, convex: add_contact(q, ROD, shapes, rows, gradient, band, convex)
+    rows = np.zeros((50, 6))
+
+    def term(q: Vector, gradient: Vector, band: Vector, convex: bool) -> float:
+        return add_contact(q, shapes.stiffness, rows[: find_contacts(q, ROD, shapes, rows)], gradient, band, convex)
+
+    return term
 
 
 def test_stretching_has_its_derivatives():
-    check_derivatives(lambda q, g, b, convex: add_stretching(q, ROD, g, b, convex), bent_state())
+    check_derivatives(lambda q, g, b, c: add_stretching(q, ROD, g, b, c), bent_state())
 
 
 def test_bending_has_its_derivatives():
-    check_derivatives(lambda q, g, b, convex: add_bending(q, ROD, g, b), bent_state(), 1e-7)
+    check_derivatives(lambda q, g, b, c: add_bending(q, ROD, g, b), bent_state(), 1e-7)
 
 
 def test_the_needles_terms_have_their_derivatives():
@@ -91,11 +96,9 @@ def test_the_needles_terms_have_their_derivatives():
     outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
     needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, 1.3)
     shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=7.1e-3).packed()
-    rows, turned = np.zeros((4, 5)), np.zeros((3, 3))
     q, field = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]])
     rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
-    turn_resistance(needle, 0.3, 500.0, turned)
-    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
+    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, 500.0 * resistance, g, b, c), q)
     check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
 
 
@@ -126,20 +129,23 @@ def test_the_distance_from_a_polygon():
         ((0.9e-3, 0.8e-3), -math.hypot(0.1e-3, 0.2e-3), (0.1 / math.hypot(0.1, 0.2), 0.2 / math.hypot(0.1, 0.2)), None),
     ]
     for point, gap, normal, curvature in cases:
-        found = polygon_gap(*point, shapes, 0, math.inf)
+        found = polygon_gap(*point, shapes, 0)
         assert found[0] == pytest.approx(gap, rel=1e-12)
         assert found[1:3] == pytest.approx(normal, abs=1e-12)
         assert found[3] == pytest.approx(1.0 / gap if curvature is None else curvature, abs=1e-9)
-    assert polygon_gap(2e-3, 0.0, shapes, 0, math.inf)[:3] == pytest.approx((0.0, 0.0, -1.0))
+    assert polygon_gap(2e-3, 0.0, shapes, 0)[:3] == pytest.approx((0.0, 0.0, -1.0))
     np.testing.assert_array_equal(np.flatnonzero(shapes.convex == 0.0), [np.argmin(abs(shapes.corners - 1e-3).sum(1))])
 
 
 def test_a_segment_touches_only_corners_that_stick_out():
-    shapes, rows = Surface(polygons=(L_SHAPE,)).packed(), np.zeros((9, 5))
+    shapes, rows = Surface(polygons=(L_SHAPE,)).packed(), np.zeros((9, 6))
+
+    def contacts(*ends: float) -> int:
+        return segment_contacts(np.array([0.0, *ends]), 1, math.dist(ends[:2], ends[2:]), 3e-5, shapes, rows)
+
     # Across the corner at (4, 1) mm, at 45 degrees, 10 um off; and the same beside the reflex corner (1, 1) mm.
-    off = 1e-5 * math.sqrt(0.5)
-    assert segment_contacts(3.7e-3 + off, 1.3e-3 + off, 4.3e-3 + off, 0.7e-3 + off, 8.5e-4, 3e-5, shapes, rows) == 1
-    np.testing.assert_allclose(rows[0], [2e-5, math.sqrt(0.5), math.sqrt(0.5), 1e-5, 0.5], rtol=1e-9)
-    assert segment_contacts(3.7e-3 - off, 1.3e-3 - off, 4.3e-3 - off, 0.7e-3 - off, 8.5e-4, 3e-5, shapes, rows) == 1
-    np.testing.assert_allclose(rows[0], [4e-5, math.sqrt(0.5), math.sqrt(0.5), -1e-5, 0.5], rtol=1e-9)
-    assert segment_contacts(1.005e-3, 1.3e-3, 1.3e-3, 1.005e-3, 4.2e-4, 3e-5, shapes, rows) == 0
+    for gap in (1e-5, -1e-5):
+        off = gap * math.sqrt(0.5)
+        assert contacts(3.7e-3 + off, 1.3e-3 + off, 4.3e-3 + off, 0.7e-3 + off) == 1
+        np.testing.assert_allclose(rows[0, 1:], [0.5, 3e-5 - gap, math.sqrt(0.5), math.sqrt(0.5), gap], rtol=1e-9)
+    assert contacts(1.005e-3, 1.3e-3, 1.3e-3, 1.005e-3) == 0

@@ -1,0 +1,116 @@
+"""The command `magnetosuture`: its parser, and errors as exit codes; `python -m magnetosuture_thread.cli` too."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+
+from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
+from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe, make_console
+from magnetosuture_thread.errors import missing_module
+
+DESCRIPTION = """\
+Predicts where a suture thread goes behind a magnetically steered needle.
+
+Research software, no medical device. Lengths are in metres and times in seconds throughout.
+"""
+# Name and summary of each command; `commands/NAME.py` is imported when the command is given, so that --help is quick.
+COMMANDS = {
+    "replay": "play a recorded bag through the live graph, or offline",
+    "render": "write a bag of simulated camera frames, or poses",
+    "simulate": "run the whole graph around a simulated rig",
+    "console": "serve the operator's page",
+    "coils": "arm, disarm, stop or reset the running coil bridge",
+    "reproduce": "reproduce a result of the paper, simulated",
+    "evaluate": "score the thread model on bags, or on reference trajectories",
+    "track": "find needle and thread in camera frames, without a graph",
+    "calibrate": "fit the thread's parameters to recorded bags",
+    "calibrate-camera": "find where the dish is in the camera's image",
+    "calibrate-coils": "find the coils' properties from probe measurements",
+    "campaign": "run an autonomous procedure in the simulated closed loop, once for each seed",
+    "scene": "check a scene file, or draw it",
+    "bag": "check a recorded bag, or repair it",
+    "compile": "compile the functions that every node runs, so that nodes start at once",
+}
+
+
+def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
+    """Return the parser, in which each command sets `run` to what it does.
+
+    Args:
+        names: commands that get their arguments; the others have their name and summary only.
+
+    Raises:
+        ModuleNotFoundError: a package that one of them needs is not installed.
+    """
+    parser = argparse.ArgumentParser(prog="magnetosuture")
+    describe(parser, DESCRIPTION)
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name, summary in COMMANDS.items():
+        own = subparsers.add_parser(name, help=summary)
+        if name in names:
+            import_module(f"magnetosuture_thread.commands.{name.replace('-', '_')}").add(own)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+
+    def run() -> int:
+        options = make_parser(given[:1]).parse_args(given)
+        check_outputs(options)
+        return int(options.run(options, Terminal()))
+
+    return exit_code(run)
+
+
+def exit_code(run: Callable[[], int]) -> int:
+    """Return the exit code of what runs; an error ends it with one line on standard error."""
+    try:
+        with _interrupted_by(signal.SIGTERM, signal.SIGHUP):
+            return run()
+    except ConfigurationError as error:
+        return _fail(str(error), WRONG_USE)
+    except ModuleNotFoundError as error:
+        return _fail(missing_module(error), FAILED)
+    except (MagnetosutureError, OSError) as error:
+        return _fail(str(error), FAILED)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return FAILED
+
+
+def _fail(problem: str, code: int) -> int:
+    errors = make_console(errors=True)
+    errors.print("error:", style="bold red", end=" ")
+    errors.print(" ".join(problem.split()), markup=False)
+    return code
+
+
+@contextmanager
+def _interrupted_by(*signals: signal.Signals) -> Iterator[None]:
+    """Treat these signals as Ctrl-C, so that whatever ends this process, the nodes end too and nothing partial stays.
+
+    One that is ignored, as under nohup, stays ignored.
+    """
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    handled = [which for which in signals if signal.getsignal(which) is not signal.SIG_IGN]
+    before = [(which, signal.signal(which, interrupt)) for which in handled]
+    try:
+        yield
+    finally:
+        for which, handler in before:
+            signal.signal(which, handler)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,374 @@
+"""The command `magnetosuture campaign`: many runs of a procedure in the closed loop, and what came of them.
+
+The page loads nothing and runs no script. Its pictures are SVG: lengths in mm, y upwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Collection, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import process_time
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
+from magnetosuture_thread.campaign.bag import RunBag
+from magnetosuture_thread.campaign.loop import START
+from magnetosuture_thread.campaign.run import (
+    KEEP_OUT_TOLERANCE,
+    MAX_REST,
+    MAX_TIME_RATIO,
+    PENETRATION_TOLERANCE,
+    RunInstant,
+    RunResult,
+    check_run,
+    run_procedure,
+    vary,
+)
+from magnetosuture_thread.commands.command import (
+    DONE,
+    FAILED,
+    Terminal,
+    add_workers,
+    count_argument,
+    runs,
+)
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands.recorded import SETUP_NOTE
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.planning.procedure import Procedure, read_procedure
+from magnetosuture_thread.setups import Setup, read_procedure_setup
+from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
+
+FILE, PAGE = "campaign.json", "campaign.html"
+BAGS = "bags"  # folder of the bags in the output
+MAX_STRIPS = 200  # failed runs with pictures
+CLOSE_UP = 4.0  # lengths of the needle: side of a close-up
+MIN_CLOSE_UP = 8e-3  # m
+MIN_COMMAND = 1e-6  # m/s; a smaller command has no arrow
+NOT_REACHED = "not all goals reached"
+REASONS = {
+    "min_needle_clearance_m": "the needle came too close to wall or shape",
+    "max_thread_penetration_m": "a node of the thread was in wall or shape",
+    "longest_rest_s": "the needle rested too long",
+    "max_tension_n": "the thread's tension was too high",
+    "max_friction_nodes": "too many nodes were under friction",
+    "time_s": "it took too long",
+}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    runs(parser, run_campaign)
+    option = parser.add_argument
+    option("procedure", metavar="PROCEDURE", help="a procedure's name or YAML file")
+    option("--seeds", type=count_argument("runs", 1, 100_000), default=1, metavar="N", help="runs (default: 1)")
+    first = count_argument("a seed", 0, 2**31 - 1)
+    option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
+    option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
+    option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
+    bags = "seeds whose runs are recorded as bags (default: none)"
+    option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
+    add_workers(parser)
+    option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
+
+
+def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Run an autonomous procedure in the simulated closed loop, once for each seed.
+
+    Rig, the tracker's noise or the camera and tracker themselves, estimator, planner and coil bridge run in one process
+    on simulated time, without ROS; a seed always gives the same run. Each seed varies start, viscosity, bending
+    stiffness, coils, friction and noise; the nodes are told nothing of it. DIR, which must not exist, gets
+      campaign.json   how many runs succeeded, and the figures of each
+      campaign.html   the same as a page, with pictures of the last seconds of each run that failed
+      bags/seed_N     for each seed of --bags: what all nodes would publish, with the ground truth; `replay` takes it
+    With --scheduler and --bags, DIR must be a folder that all workers have.
+    A run succeeds if all goals are reached and all limits hold. All of it is simulated.
+    """
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    given = {name: getattr(options, name) for name in ("setup", "camera", "bags", "workers", "scheduler")}
+    with terminal.progress("campaign") as advance:
+        result = simulate_campaign(
+            options.procedure, seeds, options.output, log=terminal.log, progress=advance, **given
+        )
+    title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
+    table = Table(title=f"{title} (simulated)", title_justify="left", title_style="bold")
+    for name in ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for run in result.runs:
+        figures = run.figures
+        table.add_row(
+            str(run.seed),
+            "yes" if run.success else "no",
+            str(run.goals_met),
+            f"{figures.time_s:.1f}",
+            f"{figures.ideal_time_s:.1f}",
+            f"{1e3 * figures.min_needle_clearance_m:.3f}",
+            f"{figures.longest_rest_s:.2f}",
+            f"{figures.wrap_degrees:.0f}",
+        )
+    terminal.print(table)
+    terminal.print(f"report: {options.output / PAGE}", soft_wrap=True)
+    return FAILED if result.died else DONE
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """What came of a campaign.
+
+    Attributes:
+        procedure: that was run.
+        setup: what the nodes believe.
+        camera: whether frames were rendered and tracked.
+        runs: in the order of their seeds.
+        died: seeds whose process ended early, and why.
+        bags: seeds of which there is a bag, with its folder beside the page.
+    """
+
+    procedure: Procedure
+    setup: Setup
+    camera: bool
+    runs: Sequence[RunResult]
+    died: dict[int, str] = field(default_factory=dict)
+    bags: dict[int, str] = field(default_factory=dict)
+
+    @property
+    def successes(self) -> int:
+        """Runs in which every goal was reached and every limit held."""
+        return sum(run.success for run in self.runs)
+
+    @property
+    def min_clearance(self) -> float:
+        """Clearance of the needle's axis that a run has to keep [m]."""
+        return self.setup.coils.keep_out - KEEP_OUT_TOLERANCE
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as plain values, in the unit that each name ends with."""
+        return {
+            "procedure": self.procedure.name,
+            "setup": self.setup.name,
+            "camera": self.camera,
+            "simulated": True,
+            "successes": self.successes,
+            "runs": [run.to_json() for run in self.runs],
+            "died": {str(seed): reason for seed, reason in self.died.items()},
+        }
+
+
+def simulate_campaign(
+    name: str,
+    seeds: range,
+    output: Path,
+    *,
+    setup: str = "",
+    camera: bool = False,
+    bags: Collection[int] = (),
+    workers: int = 1,
+    scheduler: str = "",
+    log: Log = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> CampaignResult:
+    """Run a procedure once for each seed, and write `campaign.json`, a report and bags into a new folder.
+
+    The files are the same for the same seeds, however many processes run them.
+
+    Args:
+        name: of the procedure, or the path of its file.
+        seeds: of the runs.
+        output: folder to make.
+        setup: name or file of the setup; empty for the procedure's own.
+        camera: whether frames are rendered and tracked, else the tracker's noise is added to the truth.
+        bags: seeds whose runs are recorded as bags.
+        workers: processes.
+        scheduler: address of a Dask scheduler, whose workers make the runs in place of those; for bags they must have
+            the output's folder too.
+        log: called with a line for a person at each run's end.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigurationError: procedure or setup cannot be used, or do not fit each other, or a bag is of no run.
+        PlanningError: there is no way to a goal from where the first run begins.
+        BagError: the output exists, or cannot be written.
+    """
+    procedure = read_procedure(name)
+    if not set(bags) <= set(seeds):
+        raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
+    used = read_procedure_setup(procedure, setup)
+    check_run(procedure, used, vary(used, seeds[0]))
+    found: dict[int, RunResult] = {}
+    died: dict[int, str] = {}
+    folders = {seed: f"{BAGS}/seed_{seed}" for seed in sorted(set(bags))}
+    work = partial(_run, procedure, used, used.path.read_text(encoding="utf-8"), camera)
+    with whole_folder(output) as folder, make_runner(work, workers, scheduler) as runner:
+        tasks = [(seed, folder / folders[seed] if seed in folders else None) for seed in seeds]
+        for index, made in runner.run(tasks, log, progress):
+            seed = seeds[index]
+            if isinstance(made, WorkerDiedError):
+                died[seed] = str(made)
+                log(f"seed {seed}: {made}")
+                continue
+            run, used_time = made
+            found[seed], speed = run, run.simulated_s / used_time
+            log(f"seed {seed}: {'success' if run.success else run.reason} ({speed:.1f} times real time)")
+        ordered = tuple(found[seed] for seed in seeds if seed in found)
+        result = CampaignResult(procedure, used, camera, ordered, died, folders)
+        (folder / FILE).write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
+        (folder / PAGE).write_text(write_page(result), encoding="utf-8")
+    return result
+
+
+def _run(
+    procedure: Procedure,
+    setup: Setup,
+    text: str,
+    camera: bool,
+    task: tuple[int, Path | None],
+    log: Log,
+    progress: Progress,
+) -> tuple[RunResult, float]:
+    """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s]."""
+    began, (seed, folder) = process_time(), task
+    if folder is not None and not folder.parents[1].is_dir():
+        raise BagError(folder, "cannot be recorded: this worker does not have the output's folder")
+    what = f"the closed loop in one process, procedure {procedure.name}, setup {setup.name}, seed {seed}"
+    notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
+    with nullcontext() if folder is None else RunBag(folder, setup, notes, START, camera=camera) as bag:
+        found = run_procedure(procedure, setup, vary(setup, seed), camera=camera, recorder=bag)
+    return found, process_time() - began
+
+
+def write_page(result: CampaignResult) -> str:
+    """Return the report as a page of HTML, with pictures of failed runs."""
+    rows = [
+        {"result": run, "broken": set(run.figures.beyond_limits(result.setup.coils.keep_out))} for run in result.runs
+    ]
+    failed = [row for row, run in zip(rows, result.runs, strict=True) if not run.success]
+    for row in rows:
+        row |= {"pictures": (), "closest": None}
+    for row in failed[:MAX_STRIPS]:
+        row |= _pictures(result, row["result"], row["broken"])
+    reasons: dict[str, list[int]] = {}
+    for row in rows:
+        run = row["result"]
+        not_reached = [NOT_REACHED] if not (run.success or run.reached) else []
+        for why in (*not_reached, *(REASONS[name] for name in sorted(row["broken"]))):
+            reasons.setdefault(why, []).append(run.seed)
+    scene = result.setup.scene
+    return read_template(__package__, "campaign.html", {"spaced": lambda text: text.replace("_", " ")}).render(
+        details=result,
+        runs=rows,
+        failed=[row for row in failed if row["pictures"]],
+        left_out=len(failed[MAX_STRIPS:]),
+        tiles=_tiles(result) if rows else [],
+        reasons=sorted(reasons.items(), key=lambda each: -len(each[1])),
+        shapes=[{"kind": shape.kind, "path": _outline(shape.geometry)} for shape in scene.shapes],
+        dish_radius=1e3 * scene.dish.radius,
+        needle_width=1e3 * result.setup.rig.needle_width,
+        halo_width=2e3 * result.min_clearance,
+        max_rest=MAX_REST,
+        max_time_ratio=MAX_TIME_RATIO,
+        style=page_style() + read_source(__package__, "campaign.css"),
+    )
+
+
+def _tiles(result: CampaignResult) -> list[dict[str, str]]:
+    """Return the headline figures: name, value, grade and detail."""
+    count, required = len(result.runs) + len(result.died), result.min_clearance
+    reached = [run for run in result.runs if run.reached]
+    figures = [run.figures for run in result.runs]
+    clearance = min(each.min_needle_clearance_m for each in figures)
+    penetration = max(each.max_thread_penetration_m for each in figures)
+    rest = max(each.longest_rest_s for each in figures)
+    ratios = [run.figures.time_s / run.figures.ideal_time_s for run in reached if run.figures.ideal_time_s > 0.0]
+    successes = result.successes
+    rows: list[tuple[str, str, bool, str]] = [
+        ("runs that succeeded", f"{successes} of {count}", successes == count, "all goals, all limits"),
+        ("runs that reached all goals", f"{len(reached)} of {count}", len(reached) == count, "limits apart"),
+        (
+            "closest needle",
+            f"{1e3 * clearance:.3f} mm",
+            clearance >= required,
+            f"of all runs; at least {1e3 * required:.3f} mm",
+        ),
+        (
+            "deepest node of the thread",
+            f"{1e6 * penetration:.1f} µm",
+            penetration <= PENETRATION_TOLERANCE,
+            f"of all runs; at most {1e6 * PENETRATION_TOLERANCE:g} µm",
+        ),
+        ("longest rest", f"{rest:.1f} s", rest <= MAX_REST, f"of all runs; at most {MAX_REST:g} s"),
+    ]
+    if ratios:
+        most = max(ratios)
+        detail = f"median of runs that reached all goals; maximum {most:.2f}, at most {MAX_TIME_RATIO:g}"
+        rows.append(("time over ideal time", f"{median(ratios):.2f}", most <= MAX_TIME_RATIO, detail))
+    return [
+        {"name": name, "value": value, "grade": "good" if is_good else "bad", "detail": detail}
+        for name, value, is_good, detail in rows
+    ]
+
+
+def _pictures(result: CampaignResult, run: RunResult, broken: Collection[str]) -> dict[str, Any]:
+    """Return the pictures of a failed run: the whole dish at its end, its last seconds, and its closest instant.
+
+    The closest is there if the needle came too close, before the last seconds.
+    """
+    if not run.last_instants:
+        return {}
+    scene, speed = result.setup.scene, result.procedure.limits[0].speed
+    pictures = [_picture(run.last_instants[-1], scene, speed, overview=True)]
+    pictures += [_picture(instant, scene, speed) for instant in run.last_instants]
+    closest, begin = run.closest_instant, run.last_instants[0].frame.time
+    is_earlier = closest is not None and closest.frame.time < begin and "min_needle_clearance_m" in broken
+    return {"pictures": pictures, "closest": _picture(closest, scene, speed) if closest and is_earlier else None}
+
+
+def _picture(instant: RunInstant, scene: Scene, speed: float, *, overview: bool = False) -> dict[str, Any]:
+    """Return an instant as an SVG shows it, the whole dish or the surroundings of the needle.
+
+    Args:
+        instant: to show.
+        scene: around it.
+        speed: at which the arrow of the command has the needle's length [m/s].
+        overview: whether the whole dish is shown.
+    """
+    axis, frame = instant.axis, instant.frame
+    length = float(np.linalg.norm(axis[-1] - axis[0]))
+    half, centre = 0.5 * max(CLOSE_UP * length, MIN_CLOSE_UP), 0.5 * (axis[0] + axis[-1])
+    if overview:
+        half, centre = 1.02 * scene.dish.radius, np.zeros(2)
+    command: list[float] = []
+    if math.hypot(*frame.commanded) > MIN_COMMAND:
+        command = np.round(1e3 * np.append(axis[-1], axis[-1] + length / speed * frame.commanded), 3).tolist()
+    return {
+        "instant": instant,
+        "box": np.round(1e3 * np.append(centre - half, (2.0 * half, 2.0 * half)), 3).tolist(),
+        "thread": _points(frame.thread),
+        "needle": _points(axis),
+        "path": "" if instant.path is None else _points(instant.path),
+        "command": command,
+        "is_overview": overview,
+    }
+
+
+def _points(vertices: Points) -> str:
+    return " ".join(f"{1e3 * x:.3f},{1e3 * y:.3f}" for x, y in vertices.tolist())
+
+
+def _outline(geometry: Disc | Polygon) -> str:
+    """Return a shape's outline and holes as the path of an SVG."""
+    if isinstance(geometry, Disc):
+        x, y, r = (1e3 * value for value in (*geometry.centre, geometry.radius))
+        return f"M{x - r:.3f},{y:.3f}a{r:.3f},{r:.3f} 0 1 0 {2 * r:.3f},0a{r:.3f},{r:.3f} 0 1 0 {-2 * r:.3f},0z"
+    return "".join(f"M{_points(ring).replace(' ', 'L')}z" for ring in geometry.rings)

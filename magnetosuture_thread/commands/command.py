@@ -1,0 +1,273 @@
+"""What commands share: how one is described, argument types that refuse wrong values, options, and the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
+
+from magnetosuture_thread import ConfigurationError
+from magnetosuture_thread.bags import parse_remap
+from magnetosuture_thread.files import parse_location
+from magnetosuture_thread.outputs import input_problem, output_problem
+from magnetosuture_thread.texts import printable
+
+DONE, FAILED, WRONG_USE = 0, 1, 2
+STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks
+EXIT_CODES = "exit codes: 0 done, 1 the job failed, 2 wrong use"
+OUTPUTS = ("output", "json", "picture", "pictures", "overlay")  # options that name what is written
+
+Run: TypeAlias = "Callable[[argparse.Namespace, Terminal], int]"
+
+
+def describe(parser: argparse.ArgumentParser, text: str) -> None:
+    """Set the text under --help."""
+    parser.description, parser.epilog = text, EXIT_CODES
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+
+
+def runs(parser: argparse.ArgumentParser, run: Run) -> None:
+    """Make a parser that of a command.
+
+    Args:
+        parser: that has no arguments yet.
+        run: the command, called with options and terminal; returns the exit code. Its docstring is the text under
+            --help.
+    """
+    describe(parser, inspect.getdoc(run) or "")
+    parser.set_defaults(run=run)
+
+
+def add_actions(
+    parser: argparse.ArgumentParser, text: str, title: str, metavar: str, **actions: Run
+) -> list[argparse.ArgumentParser]:
+    """Add sub-commands to a command, and return their parsers.
+
+    Args:
+        parser: of the command.
+        text: under its --help.
+        title: of the list of sub-commands.
+        metavar: what stands for them.
+        actions: what each does; an underscore in a name is a hyphen.
+    """
+    describe(parser, text)
+    subparsers = parser.add_subparsers(title=title, metavar=metavar, required=True)
+    parsers = []
+    for name, run in actions.items():
+        summary = (inspect.getdoc(run) or "").partition("\n")[0].rstrip(".")
+        own = subparsers.add_parser(name.replace("_", "-"), help=summary[:1].lower() + summary[1:])
+        runs(own, run)
+        parsers.append(own)
+    return parsers
+
+
+def number_argument(low: float, high: float) -> Callable[[str], float]:
+    """Return an argument type: a number within bounds."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number from {low:g} to {high:g}")
+        return value
+
+    return parse
+
+
+def count_argument(things: str, low: int, high: int) -> Callable[[str], int]:
+    """Return an argument type: a number of things within bounds."""
+
+    def parse(text: str) -> int:
+        count = whole_number(text)
+        if not low <= count <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number of {things} from {low} to {high}")
+        return count
+
+    return parse
+
+
+def whole_number(text: str) -> int:
+    """Return a whole number of at least 0: an argument type."""
+    if not (text.isascii() and text.isdigit()):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 0")
+    return int(text)
+
+
+def output_file(text: str) -> Path:
+    """Return a file to write, in a folder that exists: an argument type."""
+    path = Path(text)
+    if not path.parent.is_dir() or path.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r} is no file in a folder that exists")
+    return path
+
+
+def bag_location(text: str) -> Path:
+    """Return the place of a bag, a path or a URL: an argument type."""
+    try:
+        return parse_location(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no path and no URL of a known file system: {error}") from None
+
+
+def namespace_argument(text: str) -> str:
+    """Return a ROS namespace, as `lab1` or `/lab1/left`, or none: an argument type."""
+    if text and not re.fullmatch(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"{text!r} is no ROS namespace, as lab1 or /lab1/left")
+    return text
+
+
+def _remap(text: str) -> tuple[str, str]:
+    try:
+        return parse_remap(text)
+    except ConfigurationError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {error.expectation}") from None
+
+
+def add_remap(parser: argparse._ActionsContainer) -> None:
+    """Add the option --remap, which may come again; its value is a list of pairs, old name and new."""
+    text = "another name for a bag's topic; may come again"
+    parser.add_argument("--remap", type=_remap, action="append", default=[], metavar="FROM:=TO", help=text)
+
+
+def add_workers(parser: argparse._ActionsContainer, default: int = 1, note: str = "") -> None:
+    """Add the options --workers and --scheduler."""
+    option = parser.add_argument
+    text = f"processes (default: %(default)s){note}"
+    option("--workers", type=count_argument("processes", 1, 256), default=default, metavar="N", help=text)
+    text = "a Dask scheduler, whose workers do it instead, for example tcp://127.0.0.1:8786 (extra `cluster`)"
+    option("--scheduler", default="", metavar="ADDRESS", help=text)
+
+
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add the argument FRAMES, --remap for those of a bag, and the camera's lens."""
+    parser.add_argument("frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag")
+    add_remap(parser)
+    lens = "the lens, as ROS's camera_calibration_parsers writes it (YAML; default: a bag's camera_info)"
+    parser.add_argument("--camera-info", type=Path, metavar="FILE", help=lens)
+
+
+def add_source(parser: argparse._ActionsContainer, bag: str = "the bag") -> None:
+    """Add --setup, --source, --remap and --frame: how a bag is read.
+
+    Args:
+        parser: that gets them.
+        bag: which bag names the setup.
+    """
+    option = parser.add_argument
+    option("--setup", default="", metavar="NAME", help=f"a setup's name or YAML file (default: the one {bag} names)")
+    source = "the camera's frames, or the recorded poses (default: the camera where there are frames)"
+    option("--source", choices=("auto", "camera", "poses"), default="auto", help=source)
+    add_remap(parser)
+    option("--frame", default="dish", metavar="NAME", help="a bag's name of the dish frame")
+
+
+def add_span(parser: argparse._ActionsContainer, bag: str = "the bag") -> None:
+    """Add --start and --duration: which part of a bag is read."""
+    option = parser.add_argument
+    option("--start", type=number_argument(0.0, 1e9), default=0.0, metavar="S", help=f"seconds into {bag} to begin at")
+    option("--duration", type=number_argument(0.0, 1e9), metavar="S", help="seconds (default: to the end)")
+
+
+def bag_selection(options: argparse.Namespace) -> dict[str, Any]:
+    """Return how a bag is read: see `commands.recorded.BagSelection`."""
+    names = (name for name in ("source", "start", "duration", "frame") if hasattr(options, name))
+    chosen = {name: getattr(options, name) for name in names}
+    return {"setup_name": options.setup, "remap": dict(options.remap), **chosen}
+
+
+def check_outputs(options: argparse.Namespace) -> None:
+    """Refuse outputs that are or damage an input, twice the same one, or something else than a new or regular file.
+
+    Raises:
+        ConfigurationError: with the option.
+    """
+    given = vars(options)
+    inputs = []
+    for name, value in given.items():
+        if name not in OUTPUTS:
+            listed = value if isinstance(value, list) else [value]
+            inputs += [Path(each) for each in listed if isinstance(each, Path) or (isinstance(each, str) and each)]
+    taken = list[Path]()
+    for name in OUTPUTS:
+        path = given.get(name)
+        if not isinstance(path, Path) or path == STANDARD_OUTPUT:
+            continue
+        problem = input_problem(path, inputs)
+        if not path.is_dir():
+            problem = problem or output_problem(path)
+        if not problem and path.absolute() in taken:
+            problem = "is named by another option too; expected a file of its own"
+        if problem:
+            what, _, expectation = problem.partition("; expected ")
+            raise ConfigurationError(f"--{name}", str(path), f"{expectation}, as it {what}")
+        taken.append(path.absolute())
+
+
+class _PlainConsole(Console):
+    """A console on which no name of a file, topic or frame moves the cursor, changes colours or turns text around."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Render; control characters in texts become escape sequences, those of the console itself stay."""
+        for segment in super().render(renderable, options):
+            text, style, control = segment
+            yield segment if control or text.isprintable() else Segment(printable(text), style)
+
+
+def make_console(*, errors: bool = False) -> Console:
+    """Return the console of a command: numbers and paths in no colours of their own, control characters escaped.
+
+    Args:
+        errors: whether it writes to standard error, in place of standard output.
+    """
+    return _PlainConsole(highlight=False, emoji=False, stderr=errors, soft_wrap=errors)
+
+
+def make_log(console: Console) -> Callable[[str], None]:
+    """Return what prints a line as it is, however long."""
+    return lambda text: console.print(text, soft_wrap=True, markup=False)
+
+
+@contextmanager
+def progress(console: Console, name: str) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar; the block gets a function that sets its fraction, 0 to 1."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+class Terminal:
+    """What a command shows while it runs and when it is done.
+
+    Attributes:
+        log: called with a line for a person, which is printed as it is, however long.
+        print: called with a table.
+    """
+
+    def __init__(self) -> None:
+        self._console = make_console()
+        self.log, self.print = make_log(self._console), self._console.print
+
+    def progress(self, name: str) -> AbstractContextManager[Callable[[float], None]]:
+        """Show a progress bar; see `progress`."""
+        return progress(self._console, name)
+
+
+def write_json(path: Path | None, figures: Any) -> None:
+    """Write figures to the file given by --json, if any."""
+    if path:
+        from magnetosuture_thread.commands.output import whole_file
+
+        with whole_file(path) as partial:
+            partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -1,0 +1,488 @@
+"""The command `magnetosuture console`: the operator's page, the graph behind it, and recordings. It needs ROS."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from magnetosuture_thread import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.command import (
+    DONE,
+    Terminal,
+    namespace_argument,
+    runs,
+    whole_number,
+)
+from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, log_compiling, own_domain
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
+from magnetosuture_thread.configuration import from_mapping, to_mapping
+from magnetosuture_thread.console.server import ConsoleServer, serve_until
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import Inbox, joined
+from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
+from magnetosuture_thread.nodes.processes import NodeProcesses
+from magnetosuture_thread.nodes.program import STOPS
+from magnetosuture_thread.resources import share_directory
+from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.workers import Log
+
+TOKEN = "MAGNETOSUTURE_TOKEN"
+POLL_PERIOD = 0.2  # s between two checks of the nodes
+QUEUE_DEPTH, RECORDING_PERIOD = 1000, 0.01  # messages of a recorded topic, and s between two looks at them
+REPLAY_BLOCKED = "this is a replay: nothing can be jogged or armed"
+# The coils rest while the needle's pose is late, and a late answer of the model is a late answer to a key: so they
+# go before the browser and the rig, and behind the bridge.
+PREFERRED, PRIORITY = "perception", 5
+SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active")  # a person arms it
+SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  # settings that no other setup changes
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    runs(parser, run_console)
+    option = parser.add_argument
+    option("setup", metavar="SETUP", nargs="?", default="", help="its name or YAML file (default: of a 35 mm dish)")
+    graph = parser.add_mutually_exclusive_group()
+    graph.add_argument("--graph", action="store_true", help="on the graph that runs on this ROS domain")
+    graph.add_argument("--replay", type=Path, metavar="BAG", help="on a bag that is played through the nodes")
+    option("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the running graph")
+    option("--address", help="network address to serve on (default: the setup's, 127.0.0.1)")
+    option("--port", type=whole_number, help="of it; 0 takes a free one (default: the setup's, 8090)")
+    option("--certificate", metavar="FILE", help="serve over TLS by this certificate, a PEM file")
+    key = "of the certificate, where it is not in the same file"
+    option("--key", dest="private_key", metavar="FILE", help=key)
+    option("--origin", metavar="URL", help="under which browsers reach the page, as https://rig.example")
+    option("--token", help=f"that commands need (default: {TOKEN} in the environment, or a new one)")
+    recordings = "folder that gets a bag for each recording (default: output/recordings)"
+    option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
+
+
+def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Serve the operator's page.
+
+    It shows the dish with needle and thread, the margins and the state of all nodes; the needle is jogged by arrow
+    keys, gamepad or mouse; emergency stop, arm and disarm.
+
+    Without an option the whole graph is started around a simulated rig, with the coils disarmed, and any setup
+    can be chosen on the page. --graph serves the page on the graph that runs on this ROS domain, --replay on a
+    bag that is played through the nodes over and over, which nobody can jog. Around a simulated rig vision_tracker
+    and thread_model get a real-time priority, where the system allows any, so that the browser does not delay them.
+
+    The page is served on this machine alone unless --address and a token say otherwise. Without a token each
+    start makes its own, which is in the address that is printed. A token in the environment, as
+    MAGNETOSUTURE_TOKEN, is not shown to others on this machine, as an option is.
+
+    Ctrl-C ends everything that this command has started; a recording that runs is kept.
+    """
+    if options.namespace and not options.graph:
+        raise ConfigurationError("--namespace", options.namespace, "none without --graph, as no other graph is joined")
+    options.token = options.token or os.environ.pop(TOKEN, None) or None  # no node gets it
+    served = {name: getattr(options, name) for name in SERVED if getattr(options, name) is not None}
+
+    def settings(setup: Setup) -> ConsoleSettings:
+        return from_mapping(ConsoleSettings, {**to_mapping(setup.console), **served})
+
+    name = options.setup or DEFAULT_SETUP
+    host: RecordingHost
+    with ExitStack() as stack:
+        if options.graph:
+            setup = read_setup(name)
+            graph = ConsoleGraph(stack.enter_context(joined(namespace=options.namespace)), settings(setup))
+            host = RecordingHost(graph, setup, options.record, terminal.log)
+        elif options.replay is not None:
+            source = GraphInput(stack.enter_context(open_bag(options.replay, terminal.log, setup_name=options.setup)))
+            source.given.check_loop()
+            shown = settings(source.given.setup)
+            shown = replace(shown, image_transport=source.transport) if source.transport else shown
+            place = _place(stack)
+            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
+            host = ReplayHost(graph, source, place, terminal.log)
+            terminal.log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
+        else:
+            shown = settings(read_setup(name))
+            place = _place(stack)
+            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
+            host = SimulatedHost(graph, name, place, options.record, terminal.log)
+            terminal.log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
+        asyncio.run(_serve(graph, host, terminal.log))
+    return DONE
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where nodes run.
+
+    Attributes:
+        domain: ROS domain.
+        environment: for the nodes.
+        logs: folder for what each node prints.
+    """
+
+    domain: int
+    environment: dict[str, str]
+    logs: Path
+
+    def nodes(self, processes: Sequence[str], arguments: Sequence[str]) -> NodeProcesses:
+        """Return nodes that are not started yet."""
+        return NodeProcesses(processes, arguments, self.environment, self.logs)
+
+
+def _place(stack: ExitStack) -> Place:
+    return Place(*stack.enter_context(own_domain()), Path(stack.enter_context(TemporaryDirectory())))
+
+
+async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
+    """Serve the page until this process gets a signal to end, or the graph breaks."""
+
+    def report(url: str) -> None:
+        log(f"open {url}")
+        log("Ctrl-C ends everything")
+
+    ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
+    try:
+        host.start()
+        await serve_until(ends, ConsoleServer(graph.settings, graph, host), host.watch, POLL_PERIOD, report)
+    finally:
+        await host.close()
+    log("ended")
+
+
+class BagRecording:
+    """Records a bag, in a thread of its own so that a slow disk delays neither jogging nor stopping.
+
+    Args:
+        output: the bag's folder; it is there, whole, once the recording has ended.
+        notes: of the bag.
+        graph: that is recorded.
+        recorded: topics that are recorded.
+    """
+
+    def __init__(
+        self, output: Path, notes: Mapping[str, str], graph: ConsoleGraph, recorded: Sequence[topics.Topic]
+    ) -> None:
+        self.output = output
+        self._notes = notes
+        self._inboxes = [Inbox(graph.node, topic, QUEUE_DEPTH) for topic in recorded]
+        self._ending = threading.Event()
+        self._writing: asyncio.Task[None] | None = None
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has ended, by `end` or because the disk is full."""
+        return self._writing is not None and self._writing.done()
+
+    async def begin(self) -> None:
+        """Begin to record.
+
+        Raises:
+            BagError: the output exists or cannot be written.
+        """
+        loop = asyncio.get_running_loop()
+        begun = loop.create_future()
+        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(begun.set_result, None))
+        self._writing = asyncio.create_task(writing)
+        await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
+        if self._writing.done():
+            await self.end()
+
+    async def end(self) -> None:
+        """End, once all messages are written.
+
+        Raises:
+            BagError: the disk is full or fails; what was recorded before is there.
+        """
+        self._ending.set()
+        if self._writing is not None:
+            await asyncio.wait([self._writing])  # which a cancellation of this does not end: the inboxes are in use
+        for inbox in self._inboxes:
+            inbox.close()
+        self._inboxes = []
+        if self._writing is not None:
+            self._writing.result()
+
+    def _write(self, begun: Callable[[], object]) -> None:
+        with (
+            whole_folder(self.output, is_recording=True) as folder,
+            BagWriter(folder, self._notes, name=self.output.name) as bag,
+        ):
+            for inbox in self._inboxes:
+                bag.add_topic(inbox.topic.channel.recorded, inbox.topic.channel.type_name)
+            begun()
+            ending = False
+            while not ending:
+                ending = self._ending.wait(RECORDING_PERIOD)
+                for inbox in self._inboxes:
+                    for data, arrived in inbox.take():
+                        bag.write(inbox.topic.channel.recorded, arrived, data)
+
+
+def new_name(folder: Path, name: str) -> Path:
+    """Return a folder that does not exist yet for a recording, named by the time and the setup."""
+    stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
+    output, count = folder / stem, 1
+    while output.exists():
+        count += 1
+        output = folder / f"{stem}_{count}"
+    return output
+
+
+class RecordingHost(GraphHost):
+    """Host of a running graph that records bags.
+
+    Args:
+        graph: to serve.
+        setup: with which.
+        recordings: folder that gets a bag for each recording.
+        log: called with a line for a person.
+    """
+
+    def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log) -> None:
+        super().__init__(graph)
+        self.setup = setup
+        self.busy = ""
+        self.log = log
+        self._recordings = recordings
+        self._recording: BagRecording | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        recording = "" if self._recording is None else str(self._recording.output)
+        own = {"setup": self.setup.name, "can_record": True, "recording": recording, "busy": self.busy}
+        return {**super().state(), **own}
+
+    def notes(self, operator: str) -> dict[str, str]:
+        """Return the notes of a recording, which the page that has control began.
+
+        Args:
+            operator: who commands that page.
+        """
+        notes = {"setup": self.setup.name, SETUP_NOTE: self.setup.path.read_text(encoding="utf-8")}
+        if self.graph.is_active(RIG):
+            what = f"the whole rig, setup {self.setup.name}; control was with {operator} when the recording began"
+            notes["simulated"] = what
+        return notes
+
+    def start(self) -> None:
+        """Start what this runs; here nothing."""
+
+    async def set_recording(self, recording: bool, operator: str) -> str:
+        """Start or end a recording; return an empty text, or the reason of a refusal."""
+        if recording == (self._recording is not None):
+            return ""
+        if not recording:
+            return await self._end_recording()
+        if self.busy:
+            return self.busy
+        raw = self.graph.settings.image_transport == "raw"
+        recorded = [topic for topic in RECORDED_TOPICS if topic is not topics.IMAGE or raw]
+        output = new_name(self._recordings, self.setup.name)
+        bag = self._recording = BagRecording(output, self.notes(operator), self.graph, recorded)
+        try:
+            await bag.begin()
+        except MagnetosutureError as error:
+            self._recording = None
+            return str(error)
+        self.log(f"recording to {bag.output}")
+        return ""
+
+    async def watch(self) -> None:
+        """Check what runs; called several times a second.
+
+        Raises:
+            GraphError: a node has ended.
+        """
+        if self._recording is not None and self._recording.ended:
+            await self._end_recording()
+
+    async def close(self) -> None:
+        """End the recording."""
+        await self._end_recording()
+
+    async def _end_recording(self) -> str:
+        """End the recording, if there is one; return the problem if it is not complete."""
+        recording = self._recording
+        if recording is None:
+            return ""
+        problem = ""
+        try:
+            await recording.end()
+        except MagnetosutureError as error:
+            problem = str(error)
+        if self._recording is recording:  # not before: whoever is cancelled meanwhile leaves it to `close`
+            self._recording = None
+            self.log(f"the recording has ended: {problem}" if problem else f"recorded: {recording.output}")
+        return problem
+
+
+class SimulatedHost(RecordingHost):
+    """Host that starts the whole graph around a simulated rig; any setup that ships can be selected.
+
+    Args:
+        graph: to serve.
+        setup: name or path of the initial setup.
+        place: where the nodes run.
+        recordings: folder that gets a bag for each recording.
+        log: called with a line for a person.
+    """
+
+    mode = "simulated"
+
+    def __init__(self, graph: ConsoleGraph, setup: str, place: Place, recordings: Path, log: Log) -> None:
+        super().__init__(graph, read_setup(setup), recordings, log)
+        shipped = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
+        self._setup_name, self._setups, self._place = setup, list(dict.fromkeys([*shipped, setup])), place
+        self._nodes: NodeProcesses | None = None
+        self._since, self._logged = 0.0, set[str]()
+        self._block(f"starting {self.setup.name}")
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        return {**super().state(), "setup": self._setup_name, "setups": self._setups, "simulated": True}
+
+    def start(self) -> None:
+        """Start the nodes; they are busy until each of them has reported its state."""
+        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *SIMULATED_COILS, *FORECAST]
+        # Here and not in another thread: the nodes end with the thread that has started them.
+        self._nodes = self._place.nodes((SCENE_SERVER, RIG, *PROCESSES, PLANNER), arguments).__enter__()
+        self._since = time.monotonic()
+
+    async def select_setup(self, setup: str) -> str:
+        """Stop the nodes and start those of a setup; return the reason of a refusal."""
+        if self.busy:
+            return self.busy
+        if setup not in self._setups:
+            return f"setup: got {setup!r}, expected one of {', '.join(self._setups)}"
+        try:
+            selected = read_setup(setup)
+            version = selected.scene.version  # read while the old nodes still run: they stay if it cannot be
+        except MagnetosutureError as error:
+            return str(error)
+        self._block(f"starting {selected.name}")
+        before, self._nodes = self._nodes, None  # `watch` does not wait for the nodes that are still there
+        await self._end_recording()
+        if before is not None:
+            await asyncio.to_thread(before.end)
+        self.setup, self._setup_name, self.paused = selected, setup, False
+        served = {name: getattr(self.graph.settings, name) for name in SERVED}
+        self.graph.begin(replace(selected.console, **served))
+        self.start()
+        self.log(f"starting {selected.name}, scene {version}")
+        return ""
+
+    async def watch(self) -> None:
+        """Permit commands once all nodes are ready; raise `GraphError` if one has ended."""
+        await super().watch()
+        if self._nodes is None:
+            return
+        self._nodes.check()
+        if not self.busy:
+            return
+        nodes = self.graph.nodes().items()
+        log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
+        missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
+        bridge = self.graph.state()["bridge"] or {}
+        if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
+            # Only now: while it compiles for the first time, others shall not wait for it.
+            self.log(f"{PREFERRED}: {self._nodes.prefer(PREFERRED, PRIORITY)}")
+            self._block("")
+            self.log(f"{self.setup.name} runs; the coils are not armed")
+        elif time.monotonic() - self._since > START_TIMEOUT:
+            unheard = ", ".join(missing) or "a bridge that is ready"
+            raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {unheard}")
+
+    async def close(self) -> None:
+        """End recording and nodes."""
+        await super().close()
+        if self._nodes is not None:
+            await asyncio.to_thread(self._nodes.end)
+
+    def _block(self, reason: str) -> None:
+        """Stop the needle and block commands for a reason; an empty one permits them again."""
+        self.graph.publish_velocity((0.0, 0.0))
+        self.busy = self.graph.blocked = reason
+
+
+class ReplayHost(RecordingHost):
+    """Host that plays a bag through the nodes in a loop; commands are blocked.
+
+    Args:
+        graph: to serve.
+        source: the bag.
+        place: where the nodes run.
+        log: called with a line for a person.
+    """
+
+    mode = "replay"
+
+    def __init__(self, graph: ConsoleGraph, source: GraphInput, place: Place, log: Log) -> None:
+        super().__init__(graph, source.given.setup, Path(), log)
+        self._source, self._domain = source, place.domain
+        self._nodes = place.nodes(source.processes, source.arguments(place.logs / "lossless.yaml"))
+        self._ending = threading.Event()
+        self._playing: asyncio.Task[None] | None = None
+        self.busy = f"starting the nodes for {source.given.recording.path}"
+        graph.blocked = REPLAY_BLOCKED
+
+    def state(self) -> dict[str, Any]:
+        """Return what runs and what is possible now."""
+        recording = self._source.given.recording
+        simulated = bool(recording.notes.get("simulated", ""))
+        return {**super().state(), "setup": str(recording.path), "can_record": False, "simulated": simulated}
+
+    def start(self) -> None:
+        """Start the nodes, and play the bag once they are there."""
+        self._nodes.__enter__()
+        self._playing = asyncio.create_task(asyncio.to_thread(self._play))
+
+    async def set_recording(self, recording: bool, operator: str) -> str:
+        """Refuse: another command records a replay."""
+        return "what comes of a bag is recorded by `magnetosuture replay BAG --output DIR`"
+
+    async def watch(self) -> None:
+        """Raise what ended the replay, as a node that has ended or a bag that cannot be played on."""
+        if self._playing is not None and self._playing.done():
+            self._playing.result()
+
+    async def close(self) -> None:
+        """End the replay and its nodes."""
+        self._ending.set()
+        if self._playing is not None:
+            await asyncio.wait([self._playing])
+        await asyncio.to_thread(self._nodes.end)
+
+    def _play(self) -> None:
+        """Play until `close` is called; in a thread, as a replay waits for the graph itself."""
+        live = self._source.live(self._domain, 1.0, lambda topic, time, data: None, self._check, self.log)
+        try:
+            live.wait_for_graph()
+            self.busy = ""
+            live.play_on(self._source.records)
+        except _EndedError:
+            pass
+        finally:
+            live.close()
+
+    def _check(self) -> None:
+        if self._ending.is_set():
+            raise _EndedError
+        self._nodes.check()
+
+
+class _EndedError(Exception):
+    """`ReplayHost.close` was called."""

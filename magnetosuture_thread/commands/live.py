@@ -1,0 +1,332 @@
+"""A graph of a command's own, on a ROS domain that nobody else uses, and a bag played into it. It needs ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from magnetosuture_thread import interface
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.observations import CHANGING
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag
+from magnetosuture_thread.commands.replay import replay_summary, write_results
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
+from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
+from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.node import COMPILING
+from magnetosuture_thread.nodes.player import DEPTH, LiveReplay
+from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.nodes.run import Interruption
+from magnetosuture_thread.nodes.timeline import Timeline
+from magnetosuture_thread.scene import write_scene
+from magnetosuture_thread.workers import Log, Progress
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+START_TIMEOUT = 240.0  # s for all nodes to be there; the first start on a machine compiles
+POLL_PERIOD = 0.02  # s between two looks at the nodes
+
+# Arguments for the nodes, after `--ros-args`. Where two cores carry the whole graph and a recording besides, the bridge
+# leaves them more of it. Whatever a setup says for a launch, nobody would activate the nodes of a command.
+OWN = (
+    "-p",
+    "coil_bridge:rate:=100.0",
+    *(p for name in interface.STANDBY_NODES for p in ("-p", f"{name}:autostart:=active")),
+)
+# Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
+FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
+# A replayed bag never moves a needle, so its bridge may arm itself.
+NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
+
+
+@dataclass
+class OwnGraph:
+    """Nodes that run in a ROS domain of their own.
+
+    Attributes:
+        domain: the ROS domain.
+        nodes: the processes.
+        interruption: keeps Ctrl-C until `check` is called, while entered.
+    """
+
+    domain: int
+    nodes: NodeProcesses
+    interruption: Interruption
+
+    def check(self) -> None:
+        """Raise `KeyboardInterrupt` if a person has interrupted, and `GraphError` if a node has ended."""
+        self.interruption.check()
+        self.nodes.check()
+
+
+@contextmanager
+def own_domain() -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield a ROS domain that nobody else uses, and the environment for it, which this process has meanwhile.
+
+    Raises:
+        GraphError: all domains are in use.
+    """
+    with reserved_domain() as domain:
+        environment = graph_environment(domain)
+        with environment_of(environment):
+            yield domain, environment
+
+
+@contextmanager
+def own_graph(
+    processes: Sequence[str], arguments: Sequence[str], logs: Path, what: str, log: Log
+) -> Iterator[OwnGraph]:
+    """Start nodes in a ROS domain of their own; they are ended with the context.
+
+    Args:
+        processes: names of the nodes' programs.
+        arguments: for each, after `--ros-args`.
+        logs: folder that gets a log file of each.
+        what: starts, as it is logged.
+        log: called with a line for a person.
+
+    Raises:
+        GraphError: all domains are in use.
+    """
+    with own_domain() as (domain, environment):
+        log(f"starting {what} (ROS domain {domain}, this machine only)")
+        with NodeProcesses(processes, arguments, environment, logs) as nodes:
+            yield OwnGraph(domain, nodes, Interruption())
+
+
+def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:
+    """Log, once of each node, that it compiles.
+
+    Args:
+        texts: state of each node.
+        logged: nodes of which it was logged; grows.
+        log: called with a line for a person.
+    """
+    for name, text in texts.items():
+        if text.startswith(COMPILING) and name not in logged:
+            logged.add(name)
+            log(f"{name}: {text}")
+
+
+class GraphInput:
+    """Messages of a bag to play into running nodes, and how these nodes are started.
+
+    Args:
+        given: the bag and its setup.
+
+    Attributes:
+        given: as given.
+        transport: how the bag has its camera frames, raw or compressed; empty where poses are played.
+        nodes: names of the graph's nodes; poses are played without a tracker.
+        processes: programs that these nodes run as.
+        channels: that are played.
+    """
+
+    def __init__(self, given: BagInput) -> None:
+        self.given = given
+        camera = given.recording.camera if given.source == "camera" else None
+        self.transport = next((transport for transport, channel in interface.CAMERA.items() if channel == camera), "")
+        self.nodes = tuple(name for name in interface.NODES if self.transport or name != "vision_tracker")
+        self.processes = interface.PROCESSES if self.transport else self.nodes
+        source = (
+            (camera, interface.CAMERA_INFO)
+            if camera is not None
+            else (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        )
+        possible = (*source, interface.NEEDLE_COMMAND, interface.MATERIAL)
+        self.channels: list[interface.Channel] = [
+            interface.SCENE,
+            *(c for c in possible if given.recording.counts.get(c.recorded)),
+        ]
+
+    def arguments(self, qos: Path) -> list[str]:
+        """Return the nodes' arguments.
+
+        Args:
+            qos: a file that this writes: parameters under which no message is lost; `scene.yaml` is written beside it.
+        """
+        qos.write_text(yaml.safe_dump(topics.lossless(DEPTH)), encoding="utf-8")
+        files = [part for path in (self.given.setup.path, qos) for part in ("--params-file", str(path.resolve()))]
+        # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
+        scene = qos.with_name("scene.yaml")
+        write_scene(self.given.setup.scene, scene)
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES, *OWN]
+        if self.transport:
+            arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
+        return arguments
+
+    def records(self) -> Iterator[RecordedMessage]:
+        """Give the messages to play, by time."""
+        given = self.given
+        # The scene comes first: the one that is in force in the bag, or else the setup's.
+        data = packed_scene(given.begin, given.setup.scene)
+        yield RecordedMessage(interface.SCENE.recorded, interface.SCENE.type_name, given.begin, data)
+        if given.start > 0.0:  # what came before about the thread is in force
+            earlier = [channel for channel in CHANGING if channel != interface.SCENE]
+            for record in given.recording.records(earlier, duration=given.start):
+                yield replace(record, time=given.begin)
+        version = given.setup.scene.version
+        for record in given.recording.records(self.channels, start=given.start, duration=given.duration):
+            if record.topic == interface.SCENE.recorded:
+                before, version = version, str(record.decode().version)
+                if version == before:
+                    continue
+            yield record
+
+    def live(
+        self, domain: int, rate: float, receive: Callable[[str, int, bytes], None], check: Callable[[], None], log: Log
+    ) -> LiveReplay:
+        """Return the node that plays the bag; see `LiveReplay`."""
+        known = (*topics.INPUTS, *topics.SETTINGS, *topics.OUTPUTS)
+        return LiveReplay(
+            domain,
+            Timeline(self.given.begin, rate),
+            played=[topic for topic in known if topic.channel in self.channels],
+            nodes=len(self.nodes),
+            receive=receive,
+            watch=check,
+            log=log,
+        )
+
+
+def replay_live(
+    bag_path: Path,
+    output: Path,
+    *,
+    rate: float = 1.0,
+    loop: bool = False,
+    log: Log = lambda text: None,
+    progress: Progress = lambda share: None,
+    **selection: Unpack[BagSelection],
+) -> ReplaySummary:
+    """Play a bag through the nodes as processes of their own, and evaluate their outputs.
+
+    `output` is made at the end, whole or not at all: `bag/` with all outputs, `summary.json`,
+    `summary.png` and the nodes' `logs/`. The coil bridge gets the recording driver, whatever the setup
+    says: a replayed bag never moves a needle. By its poses a bag is played without a tracker.
+
+    Args:
+        bag_path: a bag.
+        output: folder to make.
+        rate: how much faster than recorded.
+        loop: whether it is played over and over until it is interrupted; the first pass is recorded and evaluated.
+        log: called with a line for a person at each stage.
+        progress: called with the share played, 0 to 1.
+        selection: what of the bag is played; the thread starts as it is first measured from then on.
+
+    Raises:
+        BagError: the bag cannot be used, or the output exists or cannot be written.
+        ConfigurationError: the setup cannot be used.
+        GraphError: a node ended or did not come, or nothing was predicted.
+        KeyboardInterrupt: interrupted before the first pass was done.
+    """
+    with open_bag(bag_path, log, **selection) as given:
+        if loop:
+            given.check_loop()
+        checked = _check_poses(given, log)
+        if rate < 1.0:
+            log("played slower than recorded: the coil bridge's watchdog, in real time, may stop between commands")
+        if rate > 1.0:
+            log("played faster than recorded: latencies count what waits in the queues")
+        problem = ""
+        with whole_folder(output) as folder, TemporaryDirectory() as spare:
+            source = GraphInput(given)
+            arguments, logs = source.arguments(Path(spare) / "lossless.yaml"), folder / "logs"
+            with own_graph(source.processes, arguments, logs, ", ".join(source.nodes), log) as graph:
+                outputs = BagWriter(folder / "bag", given.notes)
+                for topic in (topics.SCENE, *topics.OUTPUTS):
+                    outputs.add_topic(topic.channel.recorded, topic.channel.type_name)
+                live = source.live(graph.domain, rate, outputs.write, graph.check, log)
+                try:
+                    with outputs, graph.interruption:
+                        live.wait_for_graph()
+                        speed = f" at {rate:g} times the speed" if rate != 1.0 else ""
+                        log(f"playing {given.duration:.1f} s{speed}")
+                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.PAUSE_REPLAY}"
+                        log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
+                        length = max(given.duration, 1e-9)
+                        live.play(source.records(), lambda time: progress(min(1.0, time / length)))
+                    log("evaluating the outputs")
+                    metrics, summary = _summary(given, folder, live, **checked)
+                    write_results(folder, given, metrics, summary, log)
+                    if loop:
+                        log("the first pass is recorded and evaluated; playing on until Ctrl-C")
+                        problem = _play_on(live, source, graph)
+                finally:
+                    live.close()
+    if problem:
+        raise GraphError(f"{problem}; the first pass is in {output}")
+    return summary
+
+
+def _play_on(live: LiveReplay, source: GraphInput, graph: OwnGraph) -> str:
+    """Play on until Ctrl-C; return what ended it else."""
+    try:
+        with graph.interruption:
+            live.play_on(source.records)
+    except KeyboardInterrupt:
+        return ""
+    except GraphError as error:
+        return str(error)
+
+
+def _check_poses(given: BagInput, log: Log) -> dict[str, Any]:
+    """Check recorded poses and threads before any node starts; return `remark`, and what is `refused`."""
+    if given.source == "camera":
+        return {}
+    checked = given.observations()
+    for _ in checked:
+        pass
+    if remark := checked.thread_problem():
+        log(remark)
+    return {"remark": remark, "refused": dict(checked.refused)}
+
+
+def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> tuple[RunMetrics, ReplaySummary]:
+    """Compare the outputs with what the bag holds."""
+    collector = GraphCollector(given.setup.model.thread_length)
+    recorded, replayed = CurrentSeries(), CurrentSeries()
+    truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
+    expected = [c for c in (*truth, interface.CURRENTS) if given.recording.counts.get(c.recorded)]
+    for record in given.recording.records(expected, start=given.start, duration=given.duration):
+        if record.topic == interface.CURRENTS.recorded:
+            recorded.add(record.decode())
+        else:
+            collector.add(record.topic, record.decode())
+    made = Bag(folder / "bag")
+    for record in made.records(set(made.topics)):
+        message = record.decode()
+        collector.add(record.topic, message)
+        if record.topic == interface.CURRENTS.recorded:
+            replayed.add(message)
+    metrics, losses = collector.metrics(given.recording.start), live.losses
+    frames = losses.played[interface.NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
+    if not len(metrics.series):
+        health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
+        things = "poses" if given.source == "poses" else "frames"
+        raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
+    commands = live.published.get(interface.NEEDLE_COMMAND.name, {})
+    summary = replay_summary(
+        given,
+        metrics,
+        frames=frames,
+        tracked=collector.poses,
+        commands=len(commands),
+        driven=len(collector.applied & set(commands)),
+        latency=stage_latencies(live.published, live.arrived, collector.applied),
+        currents=replayed.against(recorded),
+        dropped=losses.dropped(),
+        **others,
+    )
+    return metrics, summary

@@ -1,0 +1,446 @@
+"""Recorded experiments without a graph: what was observed in a bag, and what the model predicts of it.
+
+The same core as in the nodes, fed by the same numbers, so that the predictions are those of the graph to the
+last bit; but as fast as the machine can, and with nothing that depends on time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene, interface
+from magnetosuture_thread.bags.reader import RecordedMessage
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.configuration import from_mapping, to_mapping
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.geometry.orientation import round_trip_heading
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.messages.reading import (
+    pose_deviation,
+    read_force,
+    read_observation,
+    read_path,
+    read_pose,
+    stamp_of,
+)
+from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings, parse_material
+from magnetosuture_thread.thread_observation import ThreadObservation
+from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.lens import lens_of
+from magnetosuture_thread.vision.session import FrameMeasurement, TrackerSession
+from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.workers import Progress
+
+MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a seen one beyond is not of this setup
+# Why frames and poses are refused, as it is counted.
+NOT_FOUND, BROKEN, NOT_NEWER = "no needle for sure", "a broken picture", "a stamp not newer than the last"
+CHANGING = (interface.SCENE, interface.MATERIAL)  # channels on which a bag records changes of scene and thread
+_NOTHING, _NO_FORCE = np.empty((0, 2)), np.empty(0)
+_TRUE, _SEEN = interface.GROUND_TRUTH_THREAD.recorded, interface.MEASURED_THREAD.recorded
+_OBSERVED, _PULL = interface.THREAD_OBSERVATION.recorded, interface.GROUND_TRUTH_PULL.recorded
+# How a part of an observation is read, and what stands for one that is not valid.
+_READERS: dict[str, tuple[Callable[[RecordedMessage], Any], Any]] = {
+    _TRUE: (read_path, _NOTHING),
+    _SEEN: (read_path, _NOTHING),
+    _OBSERVED: (read_observation, ThreadObservation()),
+    _PULL: (read_force, _NO_FORCE),
+}
+
+
+def read_image(record: RecordedMessage) -> NDArray[np.uint8]:
+    """Return the image of a recorded camera frame, raw or compressed.
+
+    Raises:
+        BagError: the message cannot be decoded.
+        InvalidInputError: the image is broken.
+    """
+    message = record.decode()
+    if record.type_name == interface.COMPRESSED_IMAGE.type_name:
+        return decode_image(message.data)
+    return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
+
+
+def chosen_source(recording: Recording, source: str) -> str:
+    """Return `camera` or `poses`.
+
+    Args:
+        recording: the bag.
+        source: `camera`: its frames; `poses`: the needle poses and seen threads that were recorded; `auto`: the camera
+            where there are frames.
+
+    Raises:
+        BagError: the bag does not hold what was asked for.
+    """
+    has = {"camera": recording.camera is not None, "poses": bool(recording.counts.get(interface.NEEDLE_POSE.recorded))}
+    for name in ("camera", "poses") if source == "auto" else (source,):
+        if has[name]:
+            return name
+    for channel in (*interface.CAMERA.values(), interface.NEEDLE_POSE):
+        if channel.recorded in recording.unfit:
+            raise BagError(recording.path, recording.unfit[channel.recorded])
+    recording.require(interface.NEEDLE_POSE if source == "poses" else interface.COMPRESSED_IMAGE)
+    raise BagError(recording.path, "holds camera frames on a topic that is not theirs")  # require says all else
+
+
+class ObservationReader(Iterator[Observation]):
+    """Iterates over the observations of a bag: one for each camera frame, or recorded pose, in order.
+
+    Frames are tracked as `vision_tracker` does. Only a few observations are in memory at a time.
+
+    Args:
+        recording: the bag.
+        setup: what to look for, and how large the dish is.
+        source: see `chosen_source`.
+        start: seconds into the bag to begin at.
+        duration: [s]; to the bag's end if None.
+        progress: called with the share done, 0 to 1.
+
+    Attributes:
+        source: `camera` or `poses`.
+        count: camera frames, or poses, so far.
+        found: of these with a needle.
+        refused: the others, by why.
+        on_frame: called with stamp and what was seen in each frame, before its observation is given.
+        on_record: called with stamp and each recorded pose and seen thread, before its observation is given; and
+            with each scene that is taken.
+
+    Raises:
+        BagError: the bag does not hold the source; or while going through, a length is not in metres.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        setup: Setup,
+        source: str = "auto",
+        start: float = 0.0,
+        duration: float | None = None,
+        progress: Progress = lambda share: None,
+    ) -> None:
+        self.source = chosen_source(recording, source)
+        self.count = self.found = 0
+        self.refused: Counter[str] = Counter()
+        self.on_frame: Callable[[int, FrameMeasurement], None] = lambda stamp, seen: None
+        self.on_record: Callable[[int, RecordedMessage], None] = lambda stamp, record: None
+        self._recording, self._scene, self._length = recording, setup.scene, setup.model.thread_length
+        self._measured = self._odd = 0
+        self._tracker: TrackerSession | None = None
+        own = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        if self.source == "camera":
+            assert recording.camera is not None
+            warm_up()
+            self._tracker = TrackerSession(setup.vision, setup.scene)
+            own = (recording.camera, interface.CAMERA_INFO)
+        given = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, *CHANGING, *own)
+        channels = [channel for channel in given if recording.counts.get(channel.recorded)]
+        begin = recording.start + round(start * 1e9)
+        earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
+        self._changes = [record for record in earlier if record.time < begin]
+        for record in self._changes:
+            self._follow(record)
+        # What belongs to a frame, by topic and stamp.
+        self._parts: dict[str, dict[int, Any]] = {c.recorded: {} for c in channels if c.recorded in _READERS}
+        left = max(recording.duration - start, 1e-9)
+        span = left if duration is None else max(min(duration, left), 1e-9)
+        records = recording.records(channels, start=start, duration=duration)
+        self._going = self._go(_with_progress(records, begin, span, progress))
+
+    def __next__(self) -> Observation:
+        """Return the next observation.
+
+        Raises:
+            BagError: a length is not in metres, or the bag is damaged.
+        """
+        return next(self._going)
+
+    def changes(self) -> list[RecordedMessage]:
+        """Return, once, the changes of scene and thread before the last observation."""
+        changes, self._changes = self._changes, []
+        for record in changes:
+            if record.topic == interface.SCENE.recorded:
+                self.on_record(stamp_of(record), record)
+        return changes
+
+    def thread_problem(self) -> str:
+        """Return a text if most of the measured threads are not of this setup; else empty."""
+        if 2 * self._odd <= self._measured:
+            return ""
+        return (
+            f"{self._odd} of {self._measured} measured threads are longer than {MAX_LENGTH_RATIO:g} times or "
+            f"shorter than {MIN_LENGTH_RATIO:g} times the setup's {self._length:g} m: is it another thread?"
+        )
+
+    def _go(self, records: Iterator[RecordedMessage]) -> Iterator[Observation]:
+        """Give an observation once what belongs to it has come, or cannot be expected any more."""
+        changing = {channel.recorded for channel in CHANGING}
+        waiting: deque[Observation | RecordedMessage] = deque()
+        for record in records:
+            if record.topic in self._parts:
+                self._keep(record)
+            elif record.topic in changing:
+                self._follow(record)
+                waiting.append(record)
+            elif record.topic == interface.CAMERA_INFO.recorded:
+                self._take_lens(record)
+            else:
+                waiting.append(self._pose(record) if self._tracker is None else self._frame(record, self._tracker))
+            while waiting and (len(waiting) > MAX_WAITING_POSES or self._complete(waiting[0])):
+                yield from self._next(waiting.popleft())
+        while waiting:
+            yield from self._next(waiting.popleft())
+
+    def _complete(self, head: Observation | RecordedMessage) -> bool:
+        return isinstance(head, RecordedMessage) or all(head.stamp in known for known in self._parts.values())
+
+    def _next(self, head: Observation | RecordedMessage) -> Iterator[Observation]:
+        """Keep a change until it is asked for; give an observation with its parts."""
+        if isinstance(head, RecordedMessage):
+            self._changes.append(head)
+            return
+        found = {topic: known[head.stamp] for topic, known in self._parts.items() if head.stamp in known}
+        observation = replace(head, ground_truth=found.get(_TRUE, _NOTHING), true_pull=found.get(_PULL, _NO_FORCE))
+        if self.source == "poses":
+            # As live, the centreline alone tells nothing where observations come.
+            observed = found.get(_OBSERVED, ThreadObservation()) if _OBSERVED in self._parts else None
+            observation = replace(observation, measured=found.get(_SEEN, _NOTHING), observation=observed)
+        yield observation
+
+    def _follow(self, record: RecordedMessage) -> None:
+        """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
+        if record.topic != interface.SCENE.recorded:
+            return
+        try:
+            scene = parse_scene_message(record.decode())
+            if scene.version != self._scene.version and self._tracker is not None:
+                self._tracker.set_scene(scene)
+        except MagnetosutureError:
+            return  # counted and reported where the model takes it
+        self._scene = scene
+
+    def _take_lens(self, record: RecordedMessage) -> None:
+        """Undo the distortion of a recorded lens from here on, as `vision_tracker` does."""
+        assert self._tracker is not None
+        try:
+            lens = lens_of(record.decode())
+        except MagnetosutureError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
+            lens = None
+        self._tracker.set_lens(lens)
+
+    def _keep(self, record: RecordedMessage) -> None:
+        """Keep what belongs to a frame; nothing where it isn't valid."""
+        stamp, topic, known = stamp_of(record), record.topic, self._parts[record.topic]
+        if topic in (_SEEN, _OBSERVED):
+            self.on_record(stamp, record)
+        read, nothing = _READERS[topic]
+        try:
+            known[stamp] = part = read(record)
+        except InvalidInputError as error:
+            self.refused[f"{topic}: {error}"] += 1
+            known[stamp] = part = nothing
+        if topic in (_SEEN, _OBSERVED):
+            for points in [piece.points for piece in part.pieces] if topic == _OBSERVED else [part]:
+                self._check_place(topic, points)
+        if topic == _SEEN and len(part) and np.isfinite(part).all():
+            length = float(arc_lengths(part)[-1]) / self._length
+            self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
+            self._measured += 1
+        if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
+            del known[next(iter(known))]
+
+    def _pose(self, record: RecordedMessage) -> Observation:
+        """Return what a recorded pose says."""
+        self.count += 1
+        stamp = stamp_of(record)
+        self.on_record(stamp, record)
+        try:
+            tail, heading, deviation = read_pose(record)
+        except InvalidInputError as error:
+            self.refused["a pose that is none"] += 1
+            return Observation(stamp, reason=str(error))
+        self._check_place(record.topic, tail)
+        self.found += 1
+        return Observation(stamp, tail, heading, deviation=deviation)
+
+    def _frame(self, record: RecordedMessage, tracker: TrackerSession) -> Observation:
+        """Return what a camera frame says, as `thread_model` would get it."""
+        self.count += 1
+        stamp, kind = stamp_of(record), NOT_FOUND
+        try:
+            image = read_image(record)
+        except InvalidInputError as error:
+            began = time.perf_counter()
+            seen, kind = tracker.on_broken(error), BROKEN
+        else:
+            began = time.perf_counter()
+            seen = tracker.on_image(stamp * 1e-9, image)
+            if seen.problem is not None:
+                kind = NOT_NEWER if seen.problem.field == "image.stamp" else BROKEN
+        taken = time.perf_counter() - began
+        self.on_frame(stamp, seen)
+        if not seen.tracked:
+            self.refused[kind] += 1
+            return Observation(stamp, reason=seen.track.reason, processing=taken)
+        self.found += 1
+        return Observation(
+            stamp,
+            np.asarray(seen.track.tail),
+            round_trip_heading(seen.track.heading, interface.NEEDLE_POSE.name),
+            seen.centreline,
+            processing=taken,
+            observation=seen.track.observation,
+            deviation=pose_deviation(np.diag(seen.track.covariance)),
+        )
+
+    def _check_place(self, topic: str, points: Points) -> None:
+        """Refuse what is farther away than the dish is wide."""
+        width = self._scene.dish.diameter
+        far = np.where(np.isfinite(points), np.abs(points), 0.0)  # what is not finite is refused by the model
+        if far.max(initial=0.0) > width:
+            worst = points.reshape(-1, 2)[far.reshape(-1, 2).max(axis=1).argmax()]
+            where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {width:g} m wide"
+            raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another setup's?")
+
+
+def _with_progress(
+    records: Iterator[RecordedMessage], begin: int, span: float, progress: Progress
+) -> Iterator[RecordedMessage]:
+    """Go through records and report progress, a thousand times at the most: showing it takes longer than a step."""
+    following = begin
+    for record in records:
+        if record.time >= following:
+            progress(min(1.0, (record.time - begin) * 1e-9 / span))
+            following = record.time + max(round(span * 1e6), 1)
+        yield record
+
+
+@dataclass(frozen=True)
+class Step:
+    """Prediction and estimate for one observation with a needle.
+
+    Attributes:
+        observation: the observation.
+        result: prediction and estimate, or why there is none. A `late` one says why an observation was refused.
+        step_time: wall-clock time that the prediction took [s].
+        settings: in force.
+        scene: in force.
+    """
+
+    observation: Observation
+    result: PredictionResult
+    step_time: float
+    settings: ThreadModelSettings
+    scene: Scene | None
+
+
+def predictions(
+    given: ObservationReader,
+    settings: ThreadModelSettings,
+    scene: Scene | None,
+    observe: Callable[[Observation], None] = lambda observation: None,
+) -> Iterator[Step]:
+    """Predict and estimate the thread over one run, as `thread_model` does.
+
+    Changes of scene and thread that the bag records apply as they come. A pose before the thread is first measured
+    gives a step that waits, as live, and is not predicted later unless its own thread is measured; observations
+    without a needle give none.
+
+    Args:
+        given: by time.
+        settings: of thread and liquid.
+        scene: until the bag says another.
+        observe: called with each observation, also of those without a needle.
+
+    Raises:
+        ConfigurationError: a shape of the scene cannot be used.
+    """
+    session = ThreadSession(settings, scene)
+    waiting: dict[int, Observation] = {}
+
+    def step(observation: Observation, result: PredictionResult, taken: float) -> Step:
+        if result.waiting:
+            waiting[result.stamp] = observation
+        else:
+            waiting.pop(result.stamp, None)
+        return Step(observation, result, taken, session.settings, session.scene)
+
+    for observation in given:
+        observe(observation)
+        _take_changes(session, given)
+        if not observation.found:
+            continue
+        results: Iterator[PredictionResult] = iter(())
+        if observation.observation is not None:
+            results = session.on_observation(observation.stamp, observation.observation)
+        elif len(observation.measured):
+            results = session.on_measured_thread(observation.stamp, observation.measured)
+        began = time.perf_counter()
+        for result in results:
+            yield step(waiting.get(result.stamp, observation), result, time.perf_counter() - began)
+            began = time.perf_counter()
+        began = time.perf_counter()
+        pose = NeedlePose(observation.stamp * 1e-9, observation.tail, observation.heading, observation.deviation)
+        predicted = session.predict(observation.stamp, pose)
+        taken = time.perf_counter() - began
+        yield step(observation, session.estimate(predicted), taken)
+        for late in session.late_estimates():  # of observations that are refused: all others come with their poses
+            yield step(observation, late, 0.0)
+        while len(waiting) > 2 * MAX_WAITING_POSES:
+            del waiting[next(iter(waiting))]
+
+
+def _take_changes(session: ThreadSession, given: ObservationReader) -> None:
+    """Take what the bag says of scene and thread; what cannot be used is counted, as live."""
+    for record in given.changes():
+        try:
+            settings, scene = session.settings, session.scene
+            if record.topic == interface.SCENE.recorded:
+                scene = parse_scene_message(record.decode())
+            else:
+                values = {**to_mapping(settings), **parse_material(record.decode())}
+                settings = from_mapping(ThreadModelSettings, values)
+            session.change(settings, scene)
+        except MagnetosutureError as error:
+            given.refused[f"{record.topic}: {error}"] += 1
+
+
+def measure_step(step: Step, metrics: RunMetrics, refused: Counter[str], recorded: Points | None = None) -> None:
+    """Add a step to the figures of a run, or why there is no prediction to what is refused.
+
+    Args:
+        step: of the run.
+        metrics: that get its prediction.
+        refused: counts by reason, without the numbers of each case.
+        recorded: the prediction of the same frame that the bag holds.
+    """
+    result = step.result
+    if result.prediction is not None:
+        frame = FrameResult.of(
+            step.observation,
+            result.prediction,
+            result.margins,
+            step.step_time,
+            estimate=result.estimate,
+            estimated=step.settings.is_estimated,
+            recorded=recorded,
+            obstacles=step.scene.obstacles if step.scene is not None else (),
+        )
+        metrics.add(frame)
+    problem = result.problem or result.estimate_problem
+    if isinstance(problem, InvalidInputError):
+        is_late = problem.field == "needle pose stamp"
+        refused[NOT_NEWER if is_late else f"a {problem.field} that cannot be used"] += 1
+    elif problem is not None:
+        refused["a program that was not solved"] += 1

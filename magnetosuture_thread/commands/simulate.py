@@ -1,0 +1,452 @@
+"""The command `magnetosuture simulate`: the whole graph around a simulated rig, in a closed loop. It needs ROS."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from magnetosuture_thread import ConfigurationError, interface
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.command import (
+    DONE,
+    Terminal,
+    number_argument,
+    output_file,
+    runs,
+    write_json,
+)
+from magnetosuture_thread.commands.live import (
+    FORECAST,
+    OWN,
+    POLL_PERIOD,
+    START_TIMEOUT,
+    OwnGraph,
+    log_compiling,
+    own_graph,
+)
+from magnetosuture_thread.commands.output import whole_folder
+from magnetosuture_thread.commands.recorded import SETUP_NOTE
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
+from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.evaluation.tables import loop_table
+from magnetosuture_thread.geometry.polyline import arc_lengths
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import DONE as PROCEDURE_DONE
+from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient, Recorder
+from magnetosuture_thread.planning.procedure import read_procedure
+from magnetosuture_thread.resources import find_procedure_file, find_scene_file
+from magnetosuture_thread.rig.power.stage import board_addresses
+from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.workers import Log, Progress
+
+ONCE = (
+    interface.SCENE.recorded,
+    interface.SCENE_MARKERS.recorded,
+)  # published while nodes start, for the bag's beginning
+# Topics on which nothing may come before the run begins.
+OPTIONAL = (
+    *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
+    *(*topics.ON_REQUEST, *topics.PROCEDURES),
+)
+INTERRUPTED = "interrupted"
+SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
+SETTLING_TIME = 1.0  # s for all nodes to have found each other
+PREDICTION_TIMEOUT = 10.0  # s for the first prediction: where the needle cannot be tracked, there is none
+FINAL_TIME = 0.5  # s that go on once the path or procedure is done
+# A run along a path that never ends is ended after this many times its own duration, and so many s of simulated time.
+TIMEOUT_FACTOR, EXTRA_TIME = 3.0, 20.0
+MAX_PROCEDURE_TIME = 600.0  # s of simulated time, as in a campaign
+BOARDS_TIMEOUT = 15.0  # s for simulated boards to be ready
+
+# On a busy machine the recorder finds who steers up to 3 s after the bridge does: the bag would lack the start.
+AUDIENCE = "audience:=2"  # bridge and recorder
+SIMULATED_COILS = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
+# Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
+# for 75 ms, as happens with two busy cores, would be taken for dead.
+SLOW_BOARD_TIMEOUTS = {"roboclaw_answer_timeout": 0.2, "driver_timeout": 0.5}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    runs(parser, run_simulate)
+    option = parser.add_argument
+    option("setup", metavar="SETUP", help="a setup's name or YAML file")
+    option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
+    duration = "end after this many seconds (default: at the end of the path or procedure)"
+    option("--duration", type=number_argument(0.1, 1e5), help=duration)
+    option("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
+    clock = parser.add_mutually_exclusive_group()
+    rate = "run with a simulated clock, this much faster than real time (default: in real time)"
+    clock.add_argument("--rate", type=number_argument(0.5, 5.0), help=rate)
+    boards = "drive simulated RoboClaw boards, by the driver for real ones"
+    clock.add_argument("--boards", action="store_true", help=boards)
+    option("--json", type=output_file, metavar="FILE", help="write the figures to a file")
+
+
+def run_simulate(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Run the whole graph around a simulated rig.
+
+    No robot is needed: rig_simulator stands in for coils, dish, needle, thread and camera; vision_tracker,
+    thread_model and coil_bridge are the ones that run on a robot; path_follower commands needle velocities along
+    the setup's path. All are processes of their own, on a ROS domain that nobody else uses. Everything is
+    simulated, and the bag says so.
+
+    With --procedure, needle_planner executes it in place of path_follower. What came of it is in summary.json in BAG,
+    and a procedure that fails ends the command with the reason.
+
+    SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
+    exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
+    and what was recorded stays. The first run on a machine compiles for a minute before it begins.
+    """
+    new = not options.output.exists()
+    given = {name: getattr(options, name) for name in ("duration", "rate", "boards", "procedure")}
+    try:
+        with terminal.progress("simulate") as advance:
+            summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **given)
+    except KeyboardInterrupt:
+        if new and options.output.exists():
+            terminal.log(f"what was recorded is in {options.output}")
+        raise
+    terminal.print(loop_table(summary))
+    terminal.log(f"bag: {options.output}")
+    write_json(options.json, summary.to_json())
+    return DONE
+
+
+def simulate(
+    setup_name: str,
+    output: Path,
+    *,
+    duration: float | None = None,
+    rate: float | None = None,
+    boards: bool = False,
+    procedure: str = "",
+    log: Log = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> LoopSummary:
+    """Run rig, tracker, model, bridge and path follower as processes of their own, and evaluate the loop.
+
+    With a procedure the needle planner executes it in place of the path follower, and the figures, with what came of
+    the procedure, are in the folder too, as `summary.json`.
+
+    `output` becomes a bag of every topic, including ground truth, with the nodes' `logs/` beside it; its
+    notes hold the setup and say that it is simulated, and `replay` takes it. It is made at the end, also
+    of a run that was interrupted, or for which the disk was too small; of one that never began nothing is left.
+
+    Args:
+        setup_name: name or path of a setup with a path for the needle, unless there is a procedure.
+        output: the bag's folder.
+        duration: the run ends after this many seconds of the setup's time, wherever the needle is then;
+            when the path is done if None.
+        rate: how much faster than real time, with a simulated clock; in real time if None.
+        boards: whether the bridge drives the rig through simulated RoboClaw boards on pseudo-terminals, by the
+            driver for real ones; they keep real time, so not with `rate`.
+        procedure: name or path of a procedure; empty for the setup's path.
+        log: called with a line for a person at each stage.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
+        ConfigurationError: the setup cannot be used, or the procedure does not fit its scene.
+        GraphError: a node ended or did not come, the needle never got to the end of its path, or the procedure failed.
+        KeyboardInterrupt: passed on; where the run had begun, its bag is there.
+    """
+    setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
+    steering = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
+    if setup.vision.image_transport != "compressed":
+        name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
+        raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
+    with whole_folder(output, is_recording=True) as folder:
+        problem = _Run(setup, steering, duration, rate, boards, log, progress).record(folder, output.name)
+    if problem == INTERRUPTED:
+        raise KeyboardInterrupt
+    if problem and steering.result is None:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
+    log("evaluating the run")
+    figures = {"setup": setup.name, "procedure": steering.result}
+    try:
+        summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=steering.result)
+        figures = summary.to_json()
+    except GraphError as error:
+        raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
+    finally:
+        if steering.result is not None:
+            (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    if problem:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
+    return summary
+
+
+def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
+    """Return what a simulated run's bag holds, compared by stamp."""
+    collector = LoopCollector(
+        setup.model.thread_length, setup.rig.needle_length, setup.rig.needle_curvature, setup.rig.frame_rate
+    )
+    camera = {channel.recorded for channel in interface.CAMERA.values()}
+    for record in bag.records(set(bag.topics) - camera):
+        collector.add(record.topic, record.time, record.decode())
+    return collector
+
+
+class _Steering:
+    """What the run does: a path that is followed, or a procedure that is executed.
+
+    Attributes:
+        node: that steers.
+        arguments: for all nodes.
+        time_limit: of the whole run [s of simulated time].
+        stage: 0 before the node is there, 1 before the needle moves, 2 from then on.
+        share: that is done, 0 to 1.
+        ended: whether it is done.
+        result: what came of a procedure; None for a path.
+        client: in the graph while the run goes on.
+    """
+
+    node: str
+    arguments: tuple[str, ...] = ()
+    time_limit = MAX_PROCEDURE_TIME
+    stage, share, ended = 0, 0.0, False
+    result: dict[str, Any] | None = None
+    client: Any = nullcontext()
+
+    def poll(self, recorder: Recorder) -> str:
+        """Take what is new; return what went wrong."""
+        raise NotImplementedError
+
+    def problem(self, elapsed: float, recorder: Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        raise NotImplementedError
+
+
+class _Path(_Steering):
+    """The setup's path, along which the path follower steers."""
+
+    node = "path_follower"
+
+    def __init__(self, setup: Setup, duration: float | None) -> None:
+        if not setup.follower.waypoints:
+            raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
+        points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
+        path_time = float(arc_lengths(points)[-1]) / setup.follower.speed
+        self.time_limit = TIMEOUT_FACTOR * path_time + EXTRA_TIME + (duration or 0.0)
+        self._duration = duration
+
+    def poll(self, recorder: Recorder) -> str:
+        """Take what is new; return what went wrong."""
+        state, values = recorder.status_texts.get(self.node, ("", {}))
+        self.stage = 2 if recorder.taken[interface.TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
+        self.share = float(values.get("progress", 0.0))
+        self.ended = state == "done" and self._duration is None
+        bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
+        return f"coil_bridge: {bridge}" if bridge.startswith("fault: ") else ""
+
+    def problem(self, elapsed: float, recorder: Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
+        return f"after {elapsed:.0f} s only {self.share:.0%} of the path is done; {states}"
+
+
+class _Procedure(_Steering):
+    """A procedure that the needle planner executes.
+
+    Attributes:
+        result: name, state, reason, goals met, goals and minimum clearance of the needle's axis by its measured poses
+            [m].
+
+    Raises:
+        ConfigurationError: there is no such procedure, or it does not fit the setup's scene.
+    """
+
+    node = interface.PLANNER
+    result: dict[str, Any]
+
+    def __init__(self, name: str, setup: Setup) -> None:
+        procedure = read_procedure(name)
+        setup.planner.planner(setup.scene).check(procedure)
+        scene = ("-p", f"scene:={find_scene_file(procedure.scene).resolve()}") if procedure.scene else ()
+        self.arguments = (*scene, *FORECAST)
+        self.result = {"procedure": procedure.name, "state": "not begun", "reason": "", "goals_met": 0}
+        self.result |= {"goals": len(procedure.goals), "min_clearance_m": None}
+        self.client = ProcedureClient(str(find_procedure_file(name).resolve()))
+
+    def poll(self, recorder: Recorder) -> str:
+        """Take what is new; return what went wrong."""
+        self.client.poll()
+        status, result = self.client.status, self.client.result
+        if status is not None:
+            self.stage = 2
+            self.share = (status.goals_met + status.progress) / self.result["goals"]
+            self.result["min_clearance_m"] = finite_or_none(status.clearance)
+        for report in (status, result):
+            if report is not None:
+                self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
+        self.ended = result is not None
+        return self._state() if self.ended and result.state != PROCEDURE_DONE else ""
+
+    def problem(self, elapsed: float, recorder: Recorder) -> str:
+        """Return what to report of a run that does not end."""
+        if self.stage == 0:
+            self.result["reason"] = self.client.refusal or "no needle planner"
+            return self._state()
+        return f"after {elapsed:.0f} s {self._state()}"
+
+    def _state(self) -> str:
+        result = self.result
+        met = f"{result['goals_met']} of {result['goals']} goals met"
+        return f"the procedure {result['procedure']} is {result['state']}, {met}: {result['reason']}"
+
+
+@dataclass
+class _Run:
+    """One run of the graph; see `simulate`."""
+
+    setup: Setup
+    steering: _Steering
+    duration: float | None
+    rate: float | None
+    boards: bool
+    log: Log
+    progress: Progress
+
+    def record(self, folder: Path, name: str) -> str:
+        """Run the graph and record it; return what went wrong, so that the bag stays."""
+        setup, arguments = self.setup, ["--params-file", str(self.setup.path.resolve()), *OWN, *self.steering.arguments]
+        if self.rate is not None:
+            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
+        notes = {
+            "setup": setup.name,
+            SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
+            "simulated": f"the whole rig, closed loop, setup {setup.name}",
+        }
+        procedures = () if self.steering.result is None else topics.PROCEDURES
+        every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
+        recorded = [topic for topic in every if topic is not topics.IMAGE]
+        what = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
+        processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
+        with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
+            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else SIMULATED_COILS
+            for topic in recorded:
+                bag.add_topic(topic.channel.recorded, topic.channel.type_name)
+            with own_graph(processes, arguments, folder / "logs", what, self.log) as graph:
+                sink = _Sink(bag)
+                recorder = Recorder(graph.domain, recorded, simulated_clock=self.rate is not None, receive=sink.receive)
+                try:
+                    return self._run(graph, recorder, sink)
+                finally:
+                    recorder.close()
+
+    def _run(self, graph: OwnGraph, recorder: Recorder, sink: _Sink) -> str:
+        with graph.interruption:
+            _wait(recorder, graph.check, self.log)
+        if self.boards:
+            _arm()
+        self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
+        sink.running = True
+        try:
+            graph.nodes.start(self.steering.node, arguments=("-p", f"{self.steering.node}:{AUDIENCE}"))
+            with graph.interruption, self.steering.client:
+                return self._steer(recorder, graph.check)
+        except KeyboardInterrupt:
+            return INTERRUPTED  # passed on once the bag is whole
+
+    def _steer(self, recorder: Recorder, check: Callable[[], None]) -> str:
+        """Record until the path or procedure is done, or the time is over; return what went wrong."""
+        steering, rate = self.steering, self.rate or 1.0
+        stage, began = 0, time.monotonic()
+        while True:
+            check()
+            recorder.spin(POLL_PERIOD)
+            problem = steering.poll(recorder)
+            if steering.stage > stage:
+                stage, began = steering.stage, time.monotonic()
+            elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
+            timed = 0.0 if self.duration is None or not stage else min(1.0, elapsed / self.duration)
+            self.progress(steering.share if self.duration is None else timed)
+            if steering.ended:
+                recorder.spin(FINAL_TIME / rate)
+            if problem or steering.ended:
+                return problem
+            wanted = None if self.duration is None else self.duration + (EXTRA_TIME if stage == 1 else 0.0)
+            if wanted is not None and stage and elapsed > wanted:
+                return ""
+            if elapsed > (steering.time_limit if stage else START_TIMEOUT):
+                return steering.problem(elapsed, recorder)
+
+
+class _Sink:
+    """Writes what comes while the run is on; of before, only what is published once, at the bag's start."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        self.running = False
+        self._bag = bag
+        self._early: dict[str, bytes] = {}
+        self._begin: int | None = None
+
+    def receive(self, topic: str, arrival: int, data: bytes) -> None:
+        """Take a message."""
+        if not self.running:
+            if topic in ONCE:
+                self._early[topic] = data
+            return
+        if self._begin is None:
+            self._begin = arrival
+            for name, content in self._early.items():
+                self._bag.write(name, arrival, content)
+        # What waited elsewhere may have arrived before: the scene is the bag's first message all the same.
+        self._bag.write(topic, max(arrival, self._begin + 1), data)
+
+
+def _arm() -> None:
+    """Arm the bridge as soon as its boards are ready."""
+    deadline = time.monotonic() + BOARDS_TIMEOUT
+    while True:
+        try:
+            with CoilClient() as client:
+                client.execute("arm")
+                return
+        except GraphError as error:
+            if time.monotonic() > deadline:
+                raise GraphError(f"the bridge cannot be armed: {error}") from None
+
+
+def _wired(folder: str, coils: int) -> list[str]:
+    """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
+    ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
+    boards = {"roboclaw_ports": ports, "roboclaw_addresses": json.dumps(board_addresses(coils // 2))}
+    parameters: dict[str, dict[str, object]] = {
+        "coil_bridge": {"driver": "roboclaw", "autostart": "active", **boards, **SLOW_BOARD_TIMEOUTS},
+        "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
+    }
+    given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
+    return [part for each in given for part in ("-p", each)]
+
+
+def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
+    """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
+
+    On a busy machine the first frames take tracker and model a second or more; a run that had begun would lack them.
+    """
+    optional = {topic.name for topic in OPTIONAL}
+    deadline, logged = time.monotonic() + START_TIMEOUT, set[str]()
+    while missing := [name for name in recorder.silent() if name not in optional]:
+        check()
+        log_compiling({name: text for name, (text, _) in recorder.status_texts.items()}, logged, log)
+        if time.monotonic() > deadline:
+            raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
+        recorder.spin(POLL_PERIOD)
+    deadline = time.monotonic() + PREDICTION_TIMEOUT
+    while not recorder.taken[interface.PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
+        check()
+        recorder.spin(POLL_PERIOD)
+    recorder.spin(SETTLING_TIME)

@@ -1,0 +1,424 @@
+"""The command `magnetosuture track`, and the camera frames of picture files, folders and bags."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from magnetosuture_thread import InvalidInputError, Scene, read_scene
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
+from magnetosuture_thread.commands.command import (
+    DONE,
+    Terminal,
+    add_frames,
+    number_argument,
+    output_file,
+    runs,
+    write_json,
+)
+from magnetosuture_thread.commands.observations import read_image
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES, Channel
+from magnetosuture_thread.messages.reading import stamp_of
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.thread_observation import ThreadPiece
+from magnetosuture_thread.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.vision.images import decode_image
+from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
+from magnetosuture_thread.vision.look import State, Track, no_pose
+from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import VisionTracker
+from magnetosuture_thread.vision.warm_up import warm_up
+from magnetosuture_thread.workers import Log, Progress
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+PICTURE_RATE = 30.0  # frames/s, of what has no rate of its own
+MIN_RATE, MAX_RATE = 0.1, 240.0  # frames/s, that video players show
+FRAMES_FOR_RATE = 300  # of a bag, from its beginning
+MAX_ROWS = 20  # of frames; beyond, only the summary is shown
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    runs(parser, run_track)
+    option = parser.add_argument
+    add_frames(parser)
+    setup = "a setup's name or YAML file (default: %(default)s)"
+    option("--setup", default="petri_35mm_polyamide", metavar="NAME", help=setup)
+    option("--scene", default="", metavar="NAME", help="a scene's name or file (default: the setup's)")
+    scale = "the scale (default: the setup's, or from the dish's diameter)"
+    option("--metres-per-pixel", type=number_argument(1e-7, 1e-2), metavar="S", help=scale)
+    centre = "the dish's centre [px] (default: the setup's, or found)"
+    option("--centre", type=number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
+    option("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
+    option("--overlay", type=Path, metavar="PATH", help=overlay)
+
+
+def run_track(options: argparse.Namespace, terminal: Terminal) -> int:
+    """Find needle and thread in camera frames, without a graph.
+
+    FRAMES are pictures, a folder of them, or a bag. Pictures are searched one by one; a bag's frames are followed
+    over time, as the node vision_tracker does.
+
+    --json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
+    or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
+    (positive to the left), thread_m from the tail on, all in the dish frame, needle_length_m as measured over
+    the first frames of a bag, pieces of the thread (points_m, deviation_m across, why their ends are ends,
+    arc_length_m of the first point at least and at most) and whether they are complete, confidence from 0 to 1,
+    stamp_s, and time_s, the processor time to search the frame, on one core, without reading and decoding it;
+    all is compiled before. What has no value is null.
+    """
+    setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
+    view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
+    if options.centre is not None:
+        view["dish_centre_px"] = tuple(options.centre)
+    settings = replace(setup.vision, **view)
+    lens = read_lens(options.camera_info) if options.camera_info is not None else None
+    given = {"overlay": options.overlay, "remap": dict(options.remap), "lens": lens, "log": terminal.log}
+    with terminal.progress("track") as advance:
+        frames = track(options.frames, settings, setup.scene, progress=advance, **given)
+    rows = [frame.to_json() for frame in frames]
+    terminal.print(_table(rows))
+    if rows:
+        counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
+        median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
+        terminal.log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
+    write_json(options.json, rows)
+    return DONE
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """One frame.
+
+    Attributes:
+        name: the file's, with its folders where two have the same, numbered where a file is given twice; or topic and
+            stamp.
+        image: None if it is broken.
+        problem: why it is; else empty.
+        stamp: when it was taken [s]; None where nothing tells.
+        lens: of a bag's camera, by the last camera_info before the frame; None if there is none that can be used.
+    """
+
+    name: str
+    image: np.ndarray | None
+    problem: str = ""
+    stamp: float | None = None
+    lens: Lens | None = None
+
+
+class FrameSource:
+    """The frames at given paths: files in the order given, a folder by name, a bag by time.
+
+    Args:
+        paths: picture files, one folder of pictures, or one bag.
+        remap: new name of a bag's topic by its recorded name.
+        log: called with a line for a person on what of a bag is damaged or not checked.
+
+    Attributes:
+        count: number of frames.
+        names: of picture files; empty for a bag.
+        is_sequence: whether the frames follow one another in time, as in a bag.
+        unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
+
+    Raises:
+        BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
+    """
+
+    def __init__(self, paths: Sequence[Path], remap: Mapping[str, str] | None, log: Log) -> None:
+        self._files: list[Path] = []
+        self._recording: Recording | None = None
+        self._channel: Channel = CAMERA["raw"]
+        self._lens_problems: Counter[str] = Counter()
+        self.unverified = ""
+        for path in paths:
+            self._add(path, remap, log, alone=len(paths) == 1)
+        self.is_sequence = self._recording is not None
+        if remap and self._recording is None:
+            raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
+        names = [file.name for file in self._files]
+        unique = len(set(names)) == len(names)
+        self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
+        recording = self._recording
+        self.count = recording.counts[self._channel.recorded] if recording is not None else len(self._files)
+
+    def _add(self, path: Path, remap: Mapping[str, str] | None, log: Log, alone: bool) -> None:
+        try:
+            path.stat()
+            is_folder = path.is_dir()
+            inside = sorted(path.iterdir()) if is_folder else []
+        except FileNotFoundError:
+            raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
+        except (OSError, ValueError) as error:
+            raise BagError(path, f"cannot be read: {error}") from None
+        if any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
+            if not alone:
+                raise BagError(path, "is a bag; expected it alone, without other frames")
+            self._open(path, remap, log)
+        elif is_folder:
+            pictures = [file for file in inside if file.suffix.lower() in PICTURES and file.is_file()]
+            if not pictures:
+                raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
+            self._files += pictures
+        else:
+            self._files.append(path)
+
+    def _open(self, path: Path, remap: Mapping[str, str] | None, log: Log) -> None:
+        bag = Bag(path, remap=remap)
+        self._recording, self.unverified = Recording(bag), bag.unverified
+        doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
+        for line in (str(bag.damage or ""), doubt, *bag.remarks):
+            if line:
+                log(f"{path} {line}")
+        if self._recording.camera is None:
+            topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
+            raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
+        self._channel = self._recording.camera
+
+    def __iter__(self) -> Iterator[FrameFile]:
+        """Go through the frames."""
+        if self._recording is not None:
+            yield from self._recorded(self._recording)
+            return
+        for name, file in zip(self.names, self._files, strict=True):
+            try:
+                yield FrameFile(name, decode_image(read_regular(file, MAX_FILE_BYTES)))
+            except OSError as error:
+                yield FrameFile(name, None, f"cannot be read: {error.strerror}")
+            except InvalidInputError as error:
+                yield FrameFile(name, None, str(error))
+
+    def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
+        lens: Lens | None = None
+        wanted = [channel for channel in (CAMERA_INFO, self._channel) if recording.counts.get(channel.recorded)]
+        for record in recording.records(wanted):
+            if record.topic == CAMERA_INFO.recorded:
+                try:
+                    lens = lens_of(record.decode())
+                except (BagError, InvalidInputError) as error:
+                    lens = None
+                    self._lens_problems[str(error)] += 1
+                continue
+            stamp = stamp_of(record) * 1e-9
+            name = f"{record.topic} {stamp:.6f}"
+            try:
+                yield FrameFile(name, read_image(record), "", stamp, lens)
+            except (BagError, InvalidInputError) as error:
+                yield FrameFile(name, None, str(error), stamp, lens)
+
+    def log_refused(self, log: Log) -> None:
+        """Log why frames of a bag could not be taken, once all have been gone through."""
+        for reason, count in (self._recording.refused if self._recording is not None else {}).items():
+            log(f"{reason}: {pluralize(count, 'frame')} left out")
+        for problem in self._lens_problems:
+            log(f"{problem}: frames are taken as they are")
+
+    def rate(self) -> float:
+        """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
+        if self._recording is None:
+            return PICTURE_RATE
+        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), FRAMES_FOR_RATE)]
+        intervals = np.diff(stamps) * 1e-9
+        if not np.any(intervals > 0.0):
+            return PICTURE_RATE
+        # To 0.01 frames/s: the time base of MPEG-4 has no room for more.
+        return min(MAX_RATE, max(MIN_RATE, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+
+
+def numbered(names: Sequence[str], form: str) -> list[str]:
+    """Return names each of which is there once: where one comes again, it gets a number.
+
+    Args:
+        names: that may come again.
+        form: of a name with its number, 2 and up, for example `{}_{}`.
+    """
+    given, numbers, taken = list[str](), Counter[str](), set(names)
+    for name in names:
+        numbers[name] += 1
+        own = name
+        while numbers[name] > 1 and (own := form.format(name, numbers[name])) in taken:
+            numbers[name] += 1
+        taken.add(own)
+        given.append(own)
+    return given
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """What one frame showed.
+
+    Attributes:
+        name: see `FrameFile`.
+        track: what was seen.
+        duration: processor time that looking took, on one core, decoding not included; other work on the
+            machine does not show in it [s].
+        stamp: when the frame was taken [s]; None where nothing tells.
+        unverified: why a bag's frame may be wrong; empty if nothing speaks against it.
+    """
+
+    name: str
+    track: Track
+    duration: float
+    stamp: float | None
+    unverified: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what is written of it, in SI units; null for what has no value."""
+        track, pose = self.track, dict[str, Any]()
+        if not track.reason:
+            thread = track.centreline
+            pose = {
+                "tail_m": _numbers(track.tail),
+                "heading_rad": finite_or_none(math.atan2(track.heading[1], track.heading[0])),
+                "tip_m": _numbers(track.tip),
+                "curvature_per_m": finite_or_none(float(track.curvature)),
+                "thread_m": thread.tolist() if np.isfinite(thread).all() else None,
+                "pieces": [_piece(piece) for piece in track.observation.pieces],
+            }
+        names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
+        length = track.needle_length
+        return {
+            "file": self.name,
+            "status": track.state.value,
+            "reason": track.reason or None,
+            "warning": track.warning or None,
+            **{name: pose.get(name) for name in names},
+            "needle_length_m": None if length is None else finite_or_none(float(length)),
+            "complete": track.observation.complete,
+            "confidence": finite_or_none(float(track.confidence)),
+            "time_s": self.duration,
+            "stamp_s": self.stamp,
+            **({"unverified": self.unverified} if self.unverified else {}),
+        }
+
+
+def _numbers(values: np.ndarray) -> list[float] | None:
+    return [float(value) for value in values] if np.isfinite(values).all() else None
+
+
+def _piece(piece: ThreadPiece) -> dict[str, Any]:
+    """Return what is written of a piece of the thread, in SI units; null where nothing tells."""
+    return {
+        "points_m": piece.points.tolist(),
+        "deviation_m": piece.deviation.tolist(),
+        "first_end": piece.first_end.name.lower(),
+        "last_end": piece.last_end.name.lower(),
+        "arc_length_m": [finite_or_none(float(value)) for value in piece.arc_length],
+        "direction_known": piece.direction_known,
+        "confidence": piece.confidence,
+    }
+
+
+def track(
+    paths: Sequence[Path],
+    settings: VisionTrackerSettings,
+    scene: Scene,
+    *,
+    overlay: Path | None = None,
+    remap: Mapping[str, str] | None = None,
+    lens: Lens | None = None,
+    log: Callable[[str], None] = lambda text: None,
+    progress: Progress = lambda share: None,
+) -> list[TrackedFrame]:
+    """Track the needle in frames: each by itself, or over time where they are a bag's.
+
+    Args:
+        paths: picture files, one folder of pictures, or one bag.
+        settings: what to look for.
+        scene: in which.
+        overlay: folder or video to draw into.
+        remap: new name of a bag's topic by its recorded name.
+        lens: of the camera; None: a bag's own, and none of pictures.
+        log: called with a line for a person on what of a bag is damaged or not checked.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        BagError: there are no frames, or the overlay cannot be written.
+    """
+    source = FrameSource(paths, remap, log)
+    tracker = VisionTracker(settings, scene)
+    warm_up()
+    results = []
+    # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
+    files = numbered([Path(name).stem for name in source.names], "{}_{}")
+    with OverlayWriter(overlay, source.rate()) if overlay is not None else nullcontext() as writer:
+        for index, frame in enumerate(source):
+            own = lens or frame.lens
+            tracker.set_lens(own)
+            result = replace(_look(tracker, frame, source.is_sequence), unverified=source.unverified)
+            results.append(result)
+            if writer is not None and frame.image is not None:
+                name = f"frame_{index:06d}" if source.is_sequence else files[index]
+                picture = frame.image
+                if own is not None and own.problem_with(picture.shape) is None:
+                    picture = own.undistorted(picture)
+                drawn, view = (
+                    draw_overlay(picture, result.track, settings.needle_length, result.name),
+                    result.track.view,
+                )
+                if view is not None:
+                    draw_dish(drawn, view.centre_px, scene.dish.radius / view.metres_per_pixel)
+                writer.write(name, drawn)
+            progress((index + 1) / max(source.count, 1))
+    source.log_refused(log)
+    return results
+
+
+def _look(tracker: VisionTracker, frame: FrameFile, in_sequence: bool) -> TrackedFrame:
+    """Look at one frame, and time it."""
+    began = time.thread_time()
+    try:
+        if frame.image is None:
+            raise InvalidInputError("image", "a broken picture", frame.problem)
+        if in_sequence and frame.stamp is not None:
+            seen = tracker.track(frame.image, frame.stamp)
+        else:
+            seen = tracker.look(frame.image)
+    except InvalidInputError as error:
+        seen = no_pose(State.LOST, frame.problem or str(error), None)
+    return TrackedFrame(frame.name, seen, time.thread_time() - began, frame.stamp)
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return a row for each of the first frames, as `TrackedFrame.to_json` gives them."""
+    table = Table(title=f"{len(rows)} frames")
+    table.caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
+    table.add_column("frame", overflow="fold", min_width=12)
+    table.add_column("status")
+    for name in ("tail", "heading", "thread", "sure", "ms"):
+        table.add_column(name, justify="right", no_wrap=True)
+    began = rows[0]["stamp_s"] if rows else None
+    for row in rows[:MAX_ROWS]:
+        name, status = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s", row["status"]
+        cells = [""] * 4
+        if row["reason"]:
+            status = f"{status}: {row['reason']}"
+        else:
+            length = np.linalg.norm(np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0), axis=1).sum()
+            cells = [
+                ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
+                "" if row["heading_rad"] is None else f"{math.degrees(row['heading_rad']):.1f}",
+                "" if row["thread_m"] is None else f"{1e3 * length:.1f}",
+                "" if row["confidence"] is None else f"{row['confidence']:.2f}",
+            ]
+        table.add_row(name, status, *cells, f"{row['time_s'] * 1e3:.1f}")
+    if len(rows) > MAX_ROWS:
+        table.add_row(f"and {len(rows) - MAX_ROWS} more", "", "", "", "", "", "")
+    return table

@@ -1,1 +1,0 @@
-"""Jobs: what each sub-command does, a file for each."""

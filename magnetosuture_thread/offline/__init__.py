@@ -1,1 +1,0 @@
-"""A recorded experiment through the same tracker and model as in the graph, without one."""

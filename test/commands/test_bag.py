@@ -1,0 +1,125 @@
+"""`magnetosuture bag`: what is in a bag, and a whole one of what is intact; recording to a full disk."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from test.bags.bags import HEADER, make, read, stamped, write_many_chunks
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> Path:
+    """Return a bag with a broken chunk and no end."""
+    file = write_many_chunks(tmp_path / "damaged")
+    data = bytearray(file.read_bytes())
+    data[20_000] ^= 1
+    file.write_bytes(data[:-30_000])
+    return tmp_path / "damaged"
+
+
+def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with BagWriter(tmp_path / "whole", {"setup": "example"}) as bag:
+        bag.add_topic("/stamped", HEADER)
+        bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
+        for index, seconds in enumerate((1, 2, 5, 4, 6, 3)):
+            bag.write_message("/stamped", 10**9 + index * 5 * 10**8, stamped(seconds))
+    found = tmp_path / "found.json"
+    assert cli.main(["bag", "check", str(tmp_path / "whole"), "--json", str(found)]) == 0
+    shown = capsys.readouterr().out
+    for words in (
+        "6 messages in 2.500 s",
+        "std_msgs/Header",
+        "/ground_truth/needle *",
+        "setup: example",
+        "nothing is damaged",
+    ):
+        assert words in shown
+    assert "/stamped: 2 stamps are before the one before them" in shown
+    topics = {topic["topic"]: topic for topic in json.loads(found.read_text())["topics"]}
+    told = topics["/stamped"]
+    assert (told["messages"], told["rate_hz"], told["first_s"], told["last_s"]) == (6, 2.0, 0.0, 2.5)
+    assert (told["greatest_gap_s"], told["stamps_going_back"], told["frames"]) == (0.5, 2, ["dish"])
+    assert (topics["/ground_truth/needle"]["rate_hz"], topics["/ground_truth/needle"]["known"]) == (None, True)
+
+
+def test_a_damaged_bag_is_shown_all_the_same(damaged: Path, capsys: pytest.CaptureFixture[str]):
+    assert cli.main(["bag", "check", str(damaged), "--remap", "camera:=/camera/image_raw"]) == 1
+    shown = capsys.readouterr().out
+    assert "/camera/image_raw *" in shown
+    assert "is damaged" in shown
+    assert shown.count("damaged_0.mcap, bytes") >= 3
+
+
+def test_repair_makes_a_whole_bag_of_what_is_intact(damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    before = {path: path.read_bytes() for path in damaged.iterdir()}
+    output = tmp_path / "repaired"
+    assert cli.main(["bag", "repair", str(damaged), "--output", str(output)]) == 0
+    shown = capsys.readouterr().out
+    old, new = Bag(damaged), Bag(output)
+    assert (old.damage is None, new.damage) == (False, None)
+    assert read(new) == read(old)
+    assert f"{sum(new.counts.values())} messages in {output}" in shown
+    assert re.search(r"; messages between \d+\.\d+ s and \d+\.\d+ s", shown)
+    assert {path: path.read_bytes() for path in damaged.iterdir()} == before
+    with Reader(output) as reader:
+        assert reader.message_count == sum(new.counts.values())
+    assert cli.main(["bag", "repair", str(damaged), "--output", str(output)]) == 1
+    assert "exists already" in capsys.readouterr().err
+
+
+# `whole_folder` as `simulate` uses it, on a disk that takes files of a megabyte.
+FULL = """
+import os, resource, signal, sys
+from pathlib import Path
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.commands.output import whole_folder
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))
+try:
+    with whole_folder(Path(sys.argv[1]), is_recording=sys.argv[2] == "recording") as folder:
+        (folder / "logs").mkdir()
+        with BagWriter(folder / "bag", name="run") as bag:
+            bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")
+            for index in range(1000):
+                bag.write("/noise", 10**9 + index * 10**7, os.urandom(10_000))
+except BagError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("kind", ["recording", "result"])
+def test_a_recording_stays_when_the_disk_is_full_and_nothing_else_does(tmp_path: Path, kind: str):
+    output = tmp_path / "run"
+    command = [sys.executable, "-c", FULL, str(output), kind]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+    assert "the disk takes no larger file after" in said
+    if kind == "result":
+        assert list(tmp_path.iterdir()) == []
+        return
+    assert said.startswith(f"{output}: the disk takes no larger file after")
+    assert str(output / "bag" / "run_0.mcap") in said
+    assert Bag(output / "bag").counts["/noise"] > 60
+    assert list(tmp_path.iterdir()) == [output]
+
+
+def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/ground_truth/needle", "geometry_msgs/msg/PoseStamped")
+        point = make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0)
+        turn = make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        pose = make("geometry_msgs/msg/Pose", point, turn)
+        bag.write_message("/ground_truth/needle", 1, make("geometry_msgs/msg/PoseStamped", stamped(1, "world"), pose))
+    for words, is_told in (([], True), (["--frame", "world"], False)):
+        assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
+        assert ("is not connected to dish" in capsys.readouterr().out) == is_told

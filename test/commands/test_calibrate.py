@@ -1,0 +1,169 @@
+"""The job and the command `calibrate`: from bags to a file that thread_model loads."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.calibration.parameters import stiffness_over_drag
+from magnetosuture_thread.commands.calibrate import FitOptions, calibrate_bags, material_named
+from magnetosuture_thread.commands.render import render_bag
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
+from magnetosuture_thread.setups import read_setup
+from test.bags.bags import copy_with_notes
+from test.calibration.runs import LENGTH, rig_run
+
+TRUE = 1.6e-9  # m^4/s; the material's is 1.3e-9
+SETUP = """\
+/**:
+  ros__parameters:
+    scene: dish_150mm
+    thread_length: 0.019
+
+/**/thread_model:
+  ros__parameters:
+    material: polyamide_7_0
+    segments: 12
+    attachment: pinned
+    max_step: 0.07
+"""
+ONE = ("--parameters", "elastic_modulus")
+
+
+def trajectory(phase: float = 0.0, ratio: float = TRUE) -> ReferenceTrajectory:
+    """Return a run of the rig's rod, of a stiffness over drag, as a reference trajectory."""
+    sights = rig_run(ratio, phase=phase)
+    headings = np.unwrap([math.atan2(sight.heading[1], sight.heading[0]) for sight in sights])
+    times = np.array([(sight.stamp - sights[0].stamp) * 1e-9 for sight in sights])
+    tails, threads = (np.array([getattr(sight, name) for sight in sights]) for name in ("tail", "ground_truth"))
+    return ReferenceTrajectory("rig", times, tails, headings, threads, (), {"material": {"L_m": LENGTH}})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a setup and two bags of poses with noise."""
+    folder = tmp_path_factory.mktemp("calibrate")
+    setup = folder / "lab.yaml"
+    setup.write_text(SETUP)
+    for name, phase in (("one", 0.0), ("two", 1.5)):
+        render_bag(trajectory(phase), read_setup(str(setup)), folder / name, rate=15.0, pose_noise=2e-5)
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> int:
+    """Run the command, in this process unless it is given workers: each takes seconds to start."""
+    workers = () if "--workers" in arguments else ("--workers", "1")
+    return cli.main(["calibrate", *arguments, *workers, "--setup", str(folder / "lab.yaml")])
+
+
+def test_bags_give_a_file_a_picture_and_figures_whatever_the_workers(folder: Path, tmp_path: Path, capsys):
+    texts = []
+    for workers in ("1", "2"):
+        output, figures = tmp_path / f"{workers}.yaml", tmp_path / f"{workers}.json"
+        bags = [str(folder / name) for name in ("one", "two")]
+        given = ["--material", "poly", "--output", str(output), "--workers", workers, "--json", str(figures)]
+        code = run(folder, *bags, *ONE, *given)
+        assert code == 0
+        texts.append((output.read_bytes(), figures.read_bytes(), output.with_suffix(".png").read_bytes()))
+    assert texts[0] == texts[1]
+    shown = capsys.readouterr().out
+    assert "stiffness over drag" in shown
+    assert "simulated: " in shown
+    values = json.loads(texts[0][1])
+    assert values["finished"]
+    assert values["parameters"][0]["value"] == pytest.approx(TRUE, rel=0.05)
+    assert [row["truth_held_out"] < 0.5 for row in values["bags"]] == [True, True]
+    settings = read_setup(str(tmp_path / "1.yaml")).model
+    assert stiffness_over_drag(settings) == pytest.approx(TRUE, rel=0.05)
+    assert settings.attachment == "pinned"
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"{n}.{end}" for n in (1, 2) for end in ("yaml", "json", "png")
+    }
+
+
+def test_an_unverified_bag_says_so_in_file_figures_and_text(folder: Path, tmp_path: Path, capsys):
+    copy_with_notes(folder / "one", tmp_path / "bag", unverified="salvaged without checksums")
+    output, figures = tmp_path / "found.yaml", tmp_path / "found.json"
+    assert run(folder, str(tmp_path / "bag"), *ONE, "--output", str(output), "--json", str(figures)) == 0
+    assert "UNVERIFIED: salvaged without checksums" in output.read_text()
+    found = json.loads(figures.read_text())
+    assert [row["unverified"] for row in found["bags"]] == ["salvaged without checksums"]
+    assert "is unverified: salvaged without checksums" in " ".join(capsys.readouterr().out.split())
+
+
+def test_ctrl_c_leaves_the_best_so_far(folder: Path, tmp_path: Path):
+    output = tmp_path / "best.yaml"
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "calibrate", str(folder / "one")]
+    command += ["--setup", str(folder / "lab.yaml"), "--output", str(output), "--workers", "2"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        for line in process.stdout:
+            if line.startswith("tried"):
+                process.send_signal(signal.SIGINT)
+                break
+        rest, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (130, "")
+    assert "interrupted; writing the best so far" in rest
+    assert output.read_text().startswith("# BEST SO FAR, NOT FINISHED")
+    assert stiffness_over_drag(read_setup(str(output)).model) == pytest.approx(TRUE, rel=0.2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["best.png", "best.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["nowhere"], 1, "nowhere: does not exist"),
+        (["one", "--parameters", "elastic_module"], 2, "did you mean elastic_modulus"),
+        (["one", "--material", "steel"], 2, "material: got 'steel', expected one of polyamide_7_0, silk_6_0"),
+        (["one", "--against", "truth", "--remap", "/ground_truth/thread:=/elsewhere"], 1, "holds no ground truth"),
+        (["one", "--source", "camera"], 1, "camera/image_raw"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(
+    folder: Path, tmp_path: Path, capsys, arguments: list[str], code: int, words: str
+):
+    name, *more = arguments
+    assert run(folder, str(folder / name), *more, "--output", str(tmp_path / "found.yaml")) == code
+    errors = " ".join(capsys.readouterr().err.split())
+    assert errors.startswith("error: ")
+    assert words in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bags_of_different_threads_are_refused(folder: Path, tmp_path: Path):
+    setup = read_setup("petri_150mm_silk")
+    still = replace(trajectory(), metadata={})
+    render_bag(still, setup, tmp_path / "silk", rate=15.0, pose_noise=0.0)
+    render_bag(still, read_setup("petri_35mm_polyamide"), tmp_path / "polyamide", rate=15.0, pose_noise=0.0)
+    own = str(folder / "lab.yaml")
+    with pytest.raises(
+        InvalidInputError, match="silk: got a thread with material silk_6_0, expected polyamide_7_0, as"
+    ):
+        calibrate_bags([tmp_path / "polyamide", tmp_path / "silk"], tmp_path / "found.yaml", setup_name=own)
+
+
+def test_a_material_is_told_by_how_it_begins():
+    assert material_named("silk") == "silk_6_0"
+    assert material_named("polyamide_7_0") == "polyamide_7_0"
+    for text in ("", "steel"):
+        with pytest.raises(ConfigurationError, match="or how it begins"):
+            material_named(text)
+
+
+def test_another_material_comes_with_its_own_numbers():
+    setup = read_setup("petri_35mm_polyamide")
+    own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
+    assert FitOptions("polyamide").settings_of(own) == own.model
+    silk = FitOptions("silk", "paper").settings_of(own)
+    assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

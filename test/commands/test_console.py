@@ -1,0 +1,250 @@
+"""The command `magnetosuture console` as a person runs it, with a page that is a program."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from magnetosuture_msgs.msg import CoilCurrents
+from rclpy.context import Context
+
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.cli import main
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.clients import Inbox
+from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
+from test.console.visitor import Page, opened, until
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "post_wrap"
+OTHER = "petri_35mm_polyamide_post"
+WAIT = 300.0  # s; the first start on a machine compiles
+
+
+@dataclass
+class Console:
+    """The command, running; what it prints goes to a file."""
+
+    process: subprocess.Popen[bytes]
+    output: Path
+
+    def find(self, pattern: str) -> str:
+        """Wait for a line of its output, and return what the pattern's group holds."""
+        deadline = time.monotonic() + WAIT
+        while not (found := re.search(pattern, self.output.read_text(), re.MULTILINE)):
+            assert self.process.poll() is None, self.output.read_text()
+            assert time.monotonic() < deadline, f"no {pattern} in {self.output.read_text()}"
+            time.sleep(0.02)
+        return found[1]
+
+    def end(self) -> int:
+        """Press Ctrl-C, and return its exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(60.0)
+
+
+@contextmanager
+def running(*arguments: str, **environment: str) -> Iterator[Console]:
+    """Run the command on a free port; end it at the end if it has not."""
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
+    own = {**os.environ, "MAGNETOSUTURE_TOKEN": "only-for-this-test-0123", **environment}
+    with (
+        TemporaryDirectory() as folder,
+        (Path(folder) / "output").open("wb") as file,
+        subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own) as process,
+    ):
+        console = Console(process, Path(file.name))
+        try:
+            yield console
+        finally:
+            if process.poll() is None:
+                console.end()
+
+
+@contextmanager
+def wire(domain: int) -> Iterator[Inbox]:
+    """Give what goes to the simulated coils."""
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, args=[])
+    node = rclpy.create_node("wire", context=context)
+    try:
+        yield Inbox(node, topics.RIG_CURRENTS, 10)
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def tail(page: Page) -> np.ndarray:
+    """Return where the needle's tail is seen."""
+    return np.array(page.graph["needle"]["tail"])
+
+
+async def wait(page: Page, condition: Callable[[], Any], what: str) -> None:
+    """Wait until the page shows something of a whole graph."""
+    await until(lambda: page.graph and condition(), f"{what}; {page.of('error')[-3:]}", WAIT)
+
+
+async def record_a_second(page: Page) -> None:
+    """Begin a recording, and let it run for a second of the graph's time."""
+    assert await page.ask(type="record", recording=True) == ""
+    began = page.graph["time"]
+    await wait(page, lambda: page.host["recording"] and page.graph["time"] > began + 1.0, "a second")
+
+
+async def steer_and_stop(page: Page, currents: Inbox) -> None:
+    """Arm, steer, record, pause, stop in an emergency, and choose another setup."""
+    await wait(page, lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "the graph")
+    assert (page.host["mode"], page.host["simulated"]) == ("simulated", True)
+    assert not page.graph["bridge"]["armed"]
+    assert await page.ask(type="acquire_control") == ""
+    await record_a_second(page)
+    assert await page.ask(type="bridge_action", action="arm") == ""
+    before = tail(page)
+    page.hold(1.0, 0.0, 0.005)
+    await wait(page, lambda: tail(page)[0] - before[0] > 1e-3, "the needle to move")
+    assert abs(tail(page)[1] - before[1]) < 1e-3
+    assert page.graph["filter"]["commanded"] == [0.005, 0.0]
+    assert await page.ask(type="pause", paused=True) == ""
+    await wait(page, lambda: page.host["paused"] and page.graph["needle"]["age"] > 0.5, "no poses any more")
+    await wait(page, lambda: not any(page.graph["bridge"]["current"]), "no currents without poses")
+    assert await page.ask(type="pause", paused=False) == ""
+    await wait(page, lambda: page.graph["needle"]["age"] < 0.5, "poses again")
+    await page.release()  # what was held before counts no more
+    page.hold(1.0, 0.0)
+    await wait(page, lambda: any(page.graph["bridge"]["current"]), "currents again")
+    assert await page.ask(type="bridge_action", action="stop") == ""
+    await wait(page, lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+    list(currents.take())
+    heard: list[CoilCurrents] = []
+
+    def enough() -> bool:
+        heard.extend(message for message, _ in currents.read())
+        return len(heard) > 10
+
+    await wait(page, enough, "currents on the wire")
+    assert not any(any(message.current) for message in heard)
+    await page.release()
+    assert "expected one of" in await page.ask(type="select_setup", setup="../../etc/passwd.yaml")
+    assert await page.ask(type="select_setup", setup=OTHER) == ""
+    await wait(page, lambda: page.host["setup"] == OTHER and not page.host["recording"], "the other setup to begin")
+    await wait(page, lambda: not page.host["busy"] and page.graph["predicted"], "the other setup")
+    assert len(page.graph["scene"]["shapes"]) == 1
+    assert not page.graph["bridge"]["emergency_stopped"]
+    await record_a_second(page)
+
+
+@pytest.mark.whole_graph
+def test_a_person_steers_the_simulated_rig(tmp_path: Path):
+    recordings = tmp_path / "recordings"
+
+    async def use(url: str, currents: Inbox) -> None:
+        async with opened(url) as page:
+            await steer_and_stop(page, currents)
+
+    with running("petri_35mm_polyamide", "--record", str(recordings)) as console:
+        domain = int(console.find(r"ROS domain (\d+)"))
+        url = console.find(r"open (http://127\.0\.0\.1:\d+/#token=only-for-this-test-0123)$")
+        # This machine may allow no priority.
+        console.find(r"perception: (real time, priority 5|ordinary; real-time priority 5 refused .*)$")
+        with wire(domain) as currents:
+            asyncio.run(use(url, currents))
+        assert console.end() == 0
+        assert console.output.read_text().endswith("ended\n")
+        assert console.output.read_text().endswith("ended\n")
+    first, second = map(Bag, sorted(recordings.iterdir()))  # ended by the choice of a setup, and by Ctrl-C
+    assert first.damage is second.damage is None
+    assert second.notes["setup"] == OTHER
+    assert "control was with a script when the recording began" in first.notes["simulated"]
+    assert "thread_model" in first.notes["scenario"]
+    for name in ("/needle/filter_state", "/camera/image_raw/compressed", "/scene"):
+        assert first.counts[name] > 0, name
+    assert 0.005 in [record.decode().twist.linear.x for record in first.records({"/operator/servo_cv"})]
+
+
+@pytest.mark.whole_graph
+def test_a_person_watches_a_bag():
+    async def use(url: str) -> None:
+        async with opened(url) as page:
+            await wait(page, lambda: not page.host["busy"] and page.graph["predicted"] and page.frames, "a prediction")
+            assert (page.host["mode"], page.host["can_pause"], page.host["can_record"]) == ("replay", True, False)
+            assert await page.ask(type="acquire_control") == ""
+            assert "nothing can be jogged" in await page.ask(type="bridge_action", action="arm")
+            assert "nothing can be jogged" in page.graph["filter"]["reason"]
+            assert await page.ask(type="pause", paused=True) == ""
+            await wait(page, lambda: page.graph["predicted"]["age"] > 0.5, "time to stand still")
+            still = page.graph["time"]
+            await wait(page, lambda: page.graph["predicted"]["age"] > 1.0, "time to stand still for longer")
+            assert page.graph["time"] == still
+            assert await page.ask(type="pause", paused=False) == ""
+            await wait(page, lambda: page.graph["time"] > still, "time to go on again")
+
+    with running("--replay", str(EXAMPLE)) as console:
+        asyncio.run(use(console.find(r"open (http://\S+)$")))
+        assert console.end() == 0
+
+
+@pytest.mark.whole_graph
+def test_a_graph_that_runs_is_joined_and_recorded(tmp_path: Path):
+    async def use(url: str) -> None:
+        async with opened(url) as page:
+            await wait(page, lambda: page.graph["bridge"] is not None, "the bridge")
+            assert (page.host["mode"], page.host["simulated"], page.host["can_pause"]) == ("graph", False, False)
+            assert await page.ask(type="acquire_control") == ""
+            assert "not started from the page" in await page.ask(type="select_setup", setup=OTHER)
+            assert await page.ask(type="record", recording=True) == ""
+            assert await page.ask(type="bridge_action", action="arm") == ""
+            await wait(page, lambda: page.graph["bridge"]["armed"], "the bridge to be armed")
+            assert await page.ask(type="bridge_action", action="stop") == ""
+            await wait(page, lambda: page.graph["bridge"]["emergency_stopped"], "the emergency stop")
+
+    with reserved_domain() as domain:
+        environment = graph_environment(domain)
+        arguments = ("-p", "coil_bridge:autostart:=active", "-p", "scene:=dish_35mm")
+        with (
+            NodeProcesses(("coil_bridge",), arguments, environment, tmp_path / "logs") as nodes,
+            running("--graph", "--record", str(tmp_path / "recordings"), ROS_DOMAIN_ID=str(domain)) as console,
+        ):
+            asyncio.run(use(console.find(r"open (http://\S+)$")))
+            nodes.check()
+            assert console.end() == 0
+            nodes.check()  # it is not ours to end
+    states = [record.decode() for record in Bag(next((tmp_path / "recordings").iterdir())).records({"/coils/state"})]
+    assert any(state.armed for state in states)
+    assert states[-1].emergency_stopped
+
+
+def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path):
+    for arguments, code, words in (
+        (["petri_36mm"], 2, "setup: got 'petri_36mm'"),
+        (["--port", "70000"], 2, "console.port: got 70000"),
+        (["--address", "0.0.0.0"], 2, "a token, as 0.0.0.0 can be reached"),
+        (["--replay", str(tmp_path / "nowhere")], 1, "does not exist"),
+    ):
+        assert main(["console", *arguments]) == code
+        errors = capsys.readouterr().err
+        assert words in errors
+        assert errors.count("\n") == 1
+
+
+def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
+    for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
+        monkeypatch.delitem(sys.modules, name)
+    jobs = {f"magnetosuture_thread.commands.{name}" for name in ("console", "live", "simulate")}
+    for name in [name for name in sys.modules if name in jobs or name.split(".")[0] == "rclpy"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    assert main(["console", "--port", "0"]) == 1
+    assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err

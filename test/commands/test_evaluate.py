@@ -1,0 +1,170 @@
+"""Evaluating bags: pages and table, whatever becomes of one of the bags."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from magnetosuture_thread import cli
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags, kind_of
+from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.interface import NEEDLE_POSE, PREDICTED_THREAD
+from test.bags.bags import copy_with_notes
+
+
+def broken(path: Path) -> Path:
+    """Make a bag of which nothing can be read."""
+    path.mkdir()
+    (path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    return path
+
+
+def test_a_bag_gets_a_page_and_a_row(tmp_path: Path, short_bag: Path):
+    (row,) = evaluate_bags([short_bag], tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"pull.html", "table.csv", "table.json"}
+    assert row["bag"] == "pull"
+    assert row["setup"] == "petri_35mm_polyamide"
+    assert "straight_pull" in str(row["simulated"])
+    assert (row["frames"], row["predicted"], row["problem"]) == (30, 28, "")
+    assert 0.0 < float(str(row["error_truth_mean_percent"])) < 1.0
+    assert 0.0 < float(str(row["error_seen_mean_percent"])) < 1.0
+    assert row["recorded_error_truth_frames"] == 0
+    assert json.loads((tmp_path / "out" / "table.json").read_text())["bags"] == [row]
+    page = (tmp_path / "out" / "pull.html").read_text()
+    assert "28 of 30" in page
+    assert page.count("data:image/jpeg;base64,") == 1
+    assert "Simulated camera frame at" in page
+
+
+def test_what_is_wrong_with_one_bag_is_in_its_row_and_ends_with_1(tmp_path: Path, short_bag: Path, capsys):
+    bags = [str(broken(tmp_path / "=x")), str(short_bag), str(shutil.copytree(short_bag, tmp_path / "again" / "pull"))]
+    output = tmp_path / "out"
+    assert cli.main(["evaluate", *bags, "--output", str(output), "--duration", "0.4", "--workers", "2"]) == 1
+    assert "=x: " in capsys.readouterr().out
+    rows = json.loads((output / "table.json").read_text())["bags"]
+    assert "nothing intact" in rows[0]["problem"]
+    assert [row["problem"] for row in rows[1:]] == ["", ""]
+    assert {path.name for path in output.glob("*.html")} == {"pull.html", "pull-2.html"}
+    with (output / "table.csv").open(newline="") as stream:
+        assert [row["bag"] for row in csv.DictReader(stream)] == ["'=x", "pull", "pull-2"]
+
+
+def test_a_table_for_duckdb_is_written_and_a_broken_pyarrow_loses_nothing(tmp_path: Path, short_bag: Path, monkeypatch):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    logged: list[str] = []
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", duration=0.4, log=logged.append)
+    assert [each["bag"] for each in parquet.read_table(tmp_path / "out" / "table.parquet").to_pylist()] == [row["bag"]]
+    (tmp_path / "pyarrow.py").write_text("raise ImportError('it is built for another NumPy')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "pyarrow")
+    evaluate_bags([short_bag], tmp_path / "other", duration=0.4, log=logged.append)
+    assert logged[-1] == "no table.parquet: pyarrow cannot be used: it is built for another NumPy"
+    assert sorted(path.name for path in (tmp_path / "other").iterdir()) == ["pull.html", "table.csv", "table.json"]
+
+
+def test_what_the_bag_itself_predicted_is_judged_beside(tmp_path: Path, short_bag: Path):
+    replay_offline(short_bag, tmp_path / "replay")
+    both = tmp_path / "both"
+    with BagWriter(both, {"setup": "petri_35mm_polyamide"}) as writer:
+        for bag, names in (
+            (Bag(short_bag), {"/camera/image_raw/compressed", "/ground_truth/thread"}),
+            (Bag(tmp_path / "replay" / "bag"), {NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded}),
+        ):
+            for name in names:
+                writer.add_topic(name, bag.topics[name])
+            for record in bag.records(names):
+                late = 20_000_000 if name in (NEEDLE_POSE.recorded, PREDICTED_THREAD.recorded) else 0
+                writer.write(record.topic, record.time + late, record.data)
+    (row,) = evaluate_bags([both], tmp_path / "out")
+    assert row["recorded_error_truth_frames"] == 28
+    assert row["recorded_error_truth_mean_percent"] == pytest.approx(row["error_truth_mean_percent"], abs=1e-9)
+    assert row["latency_frame_to_prediction_median_s"] == pytest.approx(0.02)
+    assert row["latency_command_to_currents_median_s"] is None
+    assert row["simulated"] == ""
+
+
+def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Path):
+    (row,) = evaluate_bags([short_bag], tmp_path / "out", against="seen", formulation="paper", duration=0.4)
+    assert (row["error_truth_frames"], row["formulation"]) == (0, "paper")
+    (row,) = evaluate_bags([short_bag], tmp_path / "no", source="poses")
+    assert "/needle/measured_cp" in str(row["problem"])
+
+
+def test_what_is_wrong_for_all_bags_is_said_at_once(tmp_path: Path, short_bag: Path):
+    for paths, output, options, error, words in (
+        ([short_bag], tmp_path / "out", {"setup_name": "none"}, ConfigurationError, "setup: got 'none'"),
+        ([short_bag], tmp_path, {}, BagError, "exists already"),
+        ([tmp_path], tmp_path / "out", {}, BagError, "holds no bags"),
+        ([tmp_path / "none"], tmp_path / "out", {}, BagError, "does not exist"),
+    ):
+        with pytest.raises(error, match=words):
+            evaluate_bags(paths, output, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def touched(*paths: Path) -> None:
+    """Make empty files, with their folders."""
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_bags_are_found_two_folders_down_each_once(tmp_path: Path):
+    touched(tmp_path / "b" / "b_0.mcap", tmp_path / "b" / "metadata.yaml", tmp_path / "c" / "d" / "one.db3")
+    touched(tmp_path / "c" / "e" / "x.mcap", tmp_path / "c" / "e" / "y.mcap", tmp_path / "c" / "f" / "g" / "deep.mcap")
+    touched(tmp_path / "s" / "s_0.mcap", tmp_path / "s" / "s_1.mcap", tmp_path / ".hidden" / "h.mcap")
+    found = [str(path.relative_to(tmp_path)) for path in find_bags([tmp_path / "b", tmp_path])]
+    assert found == ["b", "c/d", "c/e/x.mcap", "c/e/y.mcap", "s"]
+
+
+def test_trajectories_and_bags_are_not_mixed(tmp_path: Path):
+    touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
+    assert kind_of([tmp_path / "r"]) == kind_of([tmp_path / "r" / "a.npz"]) == "references"
+    assert kind_of([tmp_path / "b"]) == "bags"
+    with pytest.raises(ConfigurationError, match="bags alone, or reference trajectories alone"):
+        kind_of([tmp_path / "r", tmp_path / "b"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["b"], "--output: got None"),
+        (["b", "--output", "o", "--segments", "9"], "only for reference trajectories"),
+        (["r", "--workers", "2"], "only for bags"),
+        (["r", "--setup", "x"], "only for bags"),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch, arguments: list[str], words: str
+):
+    touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["evaluate", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_name_is_one_line_without_orders_to_the_terminal(tmp_path: Path, short_bag: Path):
+    said: list[str] = []
+    bag = shutil.copytree(short_bag, tmp_path / "a\n\x1b[31m[b]<i>")
+    (row,) = evaluate_bags([bag], tmp_path / "out", duration=0.3, log=said.append)
+    assert str(row["bag"]).isprintable()
+    assert str(row["path"]).isprintable()
+    assert (tmp_path / "out" / f"{row['bag']}.html").exists()
+
+
+def test_an_unverified_bag_says_so_in_table_page_and_log(tmp_path: Path, short_bag: Path):
+    copy_with_notes(short_bag, tmp_path / "bag", unverified="salvaged without checksums")
+    said: list[str] = []
+    (row,) = evaluate_bags([tmp_path / "bag"], tmp_path / "out", duration=0.3, log=said.append)
+    assert row["unverified"] == "salvaged without checksums"
+    assert "salvaged without checksums" in (tmp_path / "out" / "table.csv").read_text()
+    assert "Unverified bag:" in (tmp_path / "out" / "bag.html").read_text()
+    assert any("unverified: salvaged" in line for line in said)

@@ -1,0 +1,286 @@
+"""Recorded experiments without a graph: what is observed in a bag, and what is predicted and written of it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.vision.frames import distorted, lens_with
+from magnetosuture_thread import interface
+from magnetosuture_thread.bags.message_types import MESSAGES as BUILDER
+from magnetosuture_thread.bags.message_types import make, typestore
+from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.observations import ObservationReader, predictions
+from magnetosuture_thread.commands.render import render_bag
+from magnetosuture_thread.commands.replay import replay_offline
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.messages.packing import packed_pose, packed_wrench
+from magnetosuture_thread.messages.reading import stamp_of
+from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.scene import Scene, SceneShape
+from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.vision.images import decode_image
+from test.bags.bags import changed
+
+SETUP = read_setup("petri_35mm_polyamide")
+SCENE, POSE, FRAME = interface.SCENE, interface.NEEDLE_POSE.recorded, interface.COMPRESSED_IMAGE.recorded
+MEASURED, TRUTH = interface.MEASURED_THREAD.recorded, interface.GROUND_TRUTH_THREAD.recorded
+LATE = round(1.9e9)  # ns; the last three messages of each topic are later
+
+
+@pytest.fixture(scope="module")
+def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceTrajectory) -> Path:
+    """Return a bag of poses of one second."""
+    path = tmp_path_factory.mktemp("poses") / "pull"
+    render_bag(straight_pull, SETUP, path, duration=1.0, pose_noise=1e-5)
+    return path
+
+
+def observed(bag: Path, **selection: Any) -> ObservationReader:
+    """Return what is observed in a bag."""
+    return ObservationReader(Recording(Bag(bag)), SETUP, **selection)
+
+
+def without(bag: Path, folder: Path, *topics: str) -> Path:
+    """Write a bag again without some topics."""
+    return changed(bag, folder, lambda old, message: None if old.topic in topics else message)
+
+
+def restamped(bag: Path, folder: Path, stamp: Callable[[RecordedMessage, int], int]) -> Path:
+    """Write a bag again with other stamps in its messages."""
+
+    def change(old: RecordedMessage, message: Any) -> Any:
+        time = message.header.stamp
+        time.sec, time.nanosec = divmod(stamp(old, stamp_of(old)), 10**9)
+        return message
+
+    return changed(bag, folder, change)
+
+
+def with_changes(bag: Path, folder: Path, *changes: tuple[float, Scene, str], material: str = "") -> Path:
+    """Write a bag again with scenes at times [s], each with its version or another, and a material at the last time."""
+    source = Bag(bag)
+    with BagWriter(folder, source.notes) as writer:
+        added = {SCENE.recorded: SCENE.type_name, interface.MATERIAL.recorded: interface.MATERIAL.type_name}
+        for topic, type_name in {**source.topics, **added}.items():
+            writer.add_topic(topic, type_name)
+        for record in source.records(set(source.topics)):
+            writer.write(record.topic, record.time, record.data)
+        for time, scene, version in changes:
+            stamp = round(time * 1e9)
+            message: Any = typestore().deserialize_cdr(packed_scene(stamp, scene), SCENE.type_name)
+            message.version = version or message.version
+            writer.write_message(SCENE.recorded, stamp, message)
+        if material:
+            numbers = dict.fromkeys(("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"), 0.0)
+            empty = {"rest_curvature": np.empty(0), "attachment": "", "attachment_offset": np.empty(0)}
+            header = BUILDER.header(stamp, "dish")
+            thread = make(interface.MATERIAL.type_name, header=header, name=material, **numbers, **empty)
+            writer.write_message(interface.MATERIAL.recorded, stamp, thread)
+    return folder
+
+
+def test_observations_of_poses_hold_what_was_recorded(pose_bag: Path, straight_pull: ReferenceTrajectory):
+    shares: list[float] = []
+    found = observed(pose_bag, progress=shares.append)
+    seen = list(found)
+    assert (found.source, found.count, found.found, found.refused) == ("poses", 30, 30, {})
+    assert [each.stamp for each in seen] == [round((1.0 + k / 30.0) * 1e9) for k in range(30)]
+    for k, observation in enumerate(seen):
+        tail, _, thread = straight_pull.at(k / 30.0)
+        assert np.linalg.norm(observation.tail - tail) < 6e-5
+        assert np.linalg.norm(observation.heading) == pytest.approx(1.0, abs=1e-12)
+        assert observation.measured.shape == (64, 2)
+        assert np.array_equal(observation.measured[0], observation.tail)
+        assert np.abs(observation.measured[-1] - thread[-1]).max() < 6e-5
+        assert observation.ground_truth.shape == (51, 2)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_observations_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_pull: ReferenceTrajectory):
+    found = observed(short_bag)
+    seen = list(found)
+    assert (found.source, found.count, found.found) == ("camera", 30, 28)
+    assert found.refused == {"no needle for sure": 2}
+    assert [bool(each.reason) for each in seen] == [True] * 2 + [False] * 28
+    for k, observation in enumerate(seen[2:], 2):
+        assert np.linalg.norm(observation.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
+        assert (observation.measured.shape, observation.ground_truth.shape) == ((64, 2), (51, 2))
+        assert observation.processing > 0.0
+
+
+def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_path: Path):
+    lens, bend = lens_with(-0.05, (640, 480)), distorted(-0.05)
+    view = SETUP.rig.camera(SETUP.scene).view
+
+    def through_lens(told: bool, old: RecordedMessage, message: Any) -> Any:
+        if old.topic == interface.CAMERA_INFO.recorded:
+            message.k, message.d = lens.matrix.ravel(), lens.coefficients if told else np.zeros(5)
+        elif old.topic == FRAME:
+            message.data = cv2.imencode(".png", bend(decode_image(message.data), view))[1].ravel()
+        return message
+
+    def tails(bag: Path) -> dict[int, np.ndarray]:
+        return {each.stamp: each.tail for each in observed(bag, duration=0.3) if not each.reason}
+
+    plain, errors = tails(short_bag), []
+    for told in (True, False):
+        found = tails(changed(short_bag, tmp_path / f"{told}", partial(through_lens, told)))
+        assert len(found) >= len(plain) - 1  # The first frame comes before its camera_info.
+        errors.append(max(float(np.linalg.norm(tail - plain[stamp])) for stamp, tail in found.items()))
+    assert errors[0] < 5e-5
+    assert errors[1] > 2.0 * errors[0]
+
+
+def test_what_cannot_be_replayed_is_refused_and_nothing_is_left(pose_bag: Path, tmp_path: Path):
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    blind = without(pose_bag, tmp_path / "blind", POSE, MEASURED, interface.NEEDLE_COMMAND.recorded)
+    unseen = without(pose_bag, tmp_path / "unseen", MEASURED)
+    for bag, selection, words in (
+        (pose_bag, {"source": "camera"}, "camera/image_raw/compressed"),
+        (blind, {}, "has no messages on"),
+        (blind, {"source": "poses"}, "has no messages on"),
+        (tmp_path / "empty.mcap", {}, r"empty\.mcap"),
+        (pose_bag, {"start": 7.0}, "asked to start at 7 s"),
+        (unseen, {}, "30 of 30 poses had a needle; waiting for the thread to be seen"),
+    ):
+        with pytest.raises(BagError, match=words):
+            replay_offline(bag, tmp_path / "out", **selection)
+    assert not (tmp_path / "out").exists()
+    steps = list(predictions(observed(unseen), replace(SETUP.model, initial_shape="straight"), SETUP.scene))
+    assert [step.result.prediction is not None for step in steps] == [True] * 30
+
+
+@pytest.mark.parametrize("topic", [POSE, MEASURED])
+def test_millimetres_are_noticed(pose_bag: Path, tmp_path: Path, topic: str):
+    def millimetres(old: RecordedMessage, message: Any) -> Any:
+        if old.topic == topic:
+            for pose in getattr(message, "poses", None) or [message.pose]:
+                pose.pose.position.x *= 1e3
+        return message
+
+    with pytest.raises(BagError, match=rf"{topic} .*the dish is 0\.035 m wide; are these millimetres"):
+        replay_offline(changed(pose_bag, tmp_path / "bag", millimetres), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_runs_write_the_same_bag(pose_bag: Path, tmp_path: Path):
+    summary = replay_offline(pose_bag, tmp_path / "a")
+    assert (summary.frames, summary.tracked, summary.predicted, summary.source) == (30, 30, 30, "poses")
+    assert summary.error_truth is not None
+    assert (summary.error_truth["count"], summary.error_truth["maximum"] < 1.0) == (30, True)
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "replay", "--offline", str(pose_bag), "--output", "b"]
+    shown = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert shown.returncode == 0, shown.stderr
+    assert "times as fast as recorded" in shown.stdout
+    for name in ("bag_0.mcap", "metadata.yaml"):
+        assert (tmp_path / "a" / "bag" / name).read_bytes() == (tmp_path / "b" / "bag" / name).read_bytes()
+    assert json.loads((tmp_path / "a" / "summary.json").read_text())["predicted"] == 30
+    assert cv2.imread(str(tmp_path / "a" / "summary.png")) is not None
+    made = (interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS)
+    topics = [POSE, MEASURED, *(channel.recorded for channel in made)]
+    assert +Bag(tmp_path / "a" / "bag").counts == {SCENE.recorded: 1, **dict.fromkeys(topics, 30)}
+
+
+def test_stamps_that_go_back_are_refused_and_a_time_that_goes_back_by_more_begins_anew(
+    pose_bag: Path, short_bag: Path, tmp_path: Path
+):
+    def back(old: RecordedMessage, stamp: int) -> int:
+        return stamp - 500_000_000 * (old.topic in (POSE, FRAME) and stamp > LATE)
+
+    for bag, tracked in ((pose_bag, 30), (short_bag, 26)):
+        summary = replay_offline(restamped(bag, tmp_path / f"back{tracked}", back), tmp_path / f"out{tracked}")
+        assert (summary.frames, summary.tracked, summary.predicted) == (30, tracked, min(tracked, 28))
+        assert summary.refused["a stamp not newer than the last"] == 2
+    anew = restamped(pose_bag, tmp_path / "anew", lambda old, stamp: stamp + 3 * 10**9 * (stamp < 1.5e9))
+    summary = replay_offline(anew, tmp_path / "out")
+    assert summary.predicted == 30
+    assert summary.error_seen is not None
+    assert summary.error_seen["maximum"] < 1.0
+
+
+def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):
+    def torn(old: RecordedMessage, message: Any) -> Any:
+        if old.topic == FRAME and stamp_of(old) > LATE:
+            message.data = message.data[:7]
+        if old.topic == POSE and stamp_of(old) > LATE:
+            message.pose.pose.orientation.w = 3.0
+        return message
+
+    summary = replay_offline(changed(short_bag, tmp_path / "torn", torn), tmp_path / "out")
+    assert summary.refused == {"no needle for sure": 2, "a broken picture": 2}
+    summary = replay_offline(changed(pose_bag, tmp_path / "bent", torn), tmp_path / "out2")
+    assert (summary.tracked, summary.refused) == (28, {"a pose that is none": 2})
+
+
+def test_a_damaged_bag_is_played_as_far_as_it_is_intact(short_bag: Path, tmp_path: Path):
+    whole = next(short_bag.glob("*.mcap")).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    said: list[str] = []
+    summary = replay_offline(tmp_path / "cut.mcap", tmp_path / "out", log=said.append)
+    assert 0 < summary.predicted < 28
+    assert summary.damage == str(Bag(tmp_path / "cut.mcap").damage)
+    assert any(summary.damage in line for line in said)
+
+
+def test_tracker_follows_a_recorded_scene(short_bag: Path, tmp_path: Path):
+    wider = replace(SETUP.scene, dish=replace(SETUP.scene.dish, diameter=0.07))
+    bag = with_changes(short_bag, tmp_path / "wider", (1.39, wider, ""))
+    for start, found in ((0.0, 12), (0.5, 0)):
+        # In a dish of twice the diameter, what was the needle is twice as long.
+        tracked = [observation.found for observation in observed(bag, start=start)]
+        assert sum(tracked) == sum(tracked[:found]) >= found - 2
+
+
+def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_path: Path):
+    scene, too_fine = (
+        SETUP.scene.add(SceneShape("post", "instrument", Disc((0.0, 0.006), radius))) for radius in (2e-3, 1e-5)
+    )
+    changes = ((1.39, scene, ""), (1.5, scene, "f" * 16), (1.61, too_fine, ""))
+    bag = with_changes(pose_bag, tmp_path / "told", *changes, material="silk_6_0")
+    for start, first in ((0.0, 12), (0.5, 0)):
+        seen = observed(bag, start=start)
+        steps = list(predictions(seen, SETUP.model, SETUP.scene))
+        assert [step.scene for step in steps] == [SETUP.scene] * first + [scene] * (len(steps) - first)
+        assert [step.result.scene_version for step in steps] == [step.scene.version for step in steps if step.scene]
+        assert {step.settings.material for step in steps} == {SETUP.model.material, "silk_6_0"}
+        assert steps[-1].settings.material == "silk_6_0"
+        assert all(step.result.prediction is not None for step in steps)
+        assert sum(seen.refused.values()) == 2
+    replay_offline(bag, tmp_path / "again")
+    said = [record.decode().version for record in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
+    assert said[:2] == [SETUP.scene.version, scene.version]  # so that what comes of it can be replayed in its turn
+
+
+def test_the_true_pull_comes_with_the_pose_of_its_stamp(tmp_path: Path):
+    """Of the second the pull is not finite, the third's is of another frame, and the fourth has none."""
+    pull = interface.GROUND_TRUTH_PULL
+    with BagWriter(tmp_path / "bag", {}) as bag:
+        for channel in (interface.NEEDLE_POSE, pull):
+            bag.add_topic(channel.recorded, channel.type_name)
+        for k in range(4):
+            stamp = (k + 1) * 10**8
+            bag.write(POSE, stamp, packed_pose(stamp, np.zeros(2), np.array([1.0, 0.0])))
+            force = packed_wrench(stamp, np.array([1e-6 * k, np.nan if k == 1 else -2e-6]), 3e-9)
+            if k < 3:
+                bag.write(pull.recorded, stamp, force.replace(b"dish", b"else") if k == 2 else force)
+    reader = observed(tmp_path / "bag")
+    first, *others = reader
+    assert first.true_pull == pytest.approx([0.0, -2e-6])
+    assert [len(each.true_pull) for each in others] == [0, 0, 0]
+    assert any("thread_pull" in why for why in reader.refused)

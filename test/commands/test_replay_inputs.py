@@ -1,0 +1,127 @@
+"""What a bag is replayed with: its own scene and setup, or those that are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from magnetosuture_thread.bags.message_types import make, typestore
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.live import GraphInput
+from magnetosuture_thread.commands.recorded import SETUP_NOTE, open_bag
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.interface import COMPRESSED_IMAGE, IMAGE, SCENE
+from magnetosuture_thread.messages.scene import packed_scene, parse_scene_message
+from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from magnetosuture_thread.vision.images import decode_image
+
+POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
+OLD = "vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\nthread_model: {ros__parameters: {length: 0.019}}\n"
+
+
+@pytest.fixture
+def copied(short_bag: Path, tmp_path: Path):
+    """Makes a copy of a short bag with other notes, and with scenes told at times into it [s] in place of its own."""
+
+    def copy(scenes: Sequence[tuple[float, Scene]], version: str = "", **notes: str) -> Path:
+        bag, path = Bag(short_bag), tmp_path / "copy"
+        with BagWriter(path, notes) as writer:
+            for topic in bag.topics:
+                writer.add_topic(topic, next(iter(bag.records({topic}))).type_name)
+            records = [(r.time, r.topic, r.data) for r in bag.records(set(bag.topics) - {SCENE.recorded})]
+            waiting = [(bag.start + round(1e9 * time), scene) for time, scene in scenes]
+            for time, topic, data in records:
+                while waiting and waiting[0][0] <= time:
+                    at, scene = waiting.pop(0)
+                    message: Any = typestore().deserialize_cdr(packed_scene(at, scene), SCENE.type_name)
+                    message.version = version or message.version
+                    writer.write_message(SCENE.recorded, at, message)
+                writer.write(topic, time, data)
+        return path
+
+    return copy
+
+
+def given(path: Path, setup_name: str = "", start: float = 0.0):
+    """Open a bag."""
+    return open_bag(path, print, setup_name=setup_name, start=start)
+
+
+def test_the_bags_own_scene_counts_whatever_the_setup_says(copied):
+    path = copied([(0.0, POST)], setup="petri_35mm_polyamide")
+    with given(path) as found:
+        assert found.setup.scene == POST
+    with given(path, setup_name="petri_150mm_silk") as found:
+        assert found.setup.scene == POST
+        assert found.setup.name == "petri_150mm_silk"
+
+
+def test_a_bag_without_a_scene_has_that_of_its_setup(copied):
+    with given(copied([], setup="petri_35mm_polyamide_post")) as found:
+        assert found.setup.scene == read_scene("dish_35mm_post")
+
+
+def test_the_scene_is_the_one_that_was_in_force_at_the_start(copied):
+    path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
+    for start, scene in ((0.0, Scene()), (0.3, Scene()), (0.6, POST)):
+        with given(path, start=start) as found:
+            assert found.setup.scene == scene
+
+
+def test_a_damaged_scene_is_refused(copied):
+    with pytest.raises(BagError, match=r"scene\.version: got '0123', expected"), given(copied([(0.0, POST)], "0123")):
+        pass
+
+
+def test_a_setup_of_an_earlier_version_is_refused_with_what_to_do(copied):
+    path = copied([], **{"setup": "mine", SETUP_NOTE: OLD})
+    words = r"the bag's own setup: got 'vision_tracker\.dish_diameter', expected .*; name a setup by --setup"
+    with pytest.raises(ConfigurationError, match=words), given(path):
+        pass
+    with given(path, setup_name="petri_35mm_polyamide") as found:
+        assert found.setup.name == "petri_35mm_polyamide"
+
+
+def test_the_scene_is_played_first_and_nodes_begin_in_it(copied, tmp_path: Path):
+    path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
+    with given(path, start=0.5) as found:
+        playing = GraphInput(found)
+        first, *rest = playing.records()
+        assert first.topic == SCENE.recorded
+        assert first.time == found.begin <= rest[0].time
+        assert parse_scene_message(first.decode()) == POST
+        assert SCENE in playing.channels
+        arguments = playing.arguments(tmp_path / "qos.yaml")
+        assert f"scene:={tmp_path / 'scene.yaml'}" in arguments
+        assert read_scene(str(tmp_path / "scene.yaml")) == POST
+
+
+def test_a_scene_that_changes_on_the_way_is_played_when_it_does(copied):
+    path = copied([(0.0, Scene()), (0.4, POST)], setup="petri_35mm_polyamide")
+    with given(path) as found:
+        told = [record for record in GraphInput(found).records() if record.topic == SCENE.recorded]
+        assert [parse_scene_message(record.decode()) for record in told] == [Scene(), POST]
+        assert told[1].time == pytest.approx(found.begin + 4e8, abs=1e8)
+
+
+def test_raw_frames_are_played_as_such_whatever_the_setup_says(short_bag: Path, tmp_path: Path):
+    """A bag that names no setup gets the default."""
+    with BagWriter(tmp_path / "raw") as writer:
+        writer.add_topic(IMAGE.recorded, IMAGE.type_name)
+        for record in Bag(short_bag).records({COMPRESSED_IMAGE.recorded}):
+            message = record.decode()
+            pixels = decode_image(message.data)
+            size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": 3 * pixels.shape[1]}
+            image = {"header": message.header, "encoding": "bgr8", "is_bigendian": 0, "data": pixels.ravel(), **size}
+            writer.write_message(IMAGE.recorded, record.time, make(IMAGE.type_name, **image))
+    logged: list[str] = []
+    with open_bag(tmp_path / "raw", logged.append) as found:
+        arguments = GraphInput(found).arguments(tmp_path / "qos.yaml")
+        assert "vision_tracker:image_transport:=raw" in arguments
+        assert GraphInput(found).channels == [SCENE, IMAGE]
+    assert any(line.startswith("the bag names no setup; taking petri_35mm_polyamide") for line in logged)

@@ -1,0 +1,152 @@
+"""The job that tracks frames, and the one that calibrates the camera."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from benchmarks.vision.measurements import frame_of
+from magnetosuture_thread import cli
+from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.commands.calibrate_camera import calibrate_camera
+from magnetosuture_thread.commands.track import track
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.vision.look import State
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from test.bags.bags import copy_with_notes
+
+SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
+KEYS = {
+    *("file", "status", "reason", "warning", "tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m"),
+    *("needle_length_m", "pieces", "complete", "confidence", "time_s", "stamp_s"),
+}
+
+
+def error_of(capsys: pytest.CaptureFixture[str]) -> str:
+    """Return what went to stderr, which must be one line."""
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    return text
+
+
+def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for index in (0, 3):
+        shutil.copy(SAMPLES / f"frame_0{index}.png", folder)
+    (folder / "frame_01.png").write_bytes(b"no picture")
+    (folder / "notes.txt").write_text("not a frame")
+    cv2.imwrite(str(folder / "frame_09.jpg"), np.full((480, 640, 3), 90, np.uint8))
+    file, overlay = tmp_path / "seen.json", tmp_path / "drawn"
+    given = ["--metres-per-pixel", "8e-5", "--centre", "322", "238", "--overlay", str(overlay)]
+    assert cli.main(["track", str(folder), "--json", str(file), *given]) == 0
+    rows = json.loads(file.read_text())
+    assert [row["file"] for row in rows] == ["frame_00.png", "frame_01.png", "frame_03.png", "frame_09.jpg"]
+    assert [row["status"] for row in rows] == ["tracked", "lost", "tracked", "lost"]
+    assert all(set(row) == KEYS for row in rows)
+    truth = json.loads((SAMPLES / "truth.json").read_text())["frames"]
+    np.testing.assert_allclose(rows[0]["tail_m"], np.array(truth[0]["tail_mm"]) * 1e-3, atol=5e-5)
+    assert rows[0]["heading_rad"] == pytest.approx(truth[0]["heading_rad"], abs=0.02)
+    assert len(rows[0]["thread_m"]) > 50
+    assert rows[0]["time_s"] > 0.0
+    assert rows[0]["reason"] is rows[0]["stamp_s"] is None
+    assert "a JPEG or PNG image" in rows[1]["reason"]
+    assert rows[1]["tail_m"] is rows[1]["heading_rad"] is rows[1]["tip_m"] is rows[1]["thread_m"] is None
+    assert sorted(picture.name for picture in overlay.iterdir()) == ["frame_00.png", "frame_03.png", "frame_09.png"]
+    assert "2 tracked, 2 lost" in capsys.readouterr().out
+
+
+def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
+    video = tmp_path / "seen.mp4"
+    seen = track([short_bag], VisionTrackerSettings(), Scene(), overlay=video)
+    assert [frame.track.state for frame in seen] == [State.SEARCHING] * 2 + [State.TRACKED] * 28
+    row = seen[5].to_json()
+    assert row["file"].startswith("/camera/image_raw/compressed ")
+    assert row["stamp_s"] == pytest.approx(1.0 + 5 / 30.0, abs=1e-6)
+    np.testing.assert_allclose(row["tail_m"], [0.003 + 0.003 * 5 / 30.0, 0.002], atol=8e-5)
+    assert video.stat().st_size > 1000
+    capture = cv2.VideoCapture(str(video))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(30.0, abs=0.01)
+    capture.release()
+
+
+def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file.mcap").write_bytes(b"")
+    cases = {"nowhere": "does not exist", "empty": "holds no pictures", "file.mcap": "is empty, expected an mcap file"}
+    for name, words in cases.items():
+        assert cli.main(["track", str(tmp_path / name)]) == 1
+        assert words in error_of(capsys)
+
+
+def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    file = tmp_path / "camera.yaml"
+    assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
+    assert "5 frames" in capsys.readouterr().out
+    given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
+    assert cli.main(["track", str(SAMPLES), *given]) == 0
+    assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
+
+
+def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    case, image = frame_of("distortion", 2, 31)
+    assert case.lens is not None
+    values = {"rows": 3, "cols": 3, "data": case.lens.matrix.ravel().tolist()}
+    coefficients = {"rows": 1, "cols": 5, "data": case.lens.coefficients.tolist()}
+    info = {"image_width": case.size[0], "image_height": case.size[1], "camera_matrix": values}
+    info |= {"distortion_model": case.lens.model, "distortion_coefficients": coefficients}
+    frame, lens, output = tmp_path / "frame.png", tmp_path / "lens.yaml", tmp_path / "camera.yaml"
+    cv2.imwrite(str(frame), image)
+    lens.write_text(yaml.safe_dump(info))
+    straight = calibrate_camera([frame], 0.035, output, camera_info=lens).view
+    assert straight.metres_per_pixel == pytest.approx(case.view.metres_per_pixel, rel=3e-3)
+    assert calibrate_camera([frame], 0.035, output).view.metres_per_pixel != pytest.approx(
+        case.view.metres_per_pixel, rel=6e-3
+    )
+    lens.write_text(yaml.safe_dump(info | {"image_width": 1280}))
+    given = ["--dish-diameter", "0.035", "--output", str(output), "--camera-info", str(lens)]
+    assert cli.main(["calibrate-camera", str(frame), *given]) == 1
+    assert "camera_info.width" in error_of(capsys)
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_bags_of_other_recorders_are_followed_and_what_is_wrong_with_them_is_said(
+    plugin: StoragePlugin, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    kind = "sensor_msgs/msg/CompressedImage"
+    picture = np.frombuffer((SAMPLES / "frame_00.png").read_bytes(), np.uint8)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as bag:
+        connection = bag.add_connection("/cam", kind, typestore=typestore())
+        for index in range(3):
+            time = typestore().types["builtin_interfaces/msg/Time"](index, 0)
+            header = typestore().types["std_msgs/msg/Header"](time, "camera")
+            message = typestore().types[kind](header, "png", picture)
+            bag.write(connection, index * 10**9, bytes(typestore().serialize_cdr(message, kind)))
+    given = [str(tmp_path / "bag"), "--remap", "/cam:=/camera/image_raw"]
+    view = ["--metres-per-pixel", "8e-5", "--centre", "322", "238"]
+    assert cli.main(["track", *given, *view]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "2 searching, 1 tracked" in said
+    assert "has no checksums" in said
+    output = str(tmp_path / "camera.yaml")
+    assert cli.main(["calibrate-camera", *given, "--dish-diameter", "0.035", "--output", output]) == 0
+    assert "has no checksums" in " ".join(capsys.readouterr().out.split())
+
+
+def test_an_unverified_bag_says_so_in_the_files_made_from_it(short_bag: Path, tmp_path: Path):
+    copy_with_notes(short_bag, tmp_path / "bag", unverified="salvaged without checksums")
+    file, camera = tmp_path / "seen.json", tmp_path / "camera.yaml"
+    assert cli.main(["track", str(tmp_path / "bag"), "--json", str(file)]) == 0
+    assert {row["unverified"] for row in json.loads(file.read_text())} == {"salvaged without checksums"}
+    given = [str(tmp_path / "bag"), "--dish-diameter", "0.035", "--output", str(camera)]
+    assert cli.main(["calibrate-camera", *given]) == 0
+    assert camera.read_text().startswith("# UNVERIFIED: salvaged without checksums\n/**")

@@ -1,0 +1,161 @@
+"""Node programs as processes, forked from one that has imported all of them: to import takes each of them seconds."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from magnetosuture_thread.nodes import program
+
+TIMEOUT = 90.0  # s for a process on a busy machine
+
+
+class Program:
+    """A node that runs as its program.
+
+    Args:
+        pid: of the process.
+        log: file that gets what it prints; its exit code is beside it.
+    """
+
+    def __init__(self, pid: int, log: Path) -> None:
+        self.pid, self._log, self._code = pid, log, log.with_suffix(".code")
+
+    @property
+    def output(self) -> str:
+        """Return what it has printed."""
+        return self._log.read_text(errors="replace")
+
+    @property
+    def errors(self) -> list[str]:
+        """Return the lines that say why it ended."""
+        return [line for line in self.output.splitlines() if line.startswith("error: ")]
+
+    def send_signal(self, which: signal.Signals) -> None:
+        """Send a signal."""
+        os.kill(self.pid, which)
+
+    def poll(self) -> int | None:
+        """Return the exit code, None while it runs."""
+        return int(self._code.read_text()) if self._code.exists() else None
+
+    def wait(self, timeout: float = TIMEOUT) -> int:
+        """Return the exit code once it has ended."""
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            assert time.monotonic() < deadline, f"waited {timeout:g} s for the end: {self.output}"
+            time.sleep(0.005)
+        return code
+
+    def wait_for(self, words: str, timeout: float = TIMEOUT) -> None:
+        """Wait until it has printed something."""
+        deadline = time.monotonic() + timeout
+        while words not in self.output:
+            assert self.poll() is None, self.output
+            assert time.monotonic() < deadline, f"waited {timeout:g} s for {words!r}: {self.output}"
+            time.sleep(0.005)
+
+    def kill(self) -> None:
+        """Kill it, as a crash would, if it has not ended."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+            self.wait()
+
+
+class Programs:
+    """Starts node programs.
+
+    Args:
+        folder: for what they print.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._numbers = folder, itertools.count()
+        self._programs: list[Program] = []
+        command = [sys.executable, __file__]
+        self._server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def start(self, name: str, *arguments: str, environment: Mapping[str, str]) -> Program:
+        """Start the program of a name with ROS arguments."""
+        assert self._server.stdin is not None
+        assert self._server.stdout is not None
+        log = self._folder / f"{next(self._numbers)}.log"
+        log.touch()
+        argv = [name, "--ros-args", *arguments]
+        self._server.stdin.write(json.dumps({"argv": argv, "environment": dict(environment), "log": str(log)}) + "\n")
+        self._server.stdin.flush()
+        started = Program(int(self._server.stdout.readline()), log)
+        self._programs.append(started)
+        return started
+
+    def kill_all(self) -> None:
+        """Kill those that still run, at the end of a test."""
+        for each in self._programs:
+            each.kill()
+        self._programs.clear()
+
+    def close(self) -> None:
+        """End the process that forks them."""
+        with self._server:  # which closes its pipes
+            pass
+
+
+def serve() -> None:
+    """Fork a program for each line on standard input, and note exit codes."""
+    for name in (*program.MAKERS, "console", "run"):
+        importlib.import_module(f"magnetosuture_thread.nodes.{name}")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a person who ends the tests
+    codes: dict[int, Path] = {}
+    ends = False
+    while codes or not ends:
+        if not ends and select.select([sys.stdin], [], [], 0.0 if codes else 0.2)[0]:
+            line = sys.stdin.readline()
+            ends = not line
+            if line:
+                given = json.loads(line)
+                pid = os.fork()
+                if not pid:
+                    run(given)
+                codes[pid] = Path(given["log"]).with_suffix(".code")
+                print(pid, flush=True)
+        for pid in list(codes):
+            done, status = os.waitpid(pid, os.WNOHANG)
+            if done:
+                path = codes.pop(pid)
+                path.with_suffix(".new").write_text(str(os.waitstatus_to_exitcode(status)))
+                path.with_suffix(".new").rename(path)
+        time.sleep(0.005)
+
+
+def run(given: dict[str, object]) -> None:
+    """Become a program."""
+    os.environ.clear()
+    os.environ.update(given["environment"])  # type: ignore[call-overload]
+    log = os.open(str(given["log"]), os.O_WRONLY | os.O_APPEND)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.argv = list(given["argv"])  # type: ignore[call-overload]
+    code = 1
+    try:
+        code = program.main()
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    serve()
