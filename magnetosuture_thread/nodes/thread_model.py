@@ -28,7 +28,7 @@ from magnetosuture_thread.thread_model.session import WAITING, PredictionResult,
 from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings, parse_material
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.vision.look import Track
+    from magnetosuture_thread.vision.tracker import Track
 
 
 class ThreadModelNode(StandbyNode[ThreadModelSettings]):

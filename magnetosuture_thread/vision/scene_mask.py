@@ -59,7 +59,8 @@ class SceneMask:
 
     def solid(self, size: tuple[int, int], tolerance_px: float) -> Mask:
         """Return where neither needle nor thread can be by a tolerance, 255 there, in a mask of a smaller size."""
-        return cv2.compare(cv2.resize(self.depth, size, interpolation=cv2.INTER_AREA), tolerance_px, cv2.CMP_GT)
+        depth = cv2.resize(self.depth, size, interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.compare(depth, tolerance_px, cv2.CMP_GT), dtype=np.uint8)
 
     @property
     def band_px(self) -> float:

@@ -436,11 +436,10 @@ class VisionTracker:
     ) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last = reader.dish.view, self._last
-        for whole in (False, True):
-            box, toward = None, None
-            if not whole:
-                if last is None:
-                    continue
+        for whole in (False, True) if last is not None else (True,):
+            box: tuple[int, int, int, int] | None = None
+            toward: np.ndarray | None = None
+            if last is not None and not whole:
                 box, (_, angle) = self._region(image, view, time), last.at(time)
                 toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
             picture = reader.picture(image, box)

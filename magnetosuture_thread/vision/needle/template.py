@@ -263,7 +263,9 @@ def _across(own, aside, share, slope):
         slope[column] = slope[last - column] = STEEPNESS * (one * (1.0 - one) + other * (1.0 - other))
 
 
-def drawn_needle(along: NDArray, aside: NDArray, length: float, half: float, bloom: float, thin: float) -> NDArray:
+def drawn_needle(
+    along: np.ndarray, aside: np.ndarray, length: float, half: float, bloom: float, thin: float
+) -> np.ndarray:
     """Return the share of steel of a drawn needle at places along and aside of its axis, shape (m, n)."""
     drawn, wider, longer = np.empty((3, len(along), len(aside)))
     _draw_needle(along, aside, length, half, bloom, thin, drawn, wider, longer)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.images import Gray, middle, sample, shrunk
+from magnetosuture_thread.vision.images import middle, sample, shrunk
 
 STEP_PX = 2.0  # of the walk
 AHEAD = 9  # steps looked ahead, of which five count in full
@@ -41,7 +41,7 @@ class Ridge(NamedTuple):
     scale: int = 1
 
 
-def black_hat(gray: Gray, hidden: Gray, scale: int) -> Ridge:
+def black_hat(gray: np.ndarray, hidden: np.ndarray, scale: int) -> Ridge:
     """Return how much darker an image is than the brightest background within a few pixels.
 
     An edge has no black-hat, so that shadows, covers and the rim are no thread.
@@ -59,7 +59,7 @@ def black_hat(gray: Gray, hidden: Gray, scale: int) -> Ridge:
     return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise), scale)
 
 
-def smoothed(gray: Gray) -> Gray:
+def smoothed(gray: np.ndarray) -> np.ndarray:
     """Return an image smoothed as wide as the thinnest thread looks."""
     return np.asarray(cv2.GaussianBlur(gray, (5, 5), 0.7))
 
