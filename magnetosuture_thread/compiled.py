@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import codegen, compiler, compiler_machinery, event, typed_passes
+from numba.core import event
 
 PACKAGE = Path(__file__).parent
 COMPILED_MARK = b"magnetosuture_thread.compiled"
@@ -20,105 +20,50 @@ _IMPORT = re.compile(rb"^\s*(?:from|import) magnetosuture_thread\.([\w.]+)", re.
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+
 # Said of every function, as numba takes it over from whatever calls one first where it is not said.
 # Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True}
-# Of numba, without types.
-_EVENTS = cast(Any, event)
-_CodeLibrary, _CompilerBase, _Lowering = (
-    cast(Any, each) for each in (codegen.JITCodeLibrary, compiler.CompilerBase, typed_passes.NativeLowering)
-)
-_passes, _register_pass = cast(Any, compiler.DefaultPassBuilder), cast(Any, compiler_machinery.register_pass)
-
+_COUNTED: dict[str, Any] = {"_nrt": True, "no_cfunc_wrapper": True}
+_UNCOUNTED: dict[str, Any] = {"_nrt": False, "no_cfunc_wrapper": True}
+_INNER: dict[str, Any] = {**_UNCOUNTED, "no_cpython_wrapper": True}
+_EVENTS = cast(Any, event)  # without types
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
-
-
-class _LinkedLibrary(_CodeLibrary):  # type: ignore[misc]
-    """Code of a function that another one calls: optimised and assembled as a part of the one called from Python.
-
-    numba optimises and assembles each function by itself, then again in each that calls it, and so on: in a tree of
-    calls four deep all code four times.
-    """
-
-    def finalize(self) -> None:
-        """Link the code of what the function calls, and leave it as it is."""
-        for library in dict.fromkeys(self._linking_libraries):
-            self._reload_init.update(library._reload_init)
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
-        self._finalized = True
-
-
-@_register_pass(mutates_CFG=True, analysis_only=False)
-class _LinkedLowering(_Lowering):  # type: ignore[misc]
-    """Lower a function to code that is linked; see `_LinkedLibrary`."""
-
-    _name = "linked_lowering"
-
-    def run_pass(self, state: Any) -> bool:
-        """Lower, and make the function known to those that call it."""
-        state.library = library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
-        state.flags.no_compile = True
-        super().run_pass(state)
-        lowered = state["cr"]
-        # The key by which numba finds the code is a builtin function, and each has to have its own: nobody calls it.
-        key = [library].copy
-        state.targetctx.insert_user_function(key, lowered.fndesc, [library])
-        state["cr"] = lowered._replace(cfunc=key)
-        return True
-
-
-class _LinkedCompiler(_CompilerBase):  # type: ignore[misc]
-    """Compiles functions that only compiled code calls."""
-
-    def define_pipelines(self) -> list[Any]:
-        """Return numba's own passes with the last but one replaced."""
-        passes = _passes.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_LinkedLowering, _Lowering)
-        passes.passes = [each for each in passes.passes if each[0] is not _Lowering]
-        passes.finalize()
-        return [passes]
-
-
-def _linked(function: _Function, **options: Any) -> Any:
-    """Return a function for compiled code alone."""
-    chosen = {**_OPTIONS, "no_cpython_wrapper": True, **options}
-    return numba.njit(pipeline_class=_LinkedCompiler, **chosen)(function)
-
-
-def _kernel(function: _Function, counted: bool, **options: Any) -> _Function:
-    """Return a function for Python, whose code is cached, and for compiled code, that links it."""
-    called = numba.njit(cache=True, _nrt=counted, **_OPTIONS, **options)(function)
-    linked = _linked(function, _nrt=counted)
-    called.get_call_template, called.get_overload = linked.get_call_template, linked.get_overload
-    return cast(_Function, called)
 
 
 def compiled(function: _Function) -> _Function:
     """Compile a function with numba at its first call, with numpy's rules for division by zero.
 
-    The result is cached beside the source file, so that only the first start of a node on a machine compiles. What
-    only compiled code calls has neither an entry from Python nor a cache of its own.
+    The result is cached beside the source file, so that only the first start of a node on a machine compiles.
     """
-    return _kernel(function, True)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_COUNTED)(function))
 
 
 def compiled_inline(function: _Function) -> _Function:
-    """Compile a function into each that calls it, as `compiled_uncounted` does.
+    """Compile a function as `compiled` does, into each function that calls it, without counting references to arrays.
 
-    For small functions that kernels call with tuples of arrays, a thousand times a step.
+    For small functions that kernels call with tuples of arrays, a thousand times a step, and that make no arrays: each
+    array of a tuple is counted twice a call, by atomic operations, which took six times as long as the contacts that
+    were looked for. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
     """
-    return cast(_Function, _linked(function, _nrt=False, forceinline=True))
+    return cast(_Function, numba.njit(error_model="numpy", forceinline=True, **_UNCOUNTED)(function))
 
 
 def compiled_uncounted(function: _Function) -> _Function:
-    """Compile a function as `compiled` does, without counting references to arrays.
+    """Compile a function as `compiled` does, without counting references to arrays; see `compiled_inline`.
 
-    For kernels of which a step calls dozens with tuples of arrays: each array is counted twice a call, by atomic
-    operations. They may neither make arrays, which numba refuses, nor return any, whose references nobody would have
-    counted. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
+    For kernels of which a step calls dozens with tuples of arrays. They may neither make arrays, which numba refuses,
+    nor return any, whose references nobody would have counted.
     """
-    return _kernel(function, False)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_UNCOUNTED)(function))
+
+
+def compiled_inner(function: _Function) -> _Function:
+    """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash.
+
+    Without an entry for Python, which takes apart each array of a tuple, a kernel compiles several times as fast.
+    """
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_INNER)(function))
 
 
 def compiled_without_gil(function: _Function) -> _Function:
@@ -126,12 +71,12 @@ def compiled_without_gil(function: _Function) -> _Function:
 
     For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
     """
-    return _kernel(function, True, nogil=True)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
 
 
 def compiled_uncounted_without_gil(function: _Function) -> _Function:
     """Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
-    return _kernel(function, False, nogil=True)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_UNCOUNTED)(function))
 
 
 def compilations() -> int:

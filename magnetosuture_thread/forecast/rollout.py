@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_uncounted, compiled_uncounted_without_gil
+from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted_without_gil
 from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
@@ -182,7 +182,7 @@ class RolloutRecord(NamedTuple):
         )
 
 
-@compiled_uncounted
+@compiled_inner
 def follow_needle(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float
 ) -> tuple[int, bool]:
@@ -226,7 +226,7 @@ def follow_needle(
     return ENDED, converged
 
 
-@compiled_uncounted
+@compiled_inner
 def record_margins(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -278,7 +278,7 @@ def record_margins(
     return True
 
 
-@compiled_uncounted
+@compiled_inner
 def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) -> float:
     """Return the factor on the needle's speed of the friction law at an instant."""
     count, fastest = 0, 0.0
@@ -289,7 +289,7 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
     return float(model.friction.beta**count) if count > 0 and fastest > model.friction.stuck_speed else 1.0
 
 
-@compiled_uncounted
+@compiled_inner
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:

@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     SPAN,
@@ -206,7 +206,7 @@ def is_active(limit: float, multiplier: float) -> bool:
     return multiplier != 0.0 and abs(multiplier) < limit
 
 
-@compiled_uncounted
+@compiled_inner
 def evaluate(axes: Axes, program: ChainProgram, u: Points, smooth: Vector, image: Vector) -> float:
     """Write P u + q and a_r' u of every row; return the largest term of the first."""
     d, width, nodes, chain, largest = len(axes), SPAN * len(axes), len(u), len(program.first), 1.0
@@ -236,7 +236,7 @@ def evaluate(axes: Axes, program: ChainProgram, u: Points, smooth: Vector, image
     return largest
 
 
-@compiled_uncounted
+@compiled_inner
 def forces(
     axes: Axes, program: ChainProgram, smooth: Vector, multipliers: Vector, force: Vector
 ) -> tuple[float, float]:
@@ -266,7 +266,7 @@ def forces(
     return worst if np.isfinite(total) else np.inf, largest  # a largest value may pass over a NaN
 
 
-@compiled_uncounted
+@compiled_inner
 def update(
     program: ChainProgram, image: Vector, centre: Vector, weights: Vector, multipliers: Vector, active: Mask
 ) -> tuple[int, float]:
@@ -290,7 +290,7 @@ def update(
     return changes, gap
 
 
-@compiled_uncounted
+@compiled_inner
 def search(
     program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
 ) -> float:
@@ -399,7 +399,7 @@ def _copy(given: Vector, factor: float, count: int, written: Vector) -> None:
         written[k] = factor * given[k]
 
 
-@compiled_uncounted
+@compiled_inner
 def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> None:
     """Write weights, proximal centres and the rows that are active at the guess."""
     vectors, active, unknowns = buffers.vectors, buffers.active, program.linear.size
@@ -426,7 +426,7 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
         active[r] = is_active(limit[r], multipliers[r])
 
 
-@compiled_uncounted
+@compiled_inner
 def solve(
     axes: Axes,
     program: ChainProgram,

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -348,7 +348,7 @@ def compiled_residuals(program: ChainProgram, velocities: Points, multipliers: V
     return _residuals(program, velocities, multipliers, np.empty(velocities.shape), np.zeros(velocities.shape))
 
 
-@compiled_uncounted
+@compiled_inner
 def _residuals(
     program: ChainProgram, velocities: Points, multipliers: Vector, force: Points, pulled: Points
 ) -> tuple[float, float, float]:

@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.barrier import Barrier
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
@@ -142,7 +142,7 @@ def copy_points(given: Points, written: Points) -> None:
             written[i, a] = given[i, a]
 
 
-@compiled_uncounted
+@compiled_inner
 def assemble_step(
     solves: int, model: StepModel, buffers: RodBuffers, given: StepInput, elsewhere: float, last_contacts: int
 ) -> tuple[int, float, bool]:
@@ -178,7 +178,7 @@ def assemble_step(
     return contacts, off if solves > 0 else np.inf, rubs
 
 
-@compiled_uncounted
+@compiled_inner
 def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
@@ -233,7 +233,7 @@ def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> Non
     _taut(program, about, start, interval)
 
 
-@compiled_uncounted
+@compiled_inner
 def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
@@ -255,7 +255,7 @@ def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -
         buffers.couplings[0, i] -= weight
 
 
-@compiled_uncounted
+@compiled_inner
 def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask, interval: float) -> float:
     """Write the rows of connectivity and compression together; return the largest |h(y)|.
 
@@ -286,7 +286,7 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask
     return strain
 
 
-@compiled_uncounted
+@compiled_inner
 def init_step(buffers: RodBuffers, given: StepInput, unit: float) -> None:
     """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
