@@ -19,9 +19,9 @@ setup(
             "py.typed",
             "commands/campaign.html",
             "commands/campaign.css",
-            "evaluation/report/page.html",
-            "evaluation/report/page.css",
-            "evaluation/report/page.js",
+            "evaluation/page.html",
+            "evaluation/page.css",
+            "evaluation/page.js",
             "console/page/*",
         ]
     },

@@ -44,21 +44,6 @@ def open_ranges(path: Path) -> BinaryIO:
     return opened
 
 
-def version_of(path: Path) -> tuple[int, str]:
-    """Return the size of a file [bytes], and what changes with its content: its time of change, of a URL the ETag.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    if not is_url(path):
-        status = path.stat()
-        return status.st_size, str(status.st_mtime_ns)
-    place = cast(Any, path)
-    about = place.fs.info(place.path)
-    named = (about.get(name) for name in ("ETag", "etag", "LastModified", "mtime", "created"))
-    return int(about["size"]), str(next((value for value in named if value), ""))
-
-
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file.
 

@@ -60,7 +60,8 @@ _PARAMETERS: dict[str, Any] = {
     ),
     "driver_timeout": quantity(
         0.2,
-        "without new currents for this long the coil drivers switch off by themselves; whole tenths for RoboClaws",
+        "without new currents for this long the coil drivers switch off by themselves; "
+        "whole tenths for RoboClaw boards",
         unit="s",
         minimum=0.05,
         maximum=1.0,

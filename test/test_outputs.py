@@ -13,7 +13,7 @@ from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.report.page import _template
+from magnetosuture_thread.evaluation.page import _template
 from magnetosuture_thread.evaluation.tables import failed_row, flat, table_csv
 from magnetosuture_thread.outputs import input_problem, output_problem
 from magnetosuture_thread.scene import Scene, write_scene

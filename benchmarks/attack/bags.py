@@ -20,10 +20,10 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
-from magnetosuture_thread.bags.bag_folder import METADATA_FILE
 from magnetosuture_thread.bags.check import write_repaired_bag
 from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import METADATA_FILE
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import MagnetosutureError
 

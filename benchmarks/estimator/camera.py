@@ -55,16 +55,8 @@ class CameraModel:
             along = float(arc_lengths(other)[-1])
             points = points_at(other, np.arange(0.0, along, SPACING))
             noisy = points + rng.normal(0.0, self.deviation, points.shape)
-            pieces.append(
-                ThreadPiece(
-                    noisy,
-                    np.full(len(noisy), self.deviation),
-                    PieceEnd.UNKNOWN,
-                    PieceEnd.UNKNOWN,
-                    (np.nan, np.nan),
-                    False,
-                )
-            )
+            ends = PieceEnd.UNKNOWN, PieceEnd.UNKNOWN
+            pieces.append(ThreadPiece(noisy, np.full(len(noisy), self.deviation), *ends, (np.nan, np.nan), False))
         return ThreadObservation(tuple(pieces), complete=len(stretches) == 1 and stretches[0] == (0.0, length))
 
     def _piece(self, nodes: Points, begin: float, end: float, length: float, rng: np.random.Generator) -> ThreadPiece:

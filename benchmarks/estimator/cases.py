@@ -70,11 +70,6 @@ def _hidden(first: float, last: float) -> CameraModel:
     return CameraModel(hidden=(first * LENGTH, last * LENGTH), hidden_time=HIDDEN_TIME)
 
 
-def _stiffness_hidden(name: str, factor: float, learned: tuple[str, ...] = ()) -> Case:
-    """Return a case of a wrong stiffness whose last half is hidden."""
-    return Case(name, (2.0, 6.0), {"stiffness": factor}, camera=_hidden(0.5, 1.0), judged="hidden", learned=learned)
-
-
 WRONG, USUAL, LEARNED = (0.3, 1.5), (0.3, 1.5), ("stiffness_over_drag",)
 CASES = {
     case.name: case
@@ -93,10 +88,15 @@ CASES = {
         Case("middle hidden", (0.3, 1.5), camera=_hidden(0.25, 0.75), judged="hidden"),
         Case("last half hidden", (0.3, 1.5), camera=_hidden(0.5, 1.0), judged="hidden"),
         Case("middle, stiffness x 5", (2.0, 6.0), {"stiffness": 5.0}, camera=_hidden(0.25, 0.75), judged="hidden"),
-        _stiffness_hidden("last half, stiffness x 5", 5.0),
-        _stiffness_hidden("last half, stiffness / 5", 0.2),
-        _stiffness_hidden("last half, x 5, learned", 5.0, LEARNED),
-        _stiffness_hidden("last half, / 5, learned", 0.2, LEARNED),
+        *(
+            Case(name, (2.0, 6.0), {"stiffness": factor}, _hidden(0.5, 1.0), judged="hidden", learned=learned)
+            for name, factor, learned in (
+                ("last half, stiffness x 5", 5.0, ()),
+                ("last half, stiffness / 5", 0.2, ()),
+                ("last half, x 5, learned", 5.0, LEARNED),
+                ("last half, / 5, learned", 0.2, LEARNED),
+            )
+        ),
         Case("5 frames a second", USUAL, every=6),
         Case("30 % lost", USUAL, lost=0.3),
         Case("latency 0.2 s", USUAL, latency=6),

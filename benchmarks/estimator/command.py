@@ -7,20 +7,13 @@ with correlated noise, gaps and outliers. Errors are distances of nodes from the
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.estimator.cases import CASES
-from benchmarks.estimator.measurements import (
-    THREADS,
-    CaseFigures,
-    Errors,
-    measure_case,
-    measure_cost,
-)
+from benchmarks.estimator.measurements import THREADS, measure_case, measure_cost
 from benchmarks.estimator.rendered import measure_rendered
 from magnetosuture_thread.commands.command import make_log, progress
 
@@ -69,24 +62,21 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
             f" {found['false_reports']} of {found['runs_without_post']} runs without a post with a false report;"
             f" estimate {found['estimate_mean']:.3f}, {found['estimate_maximum']:.2f}"
         )
-    return {"cases": [asdict(each) for each in figures], **more}, all(each.met for each in figures)
+    return {"cases": figures, **more}, all(each["met"] for each in figures)
 
 
-def _table(figures: list[CaseFigures]) -> Table:
+def _table(figures: list[dict[str, Any]]) -> Table:
     table = Table(title="mean, greatest error in % of the length", title_justify="left", title_style="bold")
     table.add_column("case", no_wrap=True)
     for name in ("limit", "estimate", "prediction", "consistent", "found", "met"):
         table.add_column(name, justify="right", no_wrap=True)
     for each in figures:
+        pairs = each["limits"], each["estimate"].values(), each["prediction"].values()
         table.add_row(
-            each.name,
-            *(_pair(errors) for errors in (Errors(*each.limits), each.estimate, each.prediction)),
-            f"{100.0 * each.consistent:.0f} %",
-            f"{each.found} of {each.runs}" if each.name == "unknown post" else "",
-            "yes" if each.met else "no",
+            each["name"],
+            *("{:.3f} {:6.2f}".format(*pair) for pair in pairs),
+            f"{100.0 * each['consistent']:.0f} %",
+            f"{each['found']} of {each['runs']}" if each["name"] == "unknown post" else "",
+            "yes" if each["met"] else "no",
         )
     return table
-
-
-def _pair(errors: Errors) -> str:
-    return f"{errors.mean:.3f} {errors.maximum:6.2f}"

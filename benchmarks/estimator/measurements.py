@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,48 +24,11 @@ CONSISTENCY_WINDOW = 5.0  # s
 FOUND_TIME = 0.5  # s
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Distance of nodes from the truth, in % of the length."""
-
-    mean: float
-    maximum: float
-
-    @classmethod
-    def of(cls, errors: NDArray[np.float64]) -> Errors:
-        """Return both figures of errors of any shape."""
-        return cls(float(errors.mean()), float(errors.max())) if errors.size else cls(0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class CaseFigures:
-    """What was measured in a case, over all threads and seeds.
-
-    Attributes:
-        name: of the case.
-        limits: of mean and maximum.
-        estimate: errors.
-        prediction: of the model alone, from the true first shape.
-        consistent: part of the windows of 5 s in which the mean normalised innovation squared is within its 95 % band.
-        innovation: mean normalised innovation squared.
-        worse: number of runs whose estimate is worse than the prediction alone.
-        runs: number of runs.
-        found: of those with a contact nobody told of, how many were found within 0.5 s of it.
-        false_alarms: runs with a right model, in which a disturbance was reported before any contact.
-        met: whether the limits hold.
-    """
-
-    name: str
-    limits: tuple[float, float]
-    estimate: Errors
-    prediction: Errors
-    consistent: float
-    innovation: float
-    worse: int
-    runs: int
-    found: int
-    false_alarms: int
-    met: bool
+def errors_of(errors: NDArray[np.float64]) -> dict[str, float]:
+    """Return mean and maximum of distances of nodes from the truth, of any shape, in % of the length."""
+    return (
+        {"mean": float(errors.mean()), "maximum": float(errors.max())} if errors.size else {"mean": 0.0, "maximum": 0.0}
+    )
 
 
 def targets(run: Run, segments: int) -> NDArray[np.float64]:
@@ -151,11 +114,18 @@ def predict(run: Run, estimator: ThreadEstimator, first: Points) -> NDArray[np.f
     return np.array([predictor.step(pose).positions for pose in run.poses[1:]])
 
 
-def measure_case(case: Case, count: int, seed: int, segments: int, progress: Callable[[], None]) -> CaseFigures:
-    """Measure one case over all threads and a number of seeds."""
-    errors: dict[str, list[NDArray[np.float64]]] = {"estimate": [], "prediction": []}
-    inside: list[bool] = []
-    innovations: list[NDArray[np.float64]] = []
+def measure_case(case: Case, count: int, seed: int, segments: int, progress: Callable[[], None]) -> dict[str, Any]:
+    """Measure one case over all threads and a number of seeds.
+
+    Returns:
+        `estimate` and `prediction` (of the model alone, from the true first shape): errors; `consistent`: part of the
+        windows of 5 s in which the mean normalised innovation squared is within its 95 % band; `innovation`: its mean;
+        `worse`: runs whose estimate is worse than the prediction alone; `found`: contacts nobody told of that were
+        found within 0.5 s, of so many `runs`; `false_alarms`: runs with a report before any contact; `met`: whether
+        the limits hold.
+    """
+    errors, alone = [np.empty(0)], [np.empty(0)]
+    inside, innovations = list[bool](), [np.ones(1)]
     worse = runs = found = alarms = 0
     for material, attachment in THREADS:
         for number in range(seed, seed + count):
@@ -165,15 +135,12 @@ def measure_case(case: Case, count: int, seed: int, segments: int, progress: Cal
                 continue
             thread = replace(run.thread, segments=segments)
             truth, estimator = targets(run, segments), estimator_of(thread, run, case)
-            seen = observations(case, run, number)
-            estimates, measured = play(case, run, seen, estimator, truth[0])
+            estimates, measured = play(case, run, observations(case, run, number), estimator, truth[0])
             contact = contact_frame(run) if case.post else len(truth)
             judged = _judged(case, run, contact, segments)
-            off = _off(np.array([each.positions for each in estimates]), truth, thread.length)
-            alone = _off(predict(run, estimator, truth[0]), truth, thread.length)
-            errors["estimate"].append(off[judged])
-            errors["prediction"].append(alone[judged])
-            worse += bool(off[judged].mean() > alone[judged].mean())
+            errors.append(_off(np.array([each.positions for each in estimates]), truth, thread.length)[judged].ravel())
+            alone.append(_off(predict(run, estimator, truth[0]), truth, thread.length)[judged].ravel())
+            worse += bool(errors[-1].mean() > alone[-1].mean())
             runs += 1
             squared = _squared(measured)
             inside += _within_band(measured, squared)
@@ -182,30 +149,26 @@ def measure_case(case: Case, count: int, seed: int, segments: int, progress: Cal
             if case.post == "unknown":
                 found += any(contact <= index <= contact + FOUND_TIME * RATE for index in alarms_at)
             alarms += any(index < contact for index in alarms_at)
-    estimate = Errors.of(_flat(errors["estimate"]))
-    met = estimate.mean <= case.limits[0] and estimate.maximum <= case.limits[1] and not (case.better and worse)
-    return CaseFigures(
-        name=case.name,
-        limits=case.limits,
-        estimate=estimate,
-        prediction=Errors.of(_flat(errors["prediction"])),
-        consistent=float(np.mean(inside)) if inside else 0.0,
-        innovation=float(np.mean(np.concatenate([np.ones(1), *innovations]))),
-        worse=worse,
-        runs=runs,
-        found=found,
-        false_alarms=alarms,
-        met=met and runs > 0 and (case.post != "unknown" or found >= 0.95 * runs),
-    )
+    estimate = errors_of(np.concatenate(errors))
+    met = estimate["mean"] <= case.limits[0] and estimate["maximum"] <= case.limits[1]
+    return {
+        "name": case.name,
+        "limits": case.limits,
+        "estimate": estimate,
+        "prediction": errors_of(np.concatenate(alone)),
+        "consistent": float(np.mean(inside)) if inside else 0.0,
+        "innovation": float(np.mean(np.concatenate(innovations))),
+        "worse": worse,
+        "runs": runs,
+        "found": found,
+        "false_alarms": alarms,
+        "met": met and runs > 0 and not (case.better and worse) and (case.post != "unknown" or found >= 0.95 * runs),
+    }
 
 
 def _off(nodes: NDArray[np.float64], truth: NDArray[np.float64], length: float) -> NDArray[np.float64]:
     """Return errors of all nodes but the needle's, in % of the length, shape (T - 1, n)."""
     return np.asarray(100.0 / length * np.linalg.norm(nodes[:, 1:] - truth[1:, 1:], axis=2))
-
-
-def _flat(errors: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    return np.concatenate([np.empty(0), *(each.ravel() for each in errors)])
 
 
 def _judged(case: Case, run: Run, contact: int, segments: int) -> tuple[slice, slice]:

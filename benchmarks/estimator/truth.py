@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +67,8 @@ def wander(seed: int, duration: float, rate: float, speed: float) -> tuple[Point
         excess = float(np.linalg.norm(ahead)) - 0.0075
         if excess > 0.0:
             away = math.atan2(-place[1], -place[0])
-            turn += (
-                min(excess / 0.003, 1.0)
-                * 1.2
-                * speed
-                / 1.5e-3
-                * math.copysign(1.0, math.remainder(away - heading, 2.0 * math.pi))
-            )
+            side = math.copysign(1.0, math.remainder(away - heading, 2.0 * math.pi))
+            turn += side * min(excess / 0.003, 1.0) * 800.0 * speed
         heading += h * turn
         place = place + h * speed * np.array([math.cos(heading), math.sin(heading)])
     return np.array(tails), np.array(headings)
@@ -89,7 +84,6 @@ def simulate(
     stiffness: float = 1.0,
     viscosity: float = 1.0,
     flow: tuple[float, float] = (0.0, 0.0),
-    wall_radius: float = WALL_RADIUS,
 ) -> Run:
     """Drive the rod's needle along tails and headings, one of each a frame.
 
@@ -102,7 +96,6 @@ def simulate(
         stiffness: factor on the bending stiffness of the true thread.
         viscosity: factor on its drag.
         flow: velocity of the liquid; only without posts and wall, as the rod is simulated in the liquid's frame [m/s].
-        wall_radius: of the dish [m].
     """
     properties = ThreadProperties(
         length=thread.length,
@@ -116,13 +109,13 @@ def simulate(
     )
     moving = np.array(flow)
     still = not moving.any()
-    radius = wall_radius - 0.5 * thread.diameter
+    wall_radius = WALL_RADIUS if still else math.inf
     heading = np.array([math.cos(headings[0]), math.sin(headings[0])])
-    path = lay_behind_needle(tails[0], heading, 1.05 * thread.length, radius - 1e-4)
+    path = lay_behind_needle(tails[0], heading, 1.05 * thread.length, WALL_RADIUS - 0.5 * thread.diameter - 1e-4)
     rig = RigDynamics(
         NeedleBody(2e-3, 4e-4, 0.0, 0.0, 1.0),
         properties,
-        Surface(posts, wall_radius=wall_radius if still else None),
+        Surface(posts, wall_radius=WALL_RADIUS if still else None),
         None,
         tails[0],
         float(headings[0]),
@@ -136,9 +129,4 @@ def simulate(
         threads.append(rig.thread + drift)
     unit = np.column_stack([np.cos(headings), np.sin(headings)])
     poses = tuple(NeedlePose(k / rate, tails[k], unit[k]) for k in range(len(tails)))
-    return Run(thread, poses, np.array(threads), posts, wall_radius if still else math.inf)
-
-
-def without_posts(run: Run) -> Run:
-    """Return the same run as one sees it who does not know of the posts."""
-    return replace(run, posts=())
+    return Run(thread, poses, np.array(threads), posts, wall_radius)

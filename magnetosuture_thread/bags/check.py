@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from magnetosuture_thread.bags.bag_folder import QOS, UNCHECKED_NOTE, jazzy_qos_profiles
-from magnetosuture_thread.bags.mcap.writer import LIBRARY
+import numpy as np
+
 from magnetosuture_thread.bags.message_types import own_definition
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.storage import CDR, Connection, DamageReport
+from magnetosuture_thread.bags.recording import Recording, UnfitError
+from magnetosuture_thread.bags.storage import (
+    CDR,
+    QOS,
+    UNCHECKED_NOTE,
+    Connection,
+    DamageReport,
+    jazzy_qos_profiles,
+)
 from magnetosuture_thread.bags.writer import MAX_TIME, BagWriter
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.interface import Channel
 from magnetosuture_thread.messages.cdr import stamp_and_frame
-from magnetosuture_thread.texts import shortened
-
-RECORDER_NOTE = "recorder"  # note of a repaired bag: which library wrote the one before
 
 
 @dataclass
@@ -29,61 +35,61 @@ class TopicReport:
     Attributes:
         topic: its name, remapped.
         types: of its messages; more than one is an error of the recorder.
-        count: number of messages.
-        first: when the first was recorded [s since the bag's start]; None without messages.
-        last: when the last was [s since the bag's start].
-        gap: greatest time between two messages [s].
-        backward: number of messages whose stamp is before that of the one before them.
+        channel: of our graph that the topic is used as; None for a topic that it does not use.
+        known: whether at least one of its messages can be used.
+        problem: why none can, although the topic has the name of one of ours.
+        times: when each message was recorded [s since the bag's start].
+        stamps: of the messages that have one [ns].
         unreadable: number of messages whose stamp cannot be read although their type has one.
         frames: frame ids of the messages.
-        known: whether our graph uses the topic, and at least one of its messages can be used.
-        problem: why it does not, although it has the name of one of our topics.
     """
 
     topic: str
     types: tuple[str, ...]
-    count: int = 0
-    first: float | None = None
-    last: float | None = None
-    gap: float = 0.0
-    backward: int = 0
-    unreadable: int = 0
-    frames: set[str] = field(default_factory=set)
+    channel: Channel | None = None
     known: bool = False
     problem: str = ""
-    _stamp: int | None = None
+    times: array[float] = field(default_factory=lambda: array("d"))
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+    unreadable: int = 0
+    frames: set[str] = field(default_factory=set)
 
     def add(self, record: RecordedMessage, time: float, *, is_cdr: bool) -> None:
         """Add a message that was recorded at a time [s since the bag's start]."""
-        self.count += 1
-        if self.last is not None:
-            self.gap = max(self.gap, time - self.last)
-        self.first = time if self.first is None else self.first
-        self.last = time
-        if not is_cdr or not record.decoder.has_header():
+        self.times.append(time)
+        if is_cdr and record.decoder.has_header():
+            try:
+                stamp, frame = stamp_and_frame(record.topic, record.data)
+            except BagError:
+                self.unreadable += 1
+                return
+            self.stamps.append(stamp)
+            self.frames.add(frame)
+
+    def try_to_use(self, record: RecordedMessage, recording: Recording) -> None:
+        """Convert a message for our graph, until one can be used; what is wrong with the first is the problem."""
+        if self.channel is None or self.known:
             return
         try:
-            stamp, frame = stamp_and_frame(record.topic, record.data)
-        except BagError:
-            self.unreadable += 1
-            return
-        self.frames.add(frame)
-        self.backward += self._stamp is not None and stamp < self._stamp
-        self._stamp = stamp
+            recording.convert(record, self.channel).decode()
+            self.known, self.problem = True, ""
+        except (UnfitError, BagError) as error:
+            why = error.problem if isinstance(error, BagError) else error
+            self.problem = self.problem or f"none of the messages on {self.topic} can be used: {why}"
 
     def to_json(self) -> dict[str, Any]:
         """Return the report in SI units; null where there is no value."""
-        first, last = self.first, self.last
-        span = last - first if first is not None and last is not None else 0.0
+        times = np.array(self.times)
+        span = float(np.ptp(times)) if len(times) else 0.0
         return {
             "topic": self.topic,
             "types": list(self.types),
-            "messages": self.count,
-            "rate_hz": (self.count - 1) / span if span > 0.0 else None,
-            "first_s": first,
-            "last_s": last,
-            "greatest_gap_s": self.gap if self.count > 1 else None,
-            "stamps_going_back": self.backward,
+            "messages": len(times),
+            "rate_hz": (len(times) - 1) / span if span > 0.0 else None,
+            "first_s": float(times[0]) if len(times) else None,
+            "last_s": float(times[-1]) if len(times) else None,
+            "greatest_gap_s": float(np.diff(times).max()) if len(times) > 1 else None,
+            "stamps_going_back": int((np.diff(np.array(self.stamps)) < 0).sum()),
             "unreadable_stamps": self.unreadable,
             "frames": sorted(self.frames),
             "known": self.known,
@@ -102,13 +108,18 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
     recording = Recording(bag, dish_frame=dish_frame)
     topics: dict[str, TopicReport] = {}
     for name in sorted(bag.counts):
-        own = bag.conflicts.get(name) or (bag.topics[name],)
-        problem = recording.problem_of(name)
-        topics[name] = TopicReport(name, own, known=recording.uses(name) and not problem, problem=problem)
+        types = bag.conflicts.get(name) or (bag.topics[name],)
+        channel = recording.channel_of(name)
+        is_empty = channel is not None and not bag.counts[name]
+        problem = recording.unfit.get(name, "")
+        topics[name] = TopicReport(name, types, channel, is_empty, problem)
     refused: Counter[str] = Counter()
     for connection, record in bag.every_record(refused):
         time = (record.time - bag.start) * 1e-9
-        topics[bag.name_of(connection)].add(record, time, is_cdr=connection.serialization == CDR)
+        is_cdr = connection.serialization == CDR
+        topics[record.topic].add(record, time, is_cdr=is_cdr)
+        if is_cdr:
+            topics[record.topic].try_to_use(record, recording)
         progress(time / max(bag.duration, 1e-9))
     return {
         "bag": str(bag.path),
@@ -152,7 +163,6 @@ class RepairReport:
         dropped: other records that it does not, by kind.
         unpacked: messages that the recorder had packed one by one, and that are not in the new bag.
         defined: types that had no definition, and have ours.
-        kept: attachments and metadata records.
         rewritten: topics whose quality of service is written by name, as Jazzy reads it.
     """
 
@@ -161,7 +171,6 @@ class RepairReport:
     dropped: Counter[str] = field(default_factory=Counter)
     unpacked: int = 0
     defined: list[str] = field(default_factory=list)
-    kept: int = 0
     rewritten: list[str] = field(default_factory=list)
 
     @property
@@ -173,12 +182,12 @@ class RepairReport:
 def write_repaired_bag(
     bag: Bag, folder: Path, name: str, progress: Callable[[float], None] = lambda fraction: None
 ) -> RepairReport:
-    """Write every message of a bag that can be vouched for into a new one, with its notes, definitions and attachments.
+    """Write every message of a bag that can be vouched for into a new one, with its notes and definitions.
 
-    The bytes of messages, definitions, attachments and metadata records stay as they are; so do times and numbers of
-    messages, the profile, and entries of others in metadata.yaml. Messages that the recorder packed one by one, as the
-    storage says, are unpacked, and topics have their remapped names. Types keep the definitions of the bag; ours is
-    written where it has none and we know the type. Chunks, indices, statistics and metadata.yaml are made anew.
+    The bytes of messages and definitions stay as they are; so do times and numbers of messages, and entries of others
+    in metadata.yaml. Messages that the recorder packed one by one are unpacked, and topics have their remapped names.
+    Types keep the definitions of the bag; ours is written where it has none and we know the type. Chunks, indices,
+    statistics and metadata.yaml are made anew. Attachments and metadata records of others are counted and not kept.
 
     Args:
         bag: the bag to repair.
@@ -192,14 +201,9 @@ def write_repaired_bag(
     notes = dict(bag.notes)
     if bag.unchecked and not bag.unverified:
         notes.setdefault(UNCHECKED_NOTE, f"made by `bag repair` from a bag that {bag.unchecked}")
-    if bag.library and bag.library != LIBRARY:
-        notes.setdefault(RECORDER_NOTE, shortened(bag.library))
-    report = RepairReport()
+    report = RepairReport(dropped=bag.others)
     numbers: dict[Connection, int] = {}
-    with BagWriter(folder, notes, name=name, profile=shortened(bag.profile), custom_data=bag.custom_data) as writer:
-        for extra in bag.extras(report.dropped):
-            writer.add_extra(extra)
-            report.kept += 1
+    with BagWriter(folder, notes, name=name, custom_data=bag.custom_data) as writer:
         for connection in bag.connections():
             if connection not in numbers:
                 numbers[connection] = writer.add_connection(_defined(bag, connection, report))

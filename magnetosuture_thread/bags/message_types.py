@@ -1,4 +1,7 @@
-"""Message types: our own, known without ROS, and those that a bag defines."""
+"""Message types: our own, known without ROS, and those that a bag defines.
+
+Definitions of a bag are parsed within a budget: one of a kilobyte may describe a message of gigabytes.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,29 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.base import make_typesdict
+from rosbags.typesys.idl import IDLParser
+from rosbags.typesys.msg import MSGParser
+from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
-from magnetosuture_thread.bags.definitions import Extent, parse_definition
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.resources import share_directory
-from magnetosuture_thread.untrusted import MAX_DECODED, BudgetError, ParserBudget
+from magnetosuture_thread.untrusted import (
+    MAX_DECODED,
+    MAX_DEFINITION_CHARS,
+    MAX_ELEMENTS,
+    MAX_NESTING,
+    BudgetError,
+    ParserBudget,
+)
+
+Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
 HEADER = "std_msgs/msg/Header"
+_MAX_EMPTY = 16  # parts of a message that take no bytes
 
 
 @cache
@@ -81,27 +97,34 @@ class MessageDecoder:
     """
 
     def __init__(self, definition: MessageDefinition, budget: ParserBudget) -> None:
-        self.type_name = definition.type_name
+        self.type_name = name = definition.type_name
         self.problem = ""
-        own, extent = dict[str, Any](), Extent({})
+        ours = typestore()
+        self._store: Typestore = get_typestore(Stores.EMPTY)
+        extent, own = Extent({}), Types()
         try:
-            own = _parsed(definition, budget)
-            types = {**typestore().fielddefs, **own}
+            own = _own_types(definition, budget)
+            types: Types = {**ours.fielddefs, **own}
             extent = Extent(types)
-            if self.type_name in types:
-                extent.check(self.type_name)
+            if name in types:
+                extent.check(name)
         except BudgetError as error:
             # Not ours in its place either: its messages are of that definition.
-            own, self.problem = {}, str(error)
+            self.problem = str(error)
         self._density = extent.density
-        ours = typestore()
         self.is_ours = (
             not self.problem
-            and self.type_name in ours.fielddefs
-            and (self.type_name not in own or not _differ(self.type_name, own, ours.fielddefs))
+            and name in ours.fielddefs
+            and (name not in own or _closure(name, types, True) == _closure(name, ours.fielddefs, True))
         )
-        self._store: Typestore = ours if self.is_ours else _store(own)
-        self.is_known = self.type_name in self._store.fielddefs
+        if self.is_ours:
+            self._store = ours
+        elif not self.problem and name in own:
+            try:
+                self._store.register(_closure(name, types))
+            except Exception:  # A name that is no name in Python, for example.
+                self._store = get_typestore(Stores.EMPTY)
+        self.is_known = name in self._store.fielddefs
 
     def decode(self, topic: str, data: bytes) -> Any:
         """Return a message as an object of a type store.
@@ -146,66 +169,145 @@ class DecoderCache:
         return self._decoders[definition]
 
 
-def _parsed(definition: MessageDefinition, budget: ParserBudget) -> dict[str, Any]:
-    """Return the types of a definition, by name; none where it cannot be parsed, or uses types without definition.
+class _Bounded(Parser):
+    """A parser that ends after a number of steps: some texts make it try every way to read them."""
+
+    budget: ParserBudget
+
+    def literal(self, pos: int, text: str) -> Any:
+        """Match a literal."""
+        self.budget.spend()
+        return super().literal(pos, text)
+
+    def regex(self, pos: int, pattern: str, flags: int = 0) -> Any:
+        """Match a pattern."""
+        self.budget.spend()
+        return super().regex(pos, pattern, flags)
+
+
+class _BoundedMsgParser(_Bounded, MSGParser):
+    """Parser of .msg files."""
+
+
+class _BoundedIdlParser(_Bounded, IDLParser):
+    """Parser of .idl files, without operators in constants: those of ROS have none, and a shift may be huge."""
+
+    def _binop(self, pos: int, left: Any, op: str, right: Any) -> Any:
+        return Failure(pos, "", {"a constant without an operator"})
+
+
+def _own_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
+    """Return the types of a definition; none where it cannot be parsed, or uses types without definition.
 
     An empty definition is ignored for a type that we know: some recorders leave it out.
 
     Raises:
         BudgetError: it asks for more than a message may be.
     """
-    own: dict[str, Any] = {}
-    if not definition.text.strip() and definition.type_name in typestore().fielddefs:
-        return own
+    name, text = definition.type_name, definition.text
+    ours = typestore().fielddefs
+    if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
+        return {}
+    if len(text) > MAX_DEFINITION_CHARS:
+        raise BudgetError(f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
+    budget.begin()
     try:
-        own = parse_definition(definition, budget)
+        parser: _Bounded
+        if definition.encoding == "ros2msg":
+            parser = _BoundedMsgParser(f"MSG: {name}\n{text}")
+        else:
+            parser = _BoundedIdlParser(text)
+        parser.budget = budget
+        own = dict(make_typesdict(parser.specification()))
     except BudgetError:
         raise
     except Exception:  # The parser raises whatever the text makes it stumble over.
         return {}
-    used = {inner for _, fields in own.values() for _, kind in fields for inner in _nested_types(kind)}
-    return own if used <= {*own, *typestore().fielddefs} else {}
+    used = {_type_within(kind) for _, fields in own.values() for _, kind in fields} - {""}
+    return own if used <= {*own, *ours} else {}
 
 
-def _differ(type_name: str, own: dict[str, Any], ours: dict[str, Any]) -> bool:
-    """Return whether two definitions of a type differ in a field, or in a type within it."""
-    waiting, seen = [type_name], set[str]()
+def _closure(name: str, types: Types, fields_only: bool = False) -> Types:
+    """Return a type and those within it; or of each its fields alone, by lower-case names, to be compared.
+
+    Raises:
+        KeyError: one of them is not defined.
+    """
+    found: Types = {}
+    waiting = [name]
     while waiting:
-        name = waiting.pop()
-        if name in seen or name not in own:  # which is then ours
-            continue
-        seen.add(name)
-        if name not in ours:
-            return True
-        fields = [(field.lower(), kind) for field, kind in own[name][1]]
-        if fields != [(field.lower(), kind) for field, kind in ours[name][1]]:
-            return True
-        waiting += [inner for _, kind in fields for inner in _nested_types(kind)]
-    return False
+        each = waiting.pop()
+        if each not in found:
+            fields = types[each][1]
+            found[each] = [(field.lower(), kind) for field, kind in fields] if fields_only else types[each]
+            waiting += [inner for _, kind in fields if (inner := _type_within(kind))]
+    return found
 
 
-def _store(own: dict[str, Any]) -> Typestore:
-    """Return a store of the types in a bag; nested types that it does not define are ours."""
-    store = get_typestore(Stores.EMPTY)
-    ours = typestore().fielddefs
-    missing = {inner for _, fields in own.values() for _, kind in fields for inner in _nested_types(kind)} - set(own)
-    types = dict(own)
-    while missing:
-        name = missing.pop()
-        if name in types or name not in ours:
-            continue
-        types[name] = ours[name]
-        missing |= {inner for _, kind in ours[name][1] for inner in _nested_types(kind)}
-    try:
-        store.register(types)
-    except Exception:  # A name that is no name in Python, for example.
-        return get_typestore(Stores.EMPTY)
-    return store
+def _type_within(kind: Any) -> str:
+    """Return the name of the type that a field is of, or is a sequence of; empty where it has none."""
+    node, detail = kind
+    if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        node, detail = detail[0]
+    return detail if node is Nodetype.NAME else ""
 
 
-def _nested_types(kind: Any) -> list[str]:
-    """Return the name of the type that a field is of, or is a sequence of, where it has one."""
-    code, value = int(kind[0]), kind[1]
-    if code == 2:
-        return [value]
-    return _nested_types(value[0]) if code in (3, 4) else []
+class Extent:
+    """What the definition of a type makes of a message.
+
+    Args:
+        types: all types that it uses.
+
+    Attributes:
+        density: objects that a byte of a sequence may become, at most.
+    """
+
+    def __init__(self, types: Types) -> None:
+        self._types = types
+        self._known: dict[str, tuple[int, int, int]] = {}
+        self.density = 0.0
+
+    def check(self, type_name: str) -> None:
+        """Refuse a type whose messages have more parts than may be, or parts in parts too deep.
+
+        Raises:
+            BudgetError: it does.
+        """
+        self._of(type_name, 0)
+
+    def _of(self, name: str, depth: int) -> tuple[int, int, int]:
+        """Return elements, least bytes and empty parts of a type."""
+        if depth > MAX_NESTING:
+            raise BudgetError(f"a definition with types more than {MAX_NESTING} deep in each other")
+        if name not in self._known:
+            elements, size, empty = 1, 0, 0
+            for _, kind in self._types[name][1]:
+                more = self._of_field(kind, depth)
+                elements, size, empty = elements + more[0], size + more[1], empty + more[2]
+                if elements > MAX_ELEMENTS:
+                    raise BudgetError(f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
+            empty += not size
+            if empty > _MAX_EMPTY:
+                raise BudgetError(f"a definition with more than {_MAX_EMPTY} parts that hold nothing")
+            self._known[name] = elements, size, empty
+        return self._known[name]
+
+    def _of_field(self, kind: Any, depth: int) -> tuple[int, int, int]:
+        node, detail = kind
+        if node is Nodetype.BASE:
+            return 1, 4 if detail[0] == "string" else 1, 0
+        if node is Nodetype.NAME:
+            return self._of(detail, depth + 1)
+        inner, count = detail
+        if count < 0:
+            raise BudgetError(f"a definition of an array of {count} parts")
+        is_numeric = inner[0] is Nodetype.BASE and inner[1][0] != "string"
+        if is_numeric:  # one array, whatever its length
+            return 1, count if node is Nodetype.ARRAY else 4, 0
+        elements, size, empty = self._of_field(inner, depth)
+        if node is Nodetype.ARRAY:
+            return count * elements, count * size, count * empty
+        if not size:
+            raise BudgetError("a definition with a sequence of parts that hold nothing")
+        self.density = max(self.density, elements / size)
+        return 1, 4, 0

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import zstandard
-from mcap.records import Attachment, Metadata
 
-from magnetosuture_thread.bags.bag_folder import (
-    METADATA_FILE,
-    UNCHECKED_NOTE,
-    UNVERIFIED_NOTE,
-    find_bag_files,
-    marks_of,
-)
+from magnetosuture_thread.bags import absolute_topic
 from magnetosuture_thread.bags.mcap.file import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
-from magnetosuture_thread.bags.remap import apply_remap
 from magnetosuture_thread.bags.sqlite import SqliteFile
 from magnetosuture_thread.bags.storage import (
     CDR,
-    ROS2_PROFILE,
-    BagStorage,
+    UNCHECKED_NOTE,
+    UNVERIFIED_NOTE,
     Connection,
     CorruptRegion,
     DamageReport,
     MessageDefinition,
     StoredMessage,
+    find_bag_files,
     merge_by_time,
     merge_reports,
 )
@@ -40,6 +34,8 @@ from magnetosuture_thread.files import is_url
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 Progress = Callable[[float], None]
+BagStorage = McapFile | SqliteFile
+_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
 _OWN_DECODERS = DecoderCache()  # of messages of no bag
 
 
@@ -81,7 +77,7 @@ class Bag:
     """A recorded bag: mcap or sqlite3, one file or several, whole or damaged.
 
     All checksums are verified as it is opened, so that damage is known before any message is used. Intact data is read;
-    data that may be wrong never is (see `bags/mcap/salvage.py` for the rule). Of a bag by URL, only what is read is
+    data that may be wrong never is (see `bags/mcap/file.py` for the rule). Of a bag by URL, only what is read is
     fetched and verified, and reading ends with an error where it is damaged.
 
     Args:
@@ -105,8 +101,7 @@ class Bag:
         remarks: on files of the bag that are not read, a line each.
         facts: properties of each file, for a person.
         decoders: of its messages; all its definitions are parsed within one budget.
-        profile: which conventions it follows, as mcap names them.
-        library: that wrote it; empty where nothing says.
+        others: number of records that are neither messages nor ours, by kind.
         custom_data: entries of others in its metadata.yaml.
 
     Raises:
@@ -120,31 +115,23 @@ class Bag:
         self.decoders = DecoderCache()
         found = find_bag_files(path)
         self._storages, problems = _open(found.files, progress)
-        metadata = found.metadata
         missing = [CorruptRegion(name, 0, 0, "it is missing") for name in found.missing]
         lost = [DamageReport((region,), 0, region.end, None) for region in (*missing, *problems)]
         self.damage = merge_reports([*(storage.damage for storage in self._storages), *lost])
-        self._packed = metadata.packed
-        self.unchecked = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
-        unlisted = [f"{name} is not read: {METADATA_FILE} does not list it" for name in found.unlisted]
-        self.remarks = [*unlisted, *([metadata.doubt] if metadata.doubt else [])]
+        self.remarks, self.custom_data = found.remarks, found.custom_data
         self.facts = [{"file": storage.path.name, **storage.facts} for storage in self._storages]
-        self.profile = next((storage.profile for storage in self._storages if storage.profile), ROS2_PROFILE)
-        self.library = next((storage.library for storage in self._storages if storage.library), "")
-        self.custom_data = metadata.custom_data
-        self.notes = next((storage.notes for storage in self._storages if storage.notes), metadata.notes)
-        # Of a damaged file the notes may be lost; each chunk has the marks once more.
-        marks = marks_of(self.connections()) | self.notes
-        self.unverified = marks.get(UNVERIFIED_NOTE, "")
-        self.unchecked = self.unchecked or marks.get(UNCHECKED_NOTE, "")
+        self.others = sum((storage.others for storage in self._storages), Counter[str]())
+        self.notes = next((storage.notes for storage in self._storages if storage.notes), found.notes)
+        self.unverified = self.notes.get(UNVERIFIED_NOTE, "")
+        doubt = next((storage.unchecked for storage in self._storages if storage.unchecked), "")
+        self.unchecked = doubt or self.notes.get(UNCHECKED_NOTE, "")
         if not any(storage.counts for storage in self._storages):
             raise BagError(found.files[0], f"{self.damage}; nothing intact" if self.damage else "holds no messages")
         filled = [storage for storage in self._storages if storage.counts]
         self.start = min(storage.start for storage in filled)
         self.end = max(storage.end for storage in filled)
         self.duration = (self.end - self.start) * 1e-9
-        recorded = {c.topic for storage in self._storages for c in storage.connections.values()}
-        self._names = apply_remap(path, recorded, remap or {})
+        self._names = apply_remap(path, {connection.topic for connection in self.connections()}, remap or {})
         self.counts: Counter[str] = Counter()
         types: dict[str, dict[str, None]] = {}
         for storage in self._storages:
@@ -175,7 +162,9 @@ class Bag:
             BagError: one of the topics has two types, or the bag has changed since it was opened.
         """
         for topic in topics or ():
-            self._refuse_two_types(topic)
+            if topic in self.conflicts:
+                types = " and ".join(self.conflicts[topic])
+                raise BagError(self.path, f"topic {topic} has two types, {types}; expected one")
         wanted = set(self.topics if topics is None else topics)
         loaded = (self._load(item, refused, only=CDR) for item in self._stored(wanted, start, duration))
         return (record for record in loaded if record is not None)
@@ -184,20 +173,23 @@ class Bag:
         """Yield all messages by time as they are stored, whatever their type or serialization."""
         return self._stored(set(self.counts), 0.0, None)
 
-    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
-        """Yield attachments, and metadata records of others; what cannot be vouched for is counted by reason."""
-        for storage in self._storages:
-            yield from storage.extras(dropped)
-
     def load(self, item: StoredMessage) -> bytes:
         """Return a stored message as it was before the recorder packed it, if it did.
 
         Raises:
             BagError: it cannot be unpacked.
         """
-        is_packed = self._packed if self._packed is not None else item.connection.serialization == CDR
+        if item.connection.serialization != CDR or not item.data.startswith(_ZSTD):
+            return item.data
         topic = self._names[item.connection.topic]
-        return unpacked(topic, item.data) if is_packed else item.data
+        try:
+            if zstandard.frame_content_size(item.data) > MAX_BLOCK_BYTES:
+                raise BagError(topic, f"a packed message is larger than {MAX_BLOCK_BYTES} bytes")
+            # Without a size in it, a frame is unpacked to this many bytes at most.
+            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES)
+            return unpacker.decompress(item.data, max_output_size=MAX_BLOCK_BYTES)
+        except (zstandard.ZstdError, MemoryError) as error:
+            raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None
 
     def every_record(self, refused: Counter[str]) -> Iterator[tuple[Connection, RecordedMessage]]:
         """Yield all messages by time, each with its connection.
@@ -212,27 +204,13 @@ class Bag:
             if record is not None:
                 yield item.connection, record
 
-    def connections(self) -> Iterable[Connection]:
+    def connections(self) -> list[Connection]:
         """Return the connections of all files, under their recorded names."""
         return [connection for storage in self._storages for connection in storage.connections.values()]
 
     def name_of(self, connection: Connection) -> str:
         """Return the remapped topic of a connection."""
         return self._names[connection.topic]
-
-    def require(self, topic: str, type_name: str) -> None:
-        """Raise `BagError` unless the bag has messages of this type on a topic."""
-        if not self.counts.get(topic):
-            present = ", ".join(sorted({*self.topics, *self.conflicts})) or "none"
-            raise BagError(self.path, f"has no messages on {topic} ({type_name}); its topics: {present}")
-        self._refuse_two_types(topic)
-        if self.topics[topic] != type_name:
-            raise BagError(self.path, f"topic {topic} is of type {self.topics[topic]}, expected {type_name}")
-
-    def _refuse_two_types(self, topic: str) -> None:
-        if topic in self.conflicts:
-            types = " and ".join(self.conflicts[topic])
-            raise BagError(self.path, f"topic {topic} has two types, {types}; expected one")
 
     def _load(self, item: StoredMessage, refused: Counter[str] | None, only: str = "") -> RecordedMessage | None:
         """Return a message; None, and count it, if it cannot be decompressed or has another serialization."""
@@ -297,22 +275,36 @@ def _file_size(file: Path) -> int:
         return 0
 
 
-_ZSTD = b"\x28\xb5\x2f\xfd"  # no CDR message begins like this: its first byte is 0
+def apply_remap(path: Path, topics: Collection[str], remap: Mapping[str, str]) -> dict[str, str]:
+    """Return the remapped name of each topic of a bag.
 
-
-def unpacked(topic: str, data: bytes) -> bytes:
-    """Return a message as it was before the recorder packed it, if it did.
+    Args:
+        path: of the bag, for errors.
+        topics: as they were recorded.
+        remap: new name of a topic by its recorded name.
 
     Raises:
-        BagError: it cannot be unpacked.
+        BagError: the bag has no such topic, or another one has the new name already.
     """
-    if not data.startswith(_ZSTD):
-        return data
-    try:
-        if zstandard.frame_content_size(data) > MAX_BLOCK_BYTES:
-            raise BagError(topic, f"a packed message is larger than {MAX_BLOCK_BYTES} bytes")
-        # Without a size in it, a frame is unpacked to this many bytes at most.
-        unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES)
-        return unpacker.decompress(data, max_output_size=MAX_BLOCK_BYTES)
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise BagError(topic, f"a packed message cannot be unpacked: {error}") from None
+    names = {topic: topic for topic in topics}
+    for before, after in remap.items():
+        known = [topic for topic in topics if absolute_topic(topic) == absolute_topic(before)]
+        if not known:
+            raise BagError(path, f"has no topic {absolute_topic(before)} to remap{_suggestion(before, topics)}")
+        names[known[0]] = absolute_topic(after)
+    sources: dict[str, list[str]] = {}
+    for topic, name in sorted(names.items()):
+        sources.setdefault(name, []).append(topic)
+    for name, own in sources.items():
+        if len(own) > 1 and name in own:
+            other = next(topic for topic in own if topic != name)
+            raise BagError(path, f"has {name} itself; {other} cannot be remapped to it without mixing the two")
+        if len(own) > 1:
+            raise BagError(path, f"{own[0]} and {own[1]} cannot both be remapped to {name}")
+    return names
+
+
+def _suggestion(topic: str, topics: Collection[str]) -> str:
+    close = get_close_matches(absolute_topic(topic), topics, n=1)
+    meant = f"; did you mean {close[0]}?" if close else ""
+    return f"{meant}; its topics: {', '.join(sorted(topics)) or 'none'}"

@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterator
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.bags.conversion import (
-    CONVERSIONS,
-    TF_MESSAGE,
-    TOPICS,
-    UNSTAMPED_TWIST,
-    RigidTransform,
-    TransformTree,
-    UnfitError,
-    moved,
-)
-from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
 from magnetosuture_thread.messages.cdr import is_in_dish_frame, stamp_and_frame
+from magnetosuture_thread.messages.markers import ADD, LINE_STRIP
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 CHANNELS = tuple(value for value in vars(interface).values() if isinstance(value, Channel))
 _CAMERA_TOPICS = {channel.recorded for channel in CAMERA.values()}
-_CAMERA_TYPES = {channel.type_name: channel for channel in CAMERA.values()}
+_CAMERA_TYPES = {channel.type_name for channel in CAMERA.values()}
+
+STATIC_TRANSFORMS = "/tf_static"
+TRANSFORMS = ("/tf", STATIC_TRANSFORMS)
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+PATH = "nav_msgs/msg/Path"
+TWIST = "geometry_msgs/msg/TwistStamped"
+UNSTAMPED_TWIST = "geometry_msgs/msg/Twist"
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)  # quaternion without rotation
+
+Matrix = NDArray[np.float64]  # homogeneous, shape (4, 4): p' = R p + t
 
 
 class Recording:
@@ -102,67 +114,31 @@ class Recording:
         wanted = {self._topics[channel]: channel for channel in channels if channel in self._topics}
         # The first message of each, so that an unknown frame is reported before any message is used.
         for topic, channel in wanted.items():
-            self._check_first(topic, channel)
+            first = next(self._bag.records({topic}, refused=Counter()), None)
+            if first is not None:
+                with suppress(UnfitError):
+                    self.convert(first, channel)
         return self._records(wanted, start, duration)
 
-    def uses(self, topic: str) -> bool:
-        """Return whether a topic of the bag is used as one of our channels."""
-        return topic in self._topics.values()
-
-    def problem_of(self, topic: str) -> str:
-        """Return why a topic with the name of one of our channels cannot be used; empty if it can."""
-        for channel, name in self._topics.items():
-            if name == topic:
-                try:
-                    return self._conversion_problem(topic, channel)
-                except BagError as error:
-                    return error.problem
-        return self.unfit.get(topic, "")
-
-    def _conversion_problem(self, topic: str, channel: Channel) -> str:
-        """Return why not one message of a topic can be used; empty if one can, or there are none.
-
-        Raises:
-            BagError: their frame is not connected to the dish's.
-        """
-        first, refused = "", Counter[str]()
-        for record in self._bag.records({topic}, refused=refused):
-            try:
-                converted = self._convert(record, channel)
-                if not isinstance(converted, str):
-                    converted.decode()
-                    return ""
-            except BagError as error:
-                if error.path == str(self.path):
-                    raise
-                converted = error.problem
-            first = first or converted
-        first = first or next(iter(refused), "")
-        return f"none of the messages on {topic} can be used: {first}" if first else ""
-
-    def _check_first(self, topic: str, channel: Channel) -> None:
-        for record in self._bag.records({topic}, refused=Counter()):
-            self._convert(record, channel)
-            return
+    def channel_of(self, topic: str) -> Channel | None:
+        """Return our channel that a topic of the bag is used as; None if it is not used."""
+        return next((channel for channel, name in self._topics.items() if name == topic), None)
 
     def _records(self, wanted: dict[str, Channel], start: float, duration: float | None) -> Iterator[RecordedMessage]:
         for record in self._bag.records(wanted, start=start, duration=duration, refused=self.refused):
             channel = wanted[record.topic]
-            converted = self._convert(record, channel)
-            if isinstance(converted, str):
-                self.refused[f"{channel.recorded}: {converted}"] += 1
-            else:
-                yield converted
+            try:
+                yield self.convert(record, channel)
+            except UnfitError as problem:
+                self.refused[f"{channel.recorded}: {problem}"] += 1
 
     def _match(self, channel: Channel) -> None:
         """Find the topic for one of our channels."""
         bag, name = self._bag, channel.recorded
         if name in _CAMERA_TOPICS:
             fitting = [topic for topic in _CAMERA_TOPICS if bag.topics.get(topic) == channel.type_name]
-            if len(fitting) > 1:
-                fitting = [name]  # the name of the channel comes first
             if fitting:
-                self._topics[channel] = fitting[0]
+                self._topics[channel] = name if name in fitting else fitting[0]
                 return
             if bag.topics.get(name) in _CAMERA_TYPES:
                 return  # used by the other camera channel
@@ -176,60 +152,64 @@ class Recording:
                 expected = " or ".join(sorted(accepted))
                 self.unfit[name] = f"topic {name} is of type {bag.topics[name]}, expected {expected}"
 
-    def _convert(self, record: RecordedMessage, channel: Channel) -> RecordedMessage | str:
-        """Return a message converted to our type and frame; the reason where that is impossible."""
+    def convert(self, record: RecordedMessage, channel: Channel) -> RecordedMessage:
+        """Return a message converted to our type and frame.
+
+        Raises:
+            UnfitError: that is impossible.
+            BagError: its frame is never connected to the dish frame.
+        """
         conversions = CONVERSIONS.get(channel.type_name)
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
         if is_ours and (conversions is None or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
-            return record if record.topic == channel.recorded else self._as_channel(record, channel, record.data)
+            return RecordedMessage(channel.recorded, channel.type_name, record.time, record.data)
         if conversions is None:
-            return f"its type {record.type_name} has another definition than ours"
+            raise UnfitError(f"its type {record.type_name} has another definition than ours")
         frame, stamp = self._dish_frame, record.time
         try:
             if record.type_name != UNSTAMPED_TWIST:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
             message = conversions[record.type_name](record.decode(), record.time)
-        except (BagError, UnfitError, AttributeError, TypeError, ValueError) as problem:
-            # Fields are missing or of other types: another definition of the type.
-            return problem.problem if isinstance(problem, BagError) else str(problem)
+        except BagError as error:
+            raise UnfitError(error.problem) from None
+        except (AttributeError, TypeError, ValueError) as error:  # of another definition of the type
+            raise UnfitError(str(error)) from None
         frame = frame.lstrip("/")
         if frame == self._dish_frame:
             message.header.frame_id = DISH_FRAME
         else:
-            transform = self._transform_to_dish(record.topic, frame, stamp)
-            if transform is None:
-                return f"no transform from its frame {frame} at its time"
-            try:
-                message = moved(message, transform, DISH_FRAME)
-            except (UnfitError, ValueError) as problem:  # a covariance of another size
-                return str(problem)
+            message = moved(message, self._transform_to_dish(record.topic, frame, stamp), DISH_FRAME)
         try:
             data = bytes(typestore().serialize_cdr(message, channel.type_name))
         except Exception:  # The serialiser raises any error, for example for a stamp out of range.
-            return "a value out of range of our type"
-        return self._as_channel(record, channel, data)
+            raise UnfitError("a value out of range of our type") from None
+        return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
 
-    def _transform_to_dish(self, topic: str, frame: str, stamp: int) -> RigidTransform | None:
-        """Return the transform from a frame to the dish frame at a time [ns]; None where it is unknown.
+    def _transform_to_dish(self, topic: str, frame: str, stamp: int) -> Matrix:
+        """Return the transform from a frame to the dish frame at a time [ns].
 
         Raises:
+            UnfitError: it is unknown at that time.
             BagError: the frame is never connected to the dish frame.
         """
         if self._transforms is None:
             self._transforms = TransformTree(self._transform_messages())
-        if not frame or not self._transforms.is_connected(frame, self._dish_frame):
+        if not frame or self._transforms.lookup(frame, self._dish_frame, None) is None:
             known = ", ".join(self._transforms.frames) or "none"
             which = f"the frame {frame}, which is not connected to {self._dish_frame}" if frame else "an empty frame"
             raise BagError(
                 self.path,
-                f"topic {topic} has {which}; frames on {' and '.join(TOPICS)}: {known}. "
+                f"topic {topic} has {which}; frames on {' and '.join(TRANSFORMS)}: {known}. "
                 f"If it is the dish frame, give it: --frame {frame or repr(frame)}",
             )
-        return self._transforms.lookup(frame, self._dish_frame, stamp)
+        matrix = self._transforms.lookup(frame, self._dish_frame, stamp)
+        if matrix is None:
+            raise UnfitError(f"no transform from its frame {frame} at its time")
+        return matrix
 
     def _transform_messages(self) -> Iterator[tuple[str, Any]]:
         """Yield topic and message of all transforms; invalid ones are counted in `refused`."""
-        topics = [topic for topic in TOPICS if self._bag.topics.get(topic) == TF_MESSAGE]
+        topics = [topic for topic in TRANSFORMS if self._bag.topics.get(topic) == "tf2_msgs/msg/TFMessage"]
         for record in self._bag.records(topics, refused=self.refused):
             try:
                 if not record.decoder.is_ours:
@@ -238,5 +218,201 @@ class Recording:
             except BagError as error:
                 self.refused[str(error)] += 1
 
-    def _as_channel(self, record: RecordedMessage, channel: Channel, data: bytes) -> RecordedMessage:
-        return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
+
+class UnfitError(Exception):
+    """A message that cannot be converted to a type of our graph; the text gives the reason."""
+
+
+class TransformTree:
+    """Tree of frames.
+
+    Args:
+        messages: topic and tf2_msgs/TFMessage in the order of the bag. Of static transforms the last one holds at any
+            time; one that moves holds from its stamp until the next.
+    """
+
+    def __init__(self, messages: Iterable[tuple[str, Any]]) -> None:
+        # By child frame, in the order of time: stamp, parent, and the transform into it from then on.
+        self._edges: dict[str, list[tuple[float, str, Matrix]]] = {}
+        static: dict[str, list[tuple[float, str, Matrix]]] = {}
+        for topic, message in messages:
+            for each in message.transforms:
+                child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
+                matrix = matrix_of(each.transform.translation, each.transform.rotation)
+                if matrix is None or child == parent:
+                    continue
+                if topic == STATIC_TRANSFORMS:
+                    static[child] = [(-math.inf, parent, matrix)]
+                else:
+                    stamp = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
+                    self._edges.setdefault(child, []).append((stamp, parent, matrix))
+        self._edges |= static
+        for entries in self._edges.values():
+            entries.sort(key=itemgetter(0))
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames."""
+        return sorted({parent for entries in self._edges.values() for _, parent, _ in entries} | set(self._edges))
+
+    def lookup(self, frame: str, target: str, stamp: int | None) -> Matrix | None:
+        """Return the transform from a frame into another at a time [ns], the last if None; None where it is unknown."""
+        ups, downs = self._ancestors(frame, stamp), self._ancestors(target, stamp)
+        for ancestor, matrix in ups.items():
+            if ancestor in downs:
+                return np.asarray(np.linalg.inv(downs[ancestor]) @ matrix)
+        return None
+
+    def _ancestors(self, frame: str, stamp: int | None) -> dict[str, Matrix]:
+        """Return the transform of a frame into each of its ancestors, from the nearest on."""
+        matrix = np.eye(4)
+        found = {frame: matrix}
+        while entries := self._edges.get(frame):
+            index = len(entries) if stamp is None else bisect_right(entries, stamp, key=itemgetter(0))
+            if not index:
+                break  # Nothing is known as early as that.
+            _, frame, up = entries[index - 1]
+            if frame in found:
+                break  # A cycle of frames.
+            matrix = up @ matrix
+            found[frame] = matrix
+        return found
+
+
+def matrix_of(place: Any, turn: Any) -> Matrix | None:
+    """Return the transform of a point or vector and a quaternion; None if it is not finite, or the quaternion 0."""
+    rotation = _rotation(turn)
+    matrix = np.eye(4)
+    matrix[:3, 3] = place.x, place.y, place.z
+    if rotation is None or not np.isfinite(matrix).all():
+        return None
+    matrix[:3, :3] = rotation.as_matrix()
+    return matrix
+
+
+def _rotation(turn: Any) -> Rotation | None:
+    """Return the rotation of a geometry_msgs/Quaternion; None if it is not finite or of length 0."""
+    from scipy.spatial.transform import Rotation  # late, as bags of our own graph turn nothing
+
+    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
+    greatest = np.abs(quaternion).max()
+    if not np.isfinite(greatest) or not greatest:
+        return None
+    return Rotation.from_quat(quaternion / greatest)  # whose length neither vanishes nor overflows
+
+
+def _moved_points(matrix: Matrix, points: Matrix) -> Matrix:
+    """Return points, shape (3,) or (n, 3) [m], in the other frame."""
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+def pose_stamped(message: Any, time: int) -> Any:
+    """Return a PoseStamped of anything that holds one pose."""
+    return MESSAGES.pose_stamped(_header_of(message), _pose_in(message))
+
+
+def pose_with_covariance(message: Any, time: int) -> Any:
+    """Return a PoseWithCovarianceStamped of anything that holds one pose; a covariance of zeros means unknown."""
+    holder = getattr(message, "pose", None)
+    covariance = getattr(holder, "covariance", None)
+    values = np.zeros(36) if covariance is None else np.array(covariance, dtype=float)
+    return MESSAGES.pose_with_covariance(_header_of(message), _pose_in(message), values)
+
+
+def path_of_marker(message: Any, time: int) -> Any:
+    """Return a Path of a Marker that is a line strip."""
+    if message.action != ADD or message.type != LINE_STRIP:
+        raise UnfitError("a marker that is no line strip being added")
+    points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
+    turn, place = message.pose.orientation, message.pose.position
+    if not np.any([turn.x, turn.y, turn.z, turn.w]):
+        turn = MESSAGES.pose((0.0, 0.0, 0.0), UPRIGHT).orientation  # RViz takes zeros for no rotation
+    matrix = matrix_of(place, turn)
+    if matrix is None:
+        raise UnfitError("an orientation that is none")
+    return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in _moved_points(matrix, points)])
+
+
+_POSES = (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry")
+# By the type that our graph takes, by the type that a bag may have.
+CONVERSIONS: dict[str, dict[str, Callable[[Any, int], Any]]] = {
+    POSE: dict.fromkeys(_POSES, pose_stamped),
+    POSE_WITH_COVARIANCE: dict.fromkeys(_POSES, pose_with_covariance),
+    PATH: {
+        PATH: lambda m, _: _path(m, [_pose(each.pose.position, each.pose.orientation) for each in m.poses]),
+        "geometry_msgs/msg/PoseArray": lambda m, _: _path(m, [_pose(e.position, e.orientation) for e in m.poses]),
+        "geometry_msgs/msg/PolygonStamped": lambda m, _: _path(m, [_pose(point) for point in m.polygon.points]),
+        "visualization_msgs/msg/Marker": path_of_marker,
+        "magnetosuture_msgs/msg/PredictedThread": lambda m, _: _path(m, [_pose(point) for point in m.positions]),
+    },
+    TWIST: {
+        TWIST: lambda m, _: MESSAGES.twist_stamped(_header_of(m), _twist(m.twist)),
+        # Stamped when it was recorded, in no frame.
+        UNSTAMPED_TWIST: lambda m, time: MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(m)),
+    },
+}
+
+
+def moved(message: Any, matrix: Matrix, frame: str) -> Any:
+    """Return a message of one of the types in `CONVERSIONS` in another frame.
+
+    Of a twist only the directions change: it stays the velocity of the same point, seen from a frame at rest.
+    A covariance C becomes M C M^T, where M turns position and rotation alike.
+    """
+    header = MESSAGES.header(message.header.stamp, frame)
+    kind = message.__msgtype__
+    if kind == POSE:
+        return MESSAGES.pose_stamped(header, _moved_pose(message.pose, matrix))
+    if kind == POSE_WITH_COVARIANCE:
+        both = np.kron(np.eye(2), matrix[:3, :3])
+        if len(message.pose.covariance) != 36:
+            raise UnfitError("a covariance of another size")
+        covariance = both @ np.reshape(message.pose.covariance, (6, 6)) @ both.T
+        return MESSAGES.pose_with_covariance(header, _moved_pose(message.pose.pose, matrix), covariance.ravel())
+    if kind == PATH:
+        return MESSAGES.path(header, [_moved_pose(each.pose, matrix) for each in message.poses])
+    return MESSAGES.twist_stamped(header, _twist(message.twist, matrix[:3, :3]))
+
+
+def _moved_pose(pose: Any, matrix: Matrix) -> Any:
+    from scipy.spatial.transform import Rotation
+
+    place = _moved_points(matrix, np.array([pose.position.x, pose.position.y, pose.position.z], dtype=float))
+    turn, rotation = pose.orientation, _rotation(pose.orientation)
+    if rotation is None:
+        raise UnfitError("an orientation that is none")
+    # Composed by hand, so that its length stays what it was: whoever takes it judges that.
+    turned = (Rotation.from_matrix(matrix[:3, :3]) * rotation).as_quat()
+    return MESSAGES.pose(place, turned * math.hypot(turn.x, turn.y, turn.z, turn.w))
+
+
+def _pose_in(message: Any) -> Any:
+    """Return the pose in a message, however deep."""
+    if hasattr(message, "transform"):
+        if matrix_of(message.transform.translation, message.transform.rotation) is None:
+            raise UnfitError("a transform that is none")
+        return _pose(message.transform.translation, message.transform.rotation)
+    pose = getattr(message.pose, "pose", message.pose)
+    return _pose(pose.position, pose.orientation)
+
+
+def _header_of(message: Any) -> Any:
+    return MESSAGES.header(message.header.stamp, message.header.frame_id)
+
+
+def _path(message: Any, poses: list[Any]) -> Any:
+    return MESSAGES.path(_header_of(message), poses)
+
+
+def _pose(position: Any, orientation: Any = None) -> Any:
+    turn = UPRIGHT
+    if orientation is not None:
+        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
+    return MESSAGES.pose((position.x, position.y, position.z), turn)
+
+
+def _twist(twist: Any, rotation: Matrix | None = None) -> Any:
+    vectors = [[each.x, each.y, each.z] for each in (twist.linear, twist.angular)]
+    if rotation is not None:
+        vectors = [(rotation @ vector).tolist() for vector in vectors]
+    return MESSAGES.twist(*(MESSAGES.vector(*vector) for vector in vectors))

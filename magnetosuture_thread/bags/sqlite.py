@@ -1,8 +1,8 @@
 """Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums.
 
-A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes. Only
-plain tables are read, within a number of steps that depends on the size of the file. A damaged one is refused: nothing
-tells its altered messages from the others.
+A database may be anything: views that compute their rows, trees that lead back to themselves, rows of gigabytes. It is
+read within a number of steps that depends on the size of the file. A damaged one is refused: nothing tells its altered
+messages from the others.
 """
 
 from __future__ import annotations
@@ -16,48 +16,42 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from mcap.records import Attachment, Metadata
-
-from magnetosuture_thread.bags.storage import ROS2_PROFILE, Connection, DamageReport, MessageDefinition, StoredMessage
+from magnetosuture_thread.bags.storage import (
+    QOS,
+    TYPE_HASH,
+    Connection,
+    DamageReport,
+    MessageDefinition,
+    StoredMessage,
+)
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import is_url
-from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
 
 UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
 _ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a damaged name
 _MAGIC = b"SQLite format 3\0"
-_SIDECARS = ("-wal", "-journal", "-shm")
-_METADATA_COLUMNS = {
-    "offered_qos_profiles": "offered_qos_profiles",
-    "topic_type_hash": "type_description_hash",
-}  # by metadata key
-_COLUMNS = {
-    "topics": ("id", "name", "type", "serialization_format"),
-    "messages": ("id", "topic_id", "timestamp", "data"),
-}
-# The last three are written anew: versions, and a copy of metadata.yaml.
-_OWN_TABLES = (*_COLUMNS, "message_definitions", "schema", "metadata", "sqlite_sequence")
-_MAX_ROW_ID = (1 << 63) - 1
+_MAX_TIME = (1 << 63) - 1
 _LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
 _MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
 # sqlite3 does not enforce column types, so that a row may hold anything.
-_IS_VALID = (
-    "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
-    f" AND length(data) <= {MAX_BLOCK_BYTES}"
-)
+_COUNT = """
+    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(
+        typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'
+    ) FROM messages GROUP BY topic_id
+"""
 
 
 class SqliteFile:
-    """A file of recorded messages in sqlite3; implements `BagStorage`, where the attributes are described.
+    """A file of recorded messages in sqlite3; see `McapFile` for the attributes.
 
     Args:
         path: the file.
         progress: called with the number of bytes read since the last call.
 
     Raises:
-        BagError: it cannot be read, is empty, or is no such file.
+        BagError: it cannot be read, is empty, damaged, or no such file.
     """
 
     def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
@@ -75,19 +69,16 @@ class SqliteFile:
         self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
         self.unchecked = UNCHECKED
-        self.profile, self.library = ROS2_PROFILE, ""
-        self.connections: dict[int, Connection] = {}
+        self.others: Counter[str] = Counter()
         self.counts: dict[int, int] = {}
         self.damage: DamageReport | None = None
         try:
             with closing(self._connect()) as database:
-                if (found := str(database.execute("PRAGMA quick_check(1)").fetchone()[0])) != "ok":
+                if (found := str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])) != "ok":
                     raise self._damaged(found)
-                self._check_tables(database)
                 self.connections = _connections(database)
-                if lost := self._count_messages(database):
-                    raise self._damaged(f"{lost} rows without a valid time, topic or data")
-        except sqlite3.OperationalError as error:  # locked, not to be opened, or too much work: that is no damage
+                self._count_messages(database)
+        except (sqlite3.OperationalError, sqlite3.DataError) as error:  # no such table, or too much work: no damage
             raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         except sqlite3.DatabaseError as error:
             raise self._damaged(_reason_of(error)) from None
@@ -95,6 +86,22 @@ class SqliteFile:
             raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         progress(size)
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
+
+    def _count_messages(self, database: sqlite3.Connection) -> None:
+        lost = longest = 0
+        times: list[int] = []
+        for topic, count, first, last, size, valid in database.execute(_COUNT):
+            if topic not in self.connections or valid < count:
+                lost += count - (valid if topic in self.connections else 0)
+                continue
+            self.counts[topic] = count
+            times += first, last
+            longest = max(longest, size)
+        if lost:
+            raise self._damaged(f"{lost} rows without a valid time, topic or data")
+        if longest > MAX_BLOCK_BYTES:
+            raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_BLOCK_BYTES} are read")
+        self.start, self.end = min(times, default=0), max(times, default=0)
 
     def _damaged(self, problem: str) -> BagError:
         words = " ".join(problem.split())
@@ -110,25 +117,19 @@ class SqliteFile:
         try:
             with closing(self._connect()) as database:
                 marks = ",".join("?" * len(wanted))
-                query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
-                between = f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
-                limits = (max(start, -_MAX_ROW_ID), min(end, _MAX_ROW_ID))
-                rows = database.execute(query + between, (*wanted, *limits))
+                query = (
+                    f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
+                    " AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
+                )
+                rows = database.execute(query, (*wanted, max(start, -_MAX_TIME), min(end, _MAX_TIME)))
                 yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
         except _ERRORS as error:
             raise BagError(self.path, f"cannot be read any more: {_reason_of(error)}") from None
 
-    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
-        """Yield nothing: the format has no attachments. Tables that rosbag2 does not write are counted."""
-        with closing(self._connect()) as database:
-            for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'"):
-                if name not in _OWN_TABLES:
-                    dropped[f"table {shortened(str(name))} of the database"] += 1
-        return iter(())
-
     def _connect(self) -> sqlite3.Connection:
         """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
-        sidecars = [path for end in _SIDECARS if (path := self.path.with_name(self.path.name + end)).exists()]
+        names = [self.path.name + end for end in ("-wal", "-journal", "-shm")]
+        sidecars = [path for name in names if (path := self.path.with_name(name)).exists()]
         for sidecar in sidecars:
             if not stat.S_ISREG(sidecar.stat().st_mode):
                 raise BagError(sidecar, "is a folder, pipe or device, expected the journal of a database")
@@ -137,7 +138,7 @@ class SqliteFile:
         database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
         database.text_factory = _decode_text
         if set_limit := getattr(database, "setlimit", None):  # from Python 3.11 on
-            set_limit(_LIMIT_LENGTH, MAX_BLOCK_BYTES + 1024)
+            set_limit(_LIMIT_LENGTH, 2 * MAX_BLOCK_BYTES)
         left = self._max_steps
 
         def step() -> int:
@@ -149,27 +150,6 @@ class SqliteFile:
         for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
             database.execute(f"PRAGMA {pragma}")
         return database
-
-    def _check_tables(self, database: sqlite3.Connection) -> None:
-        """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
-        for table, columns in _COLUMNS.items():
-            kinds = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchall()
-            if [kind for kind, _ in kinds] != ["table"] or "virtual" in str(kinds[0][1]).lower().split("(")[0]:
-                raise BagError(self.path, f"has no table {table}, which the database of a bag has")
-            found = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
-            missing = next((name for name in columns if found.get(name) != 0), None)
-            if missing is not None:
-                raise BagError(self.path, f"has no column {missing} in its table {table}, or one that is computed")
-
-    def _count_messages(self, database: sqlite3.Connection) -> int:
-        """Count the valid messages, and return the number of invalid rows."""
-        query = f"SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages WHERE {_IS_VALID} GROUP BY 1"
-        found = [row for row in database.execute(query) if row[0] in self.connections]
-        self.counts = {row[0]: row[1] for row in found}
-        self.start = min((row[2] for row in found), default=0)
-        self.end = max((row[3] for row in found), default=0)
-        (total,) = database.execute("SELECT COUNT(*) FROM messages").fetchone()
-        return int(total) - sum(int(row[1]) for row in found)
 
 
 def _decode_text(data: bytes) -> str | None:
@@ -196,15 +176,15 @@ def _connections(database: sqlite3.Connection) -> dict[int, Connection]:
     except _ERRORS:
         pass  # Older files have none.
     connections = {}
-    cursor = database.execute("SELECT * FROM topics")
-    names = [column[0] for column in cursor.description]
-    for row in cursor:
-        values = dict(zip(names, row, strict=True))
-        number, topic, kind, form = (values[name] for name in ("id", "name", "type", "serialization_format"))
+    database.row_factory = sqlite3.Row
+    for row in database.execute("SELECT * FROM topics"):
+        values = dict(row)
+        number, topic, kind, form = (values.get(name) for name in ("id", "name", "type", "serialization_format"))
         if number in connections:
             raise sqlite3.DatabaseError("its table of topics leads back to itself")
-        if isinstance(number, int) and all(isinstance(word, str) for word in (topic, kind, form)):
-            entries = {key: values.get(column) for key, column in _METADATA_COLUMNS.items()}
+        if isinstance(number, int) and isinstance(topic, str) and isinstance(kind, str) and isinstance(form, str):
+            entries = {QOS: values.get("offered_qos_profiles"), TYPE_HASH: values.get("type_description_hash")}
             metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
             connections[number] = Connection(topic, definitions.get(kind, MessageDefinition(kind)), form, metadata)
+    database.row_factory = None
     return connections

@@ -1,16 +1,36 @@
-"""Common interface of the storage formats: connections, messages in the order of time, and reports of damage."""
+"""What all formats of bags share: their files and metadata, connections, messages by time, and reports of damage."""
 
 from __future__ import annotations
 
 import heapq
+import json
 import math
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+import re
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-from mcap.records import Attachment, Metadata
+import yaml
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+
+from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.interface import STORAGE_SUFFIXES
+from magnetosuture_thread.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
+
+CDR = "cdr"  # how ROS 2 writes messages
+METADATA_FILE = "metadata.yaml"
+COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in STORAGE_SUFFIXES)
+QOS = "offered_qos_profiles"  # metadata key of a connection, in mcap and in sqlite3
+TYPE_HASH = "topic_type_hash"  # another
+NOTES = "magnetosuture"  # name of the mcap record that holds our notes
+NOTES_PREFIX = f"{NOTES}."  # of our entries in metadata.yaml
+UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one without checksums: why it may be wrong
+UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
+MAX_ALIASES = 16  # in metadata.yaml; some recorders write none, others a few
+_CHECKSUM = "crc32"  # note: of all others
 
 
 @dataclass(frozen=True)
@@ -87,10 +107,6 @@ def merge_reports(reports: Iterable[DamageReport | None]) -> DamageReport | None
     )
 
 
-CDR = "cdr"  # how ROS 2 writes messages
-ROS2_PROFILE = "ros2"  # of mcap files of ROS 2
-
-
 @dataclass(frozen=True)
 class MessageDefinition:
     """The definition of a message type in a bag.
@@ -147,46 +163,6 @@ class StoredMessage(NamedTuple):
     sequence: int | None = None
 
 
-class BagStorage(Protocol):
-    """A file of recorded messages, verified and open for reading.
-
-    Attributes:
-        path: the file.
-        connections: by number.
-        counts: number of messages that can be read, by connection.
-        start: time of the first of them [ns]; 0 if there are none.
-        end: time of the last of them [ns].
-        notes: notes of our writer.
-        damage: what is corrupt and lost; None if nothing is.
-        unchecked: why damage may not have been noticed, in one line; empty if it would have been.
-        facts: properties of the file for a person, for example chunks and compression.
-        profile: which conventions the file follows, as mcap names them.
-        library: that wrote it; empty where the format does not say.
-    """
-
-    path: Path
-    connections: dict[int, Connection]
-    counts: dict[int, int]
-    start: int
-    end: int
-    notes: dict[str, str]
-    damage: DamageReport | None
-    unchecked: str
-    facts: dict[str, str]
-    profile: str
-    library: str
-
-    def extras(self, dropped: Counter[str]) -> Iterator[Attachment | Metadata]:
-        """Yield attachments and foreign metadata records; what cannot be vouched for is counted by reason."""
-
-    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
-        """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
-
-        Raises:
-            BagError: the file has changed since it was verified, or cannot be read any more.
-        """
-
-
 def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage]]]]) -> Iterator[StoredMessage]:
     """Yield the messages of all parts by time; of parts that do not overlap, one is in memory at a time.
 
@@ -216,3 +192,131 @@ def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage
                 heapq.heappush(heap, (item.time, part, item, items))
                 break
             yield item
+
+
+@dataclass(frozen=True)
+class BagFiles:
+    """The files of a bag, and what its metadata.yaml says.
+
+    Attributes:
+        files: in the order in which they were recorded.
+        missing: names of those that are listed in metadata.yaml and do not exist.
+        remarks: on what is not read or not used, a line each.
+        notes: of our writer.
+        custom_data: entries of others.
+    """
+
+    files: list[Path]
+    missing: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    notes: dict[str, str] = field(default_factory=dict)
+    custom_data: dict[str, str] = field(default_factory=dict)
+
+
+def find_bag_files(path: Path) -> BagFiles:
+    """Return the files of a bag.
+
+    Args:
+        path: a file, or a folder with one or, where a recorder split the bag, several.
+
+    Raises:
+        BagError: there is no bag.
+    """
+    try:
+        path.stat()
+        is_file = path.is_file()
+        inside = [path] if is_file else sorted(path.iterdir(), key=_by_number)
+        files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
+    except FileNotFoundError as error:
+        raise BagError(path, "does not exist; expected an mcap file or the folder of a bag") from error
+    except Exception as error:  # The file system of a URL raises whatever its library does.
+        problem = getattr(error, "strerror", None) or error
+        raise BagError(path, f"cannot be read: {problem}") from error
+    compressed = [file.name for file in inside if file.name.endswith(COMPRESSED_SUFFIXES)]
+    if compressed and not files:
+        raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0]}")
+    if is_file:
+        return BagFiles([path])
+    if not files:
+        raise BagError(path, f"holds no {' or '.join(STORAGE_SUFFIXES)} file")
+    content, remarks = _read_metadata(path)
+    names: list[str] = content.pop("names", [])
+    present = {file.name: file for file in files}
+    if listed := [present[name] for name in names if name in present]:
+        missing = [name for name in names if name not in present]
+        remarks += [f"{name} is not read: {METADATA_FILE} does not list it" for name in present if name not in names]
+        return BagFiles(listed, missing, remarks, **content)
+    bases = {(_by_number(file)[0], file.suffix) for file in files}
+    if len(files) > 1 and (len(bases) > 1 or any(_by_number(file)[1] < 0 for file in files)):
+        kind = " and ".join(sorted({file.suffix for file in files}, reverse=True))
+        raise BagError(path, f"holds {len(files)} {kind} files; name one of them")
+    return BagFiles(files, remarks=remarks, **content)
+
+
+def _by_number(path: Path) -> tuple[str, int, str]:
+    """Sort files of a split bag as they were recorded: bag_2 before bag_10."""
+    found = re.fullmatch(r"(.*?)_?(\d+)", path.stem)
+    return (found[1], int(found[2]), path.name) if found else (path.stem, -1, path.name)
+
+
+def _read_metadata(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Return names of files, notes and custom data of a bag's metadata.yaml; and in a line why it is not used."""
+    try:
+        text = read_regular(folder / METADATA_FILE, MAX_METADATA_BYTES).decode("utf-8")
+        check_yaml(text, max_aliases=MAX_ALIASES)
+        information = yaml.load(text, yaml.CSafeLoader)["rosbag2_bagfile_information"]
+        names = list(dict.fromkeys(Path(name).name for name in information["relative_file_paths"]))
+        custom = information.get("custom_data")
+        entries = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, Mapping) else {}
+        ours = {key.removeprefix(NOTES_PREFIX): entries.pop(key) for key in [*entries] if key.startswith(NOTES_PREFIX)}
+        return {"names": names, "notes": verified_notes(ours) or {}, "custom_data": entries}, []
+    except FileNotFoundError:
+        return {}, []
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        problem = getattr(error, "strerror", None) or "is not what rosbag2 writes"
+    except BudgetError as error:
+        problem = f"has {error}"
+    except yaml.YAMLError:
+        problem = "is no YAML"
+    return {}, [f"{METADATA_FILE} is not used: {problem}"]
+
+
+def add_checksum(notes: Mapping[str, str]) -> dict[str, str]:
+    """Return notes with their checksum, to be written."""
+    return {**notes, _CHECKSUM: f"{zlib.crc32(json.dumps(sorted(notes.items())).encode()):08x}"}
+
+
+def verified_notes(entries: Mapping[str, str], *, data_verified: bool = False) -> dict[str, str] | None:
+    """Return notes without their checksum; None where it is wrong.
+
+    Args:
+        entries: as they were read.
+        data_verified: whether a checksum of the whole file is correct; then the notes need none of their own.
+    """
+    notes = {key: value for key, value in entries.items() if key != _CHECKSUM}
+    return notes if data_verified or entries == add_checksum(notes) else None
+
+
+def parse_qos_profiles(text: str) -> list[dict[str, Any]]:
+    """Return the profiles of a topic's publishers, their policies by name; none where they cannot be read.
+
+    Up to Iron, policies were written by number. A reader that expects names cannot play such a topic.
+
+    Args:
+        text: YAML, as a recorder keeps it with a topic.
+    """
+    try:
+        if len(text) > MAX_TEXT_BYTES:
+            return []
+        check_yaml(text)
+        return [{**profile} for profile in dump_qos_v9(parse_qos(text))]
+    except Exception:  # The parser raises whatever the text makes it stumble over.
+        return []
+
+
+def jazzy_qos_profiles(text: str) -> str:
+    """Return profiles as Jazzy keeps them with a topic, by name; the text itself where it does so or cannot be read."""
+    profiles = parse_qos_profiles(text)
+    if not profiles or yaml.load(text, yaml.CSafeLoader) == profiles:
+        return text
+    return yaml.safe_dump(profiles, sort_keys=False)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 from magnetosuture_thread.calibration.parameters import (
     DAMPING,
@@ -17,24 +19,21 @@ from magnetosuture_thread.calibration.parameters import (
     stiffness_over_drag,
     with_stiffness_over_drag,
 )
-from magnetosuture_thread.calibration.residuals import Replays, across_residuals, mean_error, offset_residuals
+from magnetosuture_thread.calibration.recorded_run import (
+    RecordedRun,
+    Replays,
+    across_residuals,
+    offset_residuals,
+)
 from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Array = NDArray[np.float64]
 
-STEP, ROUGH_STEP = 0.01, 0.5  # of the change that counts, in difference quotients; the second for `paper`
-NO_GAIN, NO_STEP, FLAT = 1e-4, 1e-3, 1e-10  # of cost, numbers and gradient, where a fit ends
-MAX_STEPS = 15
-MAX_TRIED, NEAR_X, NEAR_ERROR = 60, 0.05, 0.005  # of the simplex; changes that count, and % of length, where it ends
-OUTLIER = 3.0  # scatters; beyond, a residual counts by its size only, not by its square
 STARTS = tuple(10.0 ** (power / 1.5) for power in range(-3, 4))  # of the material's stiffness
 MAX_STARTS = 2  # of them, of each attachment, are fitted: the best local minima
-DAMPINGS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)  # kappa
-WEIGHTS = (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)  # W_stiff
 POOR, MUCH = 3.0, 1.0  # times the better error, and % of length more, where an attachment is given up after the starts
 WORSE_TIMES, WORSE_BY = 2.0, 0.05  # the same once the stiffness of each has been fitted
-MIN_SCALE = 1e-3  # of the thread's length, below which nothing is an outlier
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,6 @@ class Objective:
         self._which = tuple(range(len(replays.runs)) if which is None else which)
         self._replays, self._runs = replays, [replays.runs[index] for index in self._which]
         self._residuals = offset_residuals if whole else across_residuals
-        self._rough = base.formulation == "paper"
         self._units = np.array([parameter.counts(base) for parameter in parameters])
         self._low, self._high = np.array([parameter.fit_bounds(base) for parameter in parameters]).reshape(-1, 2).T
 
@@ -123,7 +121,8 @@ class Objective:
 
     def jacobian(self, x: Array) -> list[Array]:
         """Return derivatives by difference quotients, away from the nearer bound; shape (K, n, P) of each run."""
-        lengths = (ROUGH_STEP if self._rough else STEP) * self._units
+        # Predictions of `paper` jump by 0.01 % of the length from one number to the next.
+        lengths = (0.5 if self.base.formulation == "paper" else 0.01) * self._units
         steps = lengths * np.where(x + lengths <= self._high, 1.0, -1.0)
         middle, *moved = self.residuals(x, *(x + np.diag(steps)))
         return [
@@ -142,17 +141,11 @@ class Objective:
             start: numbers to begin with; those of the base if None.
             scale: of the robust loss, as a share of the length; inf for plain least squares.
 
-        For the formulation `paper`, whose predictions jump by 0.01 % of the length from one number to the next, the
-        simplex of Nelder and Mead makes the mean prediction error least instead.
-
-        Source: nonlinear least squares by scipy, trust region reflective; J. A. Nelder, R. Mead, Computer Journal 7
-        (1965).
+        Source: nonlinear least squares by scipy, trust region reflective.
         """
         first = self.start() if start is None else np.clip(start, self._low, self._high)
         x, cost = first, 0.0
-        if self._rough and self.parameters:
-            x, cost = self._simplex(first)
-        elif self.parameters:  # else only the attachment is asked for
+        if self.parameters:  # else only the attachment is asked for
             units = self._units
             found = least_squares(
                 lambda y: np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]]),
@@ -161,47 +154,23 @@ class Objective:
                     units * np.concatenate([part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)])
                 ),
                 bounds=((self._low - first) / units - 1e-9, (self._high - first) / units + 1e-9),
-                ftol=NO_GAIN,
-                xtol=NO_STEP,
-                gtol=FLAT,
+                ftol=1e-4,
+                xtol=1e-3,
+                gtol=1e-10,
                 loss="linear" if np.isinf(scale) else "soft_l1",
                 f_scale=1.0 if np.isinf(scale) else scale,
-                max_nfev=MAX_STEPS,
+                max_nfev=15,
             )
             x, cost = np.clip(first + units * found.x, self._low, self._high), float(found.cost)
         residuals = self.residuals(x)[0]
         return FitSolution(self.settings(x), self.parameters, x, residuals, self.jacobian(x), scale, cost)
-
-    def _simplex(self, first: Array) -> tuple[Array, float]:
-        """Return where the mean over the runs of the prediction error is least, and the error [% of length]."""
-        low, high, units = self._low, self._high, self._units
-        corners = np.vstack([first, first + np.diag(np.where(first + units <= high, units, -units))])
-
-        def error(x: Array) -> float:
-            (vertices,), length = self._replays.of([self.settings(x)], self._which), self.base.thread_length
-            pairs = zip(vertices, self._runs, strict=True)
-            return float(np.mean([mean_error(v, run.targets, length) for v, run in pairs]))
-
-        found = minimize(
-            error,
-            first,
-            method="Nelder-Mead",
-            bounds=list(zip(low.tolist(), high.tolist(), strict=True)),
-            options={
-                "initial_simplex": np.clip(corners, low, high),
-                "maxfev": MAX_TRIED,
-                "xatol": NEAR_X * float(units.min()),
-                "fatol": NEAR_ERROR,
-            },
-        )
-        return np.clip(found.x, low, high), float(found.fun)
 
 
 def robust_scale(residuals: Sequence[Array]) -> float:
     """Return the scale of the robust loss: three times the scatter of the residuals, by their median size."""
     sizes = np.abs(np.concatenate([part[part != 0.0] for part in residuals]))
     middle = float(np.median(sizes)) if len(sizes) else 0.0
-    return max(OUTLIER * 1.4826 * middle, MIN_SCALE)
+    return max(3.0 * 1.4826 * middle, 1e-3)
 
 
 def initial_guesses(
@@ -222,7 +191,10 @@ def initial_guesses(
     bases, count = [replace(start, attachment=kind) for kind in kinds], len(replays.runs)
     if start.formulation == "paper":  # whose error has several minima in kappa and W_stiff
         tried = [start]
-        for parameter, values in ((DAMPING, DAMPINGS), (STIFFNESS_WEIGHT, WEIGHTS)):
+        for parameter, values in (
+            (DAMPING, (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)),
+            (STIFFNESS_WEIGHT, (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)),
+        ):
             if parameter in parameters:
                 tried = [parameter.write(settings, value) for settings in tried for value in values]
         replays.begin_stage("starts", count * len(tried))
@@ -266,3 +238,142 @@ def local_minima(values: Sequence[float]) -> list[int]:
     padded = [np.inf, *values, np.inf]
     lows = [i for i, value in enumerate(values) if value < padded[i] and value <= padded[i + 2]]
     return sorted(lows, key=lambda i: values[i]) or [0]
+
+
+FLOOR = 2e-3  # of the length
+MIN_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
+CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
+MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
+
+
+class Uncertainty(NamedTuple):
+    """How well numbers are determined.
+
+    Attributes:
+        half: half of the 95 % interval of each, in the scale of the fit, shape (P,).
+        effect: mean size of d residual / d x of each that no other makes up for, as a share of the length, shape (P,).
+        correlation: of their estimates, from J' W J, shape (P, P).
+    """
+
+    half: Array
+    effect: Array
+    correlation: Array
+
+
+def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]) -> Uncertainty:
+    """Return how well some of a solution's numbers are determined, the others taken as they are.
+
+    Args:
+        solution: of a fit.
+        runs: that it was fitted to.
+        columns: of the numbers.
+    """
+    jacobian = [j[..., list(columns)] for j in solution.jacobian]
+    flat = np.concatenate([j[run.known] for j, run in zip(jacobian, runs, strict=True)])
+    weights = np.concatenate([w[run.known] for w, run in zip(solution.weights, runs, strict=True)])
+    size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), MIN_EFFECT)
+    inverse = np.linalg.pinv((flat / size).T @ (weights[:, None] * flat / size), rcond=1e-12, hermitian=True)
+    deviation = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    correlation = np.clip(inverse / np.outer(deviation, deviation), -1.0, 1.0)
+    effect = np.array([_own_effect(flat, weights, index) for index in range(len(columns))])
+    blocks, whole = [], []  # J' W r of each block of time, and of each run
+    for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
+        by_frame, block = np.einsum("knp,kn->kp", j / size, w * r), run.blocks
+        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
+        whole.append(by_frame.sum(axis=0))
+    half = _half(inverse, np.array(blocks))
+    if len(runs) >= 3:
+        half = np.maximum(half, _half(inverse, np.array(whole)))
+    return Uncertainty(half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
+
+
+def _half(inverse: Array, scores: Array) -> Array:
+    """Return half of each 95 % interval by the scores of blocks, shape (G, P)."""
+    count = len(scores)
+    if count < 2:
+        return np.full(scores.shape[1], np.inf)
+    middle = count / (count - 1.0) * scores.T @ scores
+    variance = np.maximum(np.diag(inverse @ middle @ inverse), 0.0)
+    return np.asarray(stdtrit(count - 1, 0.975) * np.sqrt(variance))
+
+
+def _own_effect(flat: Array, weights: Array, index: int) -> float:
+    """Return the mean size of a column of the Jacobian, less what the other columns make up for."""
+    own, others = flat[:, index], np.delete(flat, index, axis=1)
+    if others.shape[1]:
+        root = np.sqrt(weights)[:, None]
+        scale = np.maximum(np.linalg.norm(root * others, axis=0), MIN_EFFECT)
+        own = own - (others / scale) @ np.linalg.lstsq(root * others / scale, root[:, 0] * own, rcond=None)[0]
+    return float(np.abs(own).mean())
+
+
+class Identifiability(NamedTuple):
+    """Identifiability of one parameter, with its confidence interval.
+
+    Attributes:
+        reason: why it cannot be identified; empty if it can.
+        half: half of its 95 % interval, in the scale of the fit.
+        effect: of a change that counts, as a share of the length.
+    """
+
+    reason: str
+    half: float
+    effect: float
+
+
+def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:
+    """Return the identifiability of each parameter of a solution.
+
+    Args:
+        solution: of a fit to all that is unknown.
+        runs: that it was fitted to.
+    """
+    parameters, settings = solution.parameters, solution.settings
+    counts = np.array([parameter.counts(settings) for parameter in parameters])
+    found: dict[int, Identifiability] = {}
+    for index, parameter in enumerate(parameters):
+        if solution.at_bound(index):
+            reason = f"the fit ends at its bound, {parameter.from_fit(float(solution.x[index])):.3g}"
+            found[index] = Identifiability(reason, np.inf, 0.0)
+    left = [index for index in range(len(parameters)) if index not in found]
+    while left:
+        uncertainty = estimate_uncertainty(solution, runs, left)
+        half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
+        pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
+        if pairs.max() <= 0.95:
+            for place, index in enumerate(left):
+                reason = _too_short(solution, index, runs) or _reason(solution, index, effect[place], half[place])
+                found[index] = Identifiability(reason, half[place], effect[place])
+            break
+        one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
+        name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
+        reason = f"cannot be told apart from {name}: correlation {value:.2f}"
+        found[left.pop(one)] = Identifiability(reason, half[one], effect[one])
+    return [found[index] for index in range(len(parameters))]
+
+
+def _reason(solution: FitSolution, index: int, effect: float, half: float) -> str:
+    parameter, settings = solution.parameters[index], solution.settings
+    if effect < FLOOR:
+        change = (
+            f"{parameter.counts(settings):.3g} {parameter.unit}" if parameter.kind == "plain" else "a factor of two"
+        )
+        moved = f"{change} moves the prediction by {100.0 * effect:.2g} % of the length only"
+        return f"{moved}, less than the {100.0 * FLOOR:g} % that camera, tracker and model are wrong by"
+    if half > parameter.widest(settings):
+        low, high = parameter.interval(float(solution.x[index]), half)
+        return f"its 95 % interval is {low:.3g} to {high:.3g} {parameter.unit}".rstrip() + ", too wide to be of use"
+    return ""
+
+
+def _too_short(solution: FitSolution, index: int, runs: Sequence[RecordedRun]) -> str:
+    """Return in words that the stiffness acts on too small a part of the thread; empty if it does not."""
+    parameter, length = solution.parameters[index], solution.settings.thread_length
+    speed = min(run.speed for run in runs)
+    if parameter is not STIFFNESS_OVER_DRAG or speed <= 0.0:
+        return ""
+    bend = float(np.cbrt(parameter.from_fit(float(solution.x[index])) / speed))
+    if bend >= MIN_BEND * length:
+        return ""
+    part = f"{1e3 * bend:.1f} mm, {bend / length:.1%} of the thread"
+    return f"bending acts within {part} only; elsewhere it goes where it is pulled, however stiff"

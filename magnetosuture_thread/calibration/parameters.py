@@ -23,13 +23,10 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"
-DOUBLED = math.log(2.0)
 WIDEST = math.log(1.5)  # of a logarithm: half an interval beyond says nothing of use
 LOGARITHM = 700.0  # whose exponential is a number yet
 STIFFNESS_RANGE = 1e3  # B is looked for within this factor of the material's
-MAX_MODULUS = 0.99e12  # Pa; just within what a setup may say
 OFFSET_COUNTS, MAX_OFFSET = 0.01, 0.1  # of the thread's length
-MAX_KAPPA = 0.999  # kappa
 MIN_WEIGHT, MAX_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
 
 Settings = ThreadModelSettings
@@ -55,7 +52,7 @@ class Parameter:
     unit: str
     kind: str
     bounds: Callable[[Settings], tuple[float, float]]
-    counts: Callable[[Settings], float] = field(default=lambda settings: DOUBLED)
+    counts: Callable[[Settings], float] = field(default=lambda settings: math.log(2.0))
     getter: Callable[[Settings], float] | None = None
     setter: Callable[[Settings, float], Settings] | None = None
 
@@ -120,7 +117,8 @@ def with_stiffness_over_drag(settings: Settings, value: float) -> Settings:
 
 def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
     middle = stiffness_over_drag(replace(settings, elastic_modulus=0.0))  # the material's
-    most = stiffness_over_drag(replace(settings, elastic_modulus=MAX_MODULUS))
+    # Just within what a setup may say [Pa].
+    most = stiffness_over_drag(replace(settings, elastic_modulus=0.99e12))
     return middle / STIFFNESS_RANGE, min(middle * STIFFNESS_RANGE, most)
 
 
@@ -166,7 +164,7 @@ REST_CURVATURE = Parameter(
     _curvature_bounds,
     lambda settings: 1.0 / settings.thread_length,  # by which the thread turns by one radian on its whole length
 )
-DAMPING = Parameter("kappa", "paper_damping", "", "lost", lambda settings: (0.0, MAX_KAPPA))
+DAMPING = Parameter("kappa", "paper_damping", "", "lost", lambda settings: (0.0, 0.999))
 STIFFNESS_WEIGHT = Parameter(
     "W_stiff",
     "paper_stiffness_weight",

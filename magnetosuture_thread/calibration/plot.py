@@ -9,12 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from magnetosuture_thread.calibration.residuals import across_residuals
+from magnetosuture_thread.calibration.recorded_run import across_residuals
 from magnetosuture_thread.calibration.result import FIXED, BagFit, CalibrationResult, Estimate
 from magnetosuture_thread.evaluation.plots import FAINT, INK, PREDICTED, tidy
-
-BEFORE = "#b4bcc4"
-MIN_SHOWN = 1e-3  # % of length
 
 
 def draw_calibration(path: Path, calibration: CalibrationResult, fits: Sequence[BagFit]) -> None:
@@ -55,9 +52,9 @@ def _summary(calibration: CalibrationResult) -> str:
 def _draw_along(axes: Axes, length: float, fits: Sequence[BagFit]) -> None:
     """Draw the distance across the thread from needle to end, mean over all bags and frames."""
     count = sum(fit.run.known.sum(axis=0) for fit in fits)
-    for kind, colour in (("before", BEFORE), ("after", PREDICTED)):
+    for kind, colour in (("before", "#b4bcc4"), ("after", PREDICTED)):
         total = sum(np.abs(across_residuals(getattr(fit, kind), fit.run, length)).sum(axis=0) for fit in fits)
-        mean = np.where(count > 0, np.maximum(100.0 * total / np.maximum(count, 1), MIN_SHOWN), np.nan)
+        mean = np.where(count > 0, np.maximum(100.0 * total / np.maximum(count, 1), 1e-3), np.nan)
         at = 1e3 * length * np.arange(1, len(mean) + 1) / len(mean)
         axes.semilogy(at, mean, color=colour, linewidth=1.3, marker="o", markersize=2.0, label=kind)
     axes.set_xlim(0.0, 1e3 * length)

@@ -12,18 +12,13 @@ import numpy as np
 from rich.table import Table
 
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
-from magnetosuture_thread.calibration.recorded_run import RecordedRun
-from magnetosuture_thread.calibration.residuals import mean_across, mean_error
+from magnetosuture_thread.calibration.recorded_run import RecordedRun, mean_across, mean_error
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
-WORSE = 1.05  # times the error before, from which on a person should know
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
 WIDTH = 118
-# Of the thread and its liquid, what gives the fitted numbers their meaning; with 0 the material's diameter counts.
-GIVEN = ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction")
-UNITS = {"elastic_modulus": "Pa", "rest_curvature": "1/m", OFFSET: "m, along and left"}
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
     "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
@@ -117,7 +112,7 @@ class BagErrors:
     @property
     def warning(self) -> str:
         """Warning about a bag whose nodes fit worse than before; empty if there is none."""
-        if not self.after > WORSE * self.before:
+        if not self.after > 1.05 * self.before:
             return ""
         better = self.across_after <= self.across_before
         end = "what is left lies along it, where noise moves the measured thread" if better else "do not use"
@@ -240,7 +235,8 @@ def to_yaml(calibration: CalibrationResult) -> str:
     settings = calibration.settings
     if settings.formulation != "rod":
         lines.append(f"    formulation: {settings.formulation}")
-    for name in GIVEN:
+    # What gives the fitted numbers their meaning; with 0 the material's diameter counts.
+    for name in ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction"):
         value = getattr(settings, name)
         if name != "diameter" or value:
             lines.append(f"    {name}: {_written(value)}")
@@ -314,7 +310,8 @@ def _entry(name: str, estimates: list[Estimate], settings: ThreadModelSettings) 
     if name == OFFSET and not value:
         value = (0.0, 0.0)
     intervals = "; ".join(_interval(estimate) for estimate in estimates if estimate.status == IDENTIFIED)
-    note = " ".join(part for part in (UNITS.get(name, ""), "" if not intervals else f"[{intervals}]") if part)
+    units = {"rest_curvature": "1/m", OFFSET: "m, along and left"}
+    note = " ".join(part for part in (units.get(name, ""), intervals and f"[{intervals}]") if part)
     if name == "elastic_modulus":
         note = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s" + (f" [{intervals}]" if intervals else "")
     return [*lines, f"    {name}: {_written(value)}" + (f" # {note}" if note else "")]

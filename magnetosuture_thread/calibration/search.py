@@ -9,16 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from magnetosuture_thread.calibration.fit import Array, FitSolution, Objective, initial_guesses, robust_scale
-from magnetosuture_thread.calibration.identifiability import Identifiability, assess_identifiability
+from magnetosuture_thread.calibration.fit import (
+    Array,
+    FitSolution,
+    Identifiability,
+    Objective,
+    assess_identifiability,
+    initial_guesses,
+    robust_scale,
+)
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
     Parameter,
     choose_parameters,
 )
-from magnetosuture_thread.calibration.recorded_run import RecordedRun
-from magnetosuture_thread.calibration.residuals import BestSettings, Replays, RunTasks, mean_across
+from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, Replays, RunTasks, mean_across
 from magnetosuture_thread.calibration.result import (
     FIXED,
     IDENTIFIED,
@@ -36,7 +42,6 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 MIN_IMPROVEMENT = 0.05  # % of length by which an attachment must fit better, besides the noise
 GIVEN_WAY = 0.1  # % of length; a default that predicts worse by more gives way to what was fitted
-NARROWER = 0.5  # of the robust loss's scale, where the fit is repeated with the smaller one
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -147,7 +152,7 @@ class _Search:
         scale = robust_scale(objective.residuals(objective.start())[0])
         solution = objective.fit(scale=scale)
         narrower = robust_scale(solution.residuals)
-        return objective.fit(solution.x, narrower) if narrower < NARROWER * scale else solution
+        return objective.fit(solution.x, narrower) if narrower < 0.5 * scale else solution
 
     def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
         """Return the solution whose attachment fits better, or the setup's where that cannot be told."""

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.parameters import choose_parameters
-from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
-from magnetosuture_thread.calibration.residuals import BestSettings, replay_pool
+from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, read_run, replay_pool
 from magnetosuture_thread.calibration.result import (
     CalibrationResult,
     bag_table,

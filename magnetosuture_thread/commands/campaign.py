@@ -45,7 +45,7 @@ from magnetosuture_thread.commands.command import (
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
+from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.setups import Setup, read_procedure_setup

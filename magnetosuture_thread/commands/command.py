@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.segment import Segment
 
 from magnetosuture_thread import ConfigurationError
-from magnetosuture_thread.bags.remap import parse_remap
+from magnetosuture_thread.bags import parse_remap
 from magnetosuture_thread.files import parse_location
 from magnetosuture_thread.outputs import input_problem, output_problem
 from magnetosuture_thread.texts import printable

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, interface
-from magnetosuture_thread.bags.bag_folder import METADATA_FILE, find_bag_files
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
+from magnetosuture_thread.bags.storage import METADATA_FILE, find_bag_files
 from magnetosuture_thread.commands.command import (
     DONE,
     FAILED,
@@ -47,20 +47,21 @@ from magnetosuture_thread.commands.replay import find_photos
 from magnetosuture_thread.commands.track import numbered
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.figures import STAGES, BagDetails, Figures, LiveFigures
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.page import write_page
 from magnetosuture_thread.evaluation.plots import draw_case, draw_worst_frame
-from magnetosuture_thread.evaluation.reference import NOT_ONE, ReferenceTrajectory
-from magnetosuture_thread.evaluation.reference_scores import (
+from magnetosuture_thread.evaluation.reference import (
+    NOT_ONE,
     CaseResult,
     Evaluation,
+    ReferenceTrajectory,
     StepFigures,
     find_references,
     run_case,
     score,
     score_each,
 )
-from magnetosuture_thread.evaluation.report.figures import STAGES, BagDetails, Figures, LiveFigures
-from magnetosuture_thread.evaluation.report.page import write_page
 from magnetosuture_thread.evaluation.tables import (
     Row,
     bags_table,

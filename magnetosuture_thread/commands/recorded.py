@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, NeedlePose, Scene, interface
-from magnetosuture_thread.bags.bag_folder import UNVERIFIED_NOTE
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.storage import UNVERIFIED_NOTE
 from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.frames import FrameResult, Observation

@@ -35,9 +35,8 @@ from magnetosuture_thread.commands.recorded import (
     read_image,
 )
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.estimation import compare_errors
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import RunMetrics, finite_or_none
+from magnetosuture_thread.evaluation.metrics import RunMetrics, compare_errors, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
 from magnetosuture_thread.messages.packing import (
     Outputs,

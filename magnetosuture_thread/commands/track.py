@@ -17,10 +17,9 @@ import numpy as np
 from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError, read_scene
-from magnetosuture_thread.bags.bag_folder import COMPRESSED_SUFFIXES
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.storage import pluralize
+from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands.command import (
     DONE,
     Terminal,

@@ -22,20 +22,14 @@ Vector = NDArray[np.float64]
 Obstacles = tuple[Workspace, float]
 
 MAX_PIECES = 64  # of an observation
-MAX_POINTS = 4  # of a piece, for each segment that it could cover; of more, every so many is taken
 MIN_POINTS = 2  # of a piece
 MAX_COORDINATE = 10.0  # m; also the largest deviation
 MIN_DEVIATION = 5e-6  # m; standard deviation of a measured point, however good the camera says it is
 POINT_CORRELATION = 2.5e-4  # m along a piece; points closer than this err alike and share one point's information
-DETOUR = 8.0  # standard deviations that noise may lengthen the path by at a point
-PATH_STEP = 20.0  # standard deviations; steps of a path over which its length is measured
-MAX_SKIPPED = 8  # points in a row that may be outliers
 PATH_ERROR = 0.005  # of an arc length that is measured along a piece
 LENGTH_ERROR = 0.005  # of the length, by which a thread is known to be longer or shorter than told
 WHOLE = 0.05  # of the length, by which a piece from the tail to the free end may differ and still be the thread
-SEARCH_POINTS = 24  # of a piece, which the search for its beginning compares
 GATE = 4.0  # standard deviations; a piece of unknown arc length that is farther from the prior is another thread's
-OVERLAP = 0.5  # of a piece; where another piece shows so much of it already, it is a duplicate or of another thread
 
 
 @compiled
@@ -56,7 +50,8 @@ def path_without_outliers(points: Points, spacing: float, penalty: float) -> NDA
     best, last = np.inf, 0
     for i in range(count):
         cost[i], before[i] = penalty * i, -1
-        for j in range(max(0, i - MAX_SKIPPED), i):
+        # At most 8 points in a row are outliers.
+        for j in range(max(0, i - 8), i):
             step = np.hypot(points[i, 0] - points[j, 0], points[i, 1] - points[j, 1])
             value = cost[j] + max(step - 2.0 * spacing * (i - j), 0.0) + penalty * (i - j - 1)
             if value <= cost[i]:
@@ -122,12 +117,14 @@ def read_piece(
         spacing = np.hypot(path[1:, 0] - path[:-1, 0], path[1:, 1] - path[:-1, 1])
         usual = np.median(spacing)
         if spacing.max() > 2.0 * usual:  # else the path through all points costs nothing
-            kept = path_without_outliers(path, usual, DETOUR * np.median(deviations))
+            # Noise lengthens the path at a point by eight standard deviations at most.
+            kept = path_without_outliers(path, usual, 8.0 * np.median(deviations))
             path, deviations = path[kept], deviations[kept]
     last = len(path) - 1
     if last < 1:
         return path, deviations, np.zeros(last + 1), np.ones(last + 1)
-    arcs, share = path_lengths(path, PATH_STEP * np.median(deviations)), np.empty(last + 1)
+    # Length is measured over steps of 20 standard deviations.
+    arcs, share = path_lengths(path, 20.0 * np.median(deviations)), np.empty(last + 1)
     for k in range(last + 1):
         own = 0.5 * (arcs[min(k + 1, last)] - arcs[max(k - 1, 0)]) * (2.0 if k in (0, last) else 1.0)
         share[k] = min(1.0, own * unit / POINT_CORRELATION)
@@ -172,7 +169,8 @@ def search_start(
         high: [D]
         cap: [D^2]
     """
-    stride = max(1, len(points) // SEARCH_POINTS)
+    # So many points are enough to find where a piece begins.
+    stride = max(1, len(points) // 24)
     some, at = points[::stride].copy(), arcs[::stride].copy()
     steps = max(1, int(np.ceil(2.0 * (high - low))))
     best, found = np.inf, low
@@ -297,7 +295,7 @@ def place_pieces(
             problems.append(found)
             continue
         low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
-        if placed and high > low and np.count_nonzero(covered[low:high]) > OVERLAP * (high - low):
+        if placed and high > low and np.count_nonzero(covered[low:high]) > 0.5 * (high - low):
             problems.append("a piece lies where another one shows the thread already")
             continue
         covered[low:high] = True
@@ -320,7 +318,8 @@ def _place(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float) -> 
     deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
         return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-    points, deviation, arcs, share = read_piece(points, deviation, unit, MAX_POINTS * segments)
+    # Of four points for each segment that it could cover, every so many is taken.
+    points, deviation, arcs, share = read_piece(points, deviation, unit, 4 * segments)
     if len(points) < MIN_POINTS:
         return "a piece has fewer than two finite points on a path"
     length = float(arcs[-1])
@@ -396,7 +395,8 @@ def measured_points(
         unit: D [m].
         obstacles: and how deep the way from a point to the thread must lead into one to be refused [m].
     """
-    (workspace, margin), found, problems = obstacles, [], []
+    workspace, margin = obstacles
+    found, problems = [], []
     for piece in placed:
         place, innovation, count = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
         good = np.isfinite(place)

@@ -46,8 +46,6 @@ RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselv
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 NEIGHBOURS = 2  # on each side of a point, that it is compared with
 CHANGED = 0.1  # of a robust weight, from which on the program is solved again
-ALONG = 1e-6  # information along the thread over that across it; the chords hold it there
-RIGID = 10.0  # information on the thread's longest bending wave over that of the points; more changes nothing
 
 
 class Prior(NamedTuple):
@@ -171,7 +169,8 @@ def prior_information(prior: Prior, scale: float, clamped: bool, normals: Points
     """
     density, noise, length, stiffness = prior.density, prior.noise, prior.length, prior.stiffness
     nodes = len(density)
-    stiffest = RIGID * (nodes / np.pi) ** 4
+    # More, on the thread's longest bending wave, than the points have changes nothing.
+    stiffest = 10.0 * (nodes / np.pi) ** 4
     blocks, couplings = buffers.blocks, buffers.couplings
     buffers.linear[:], couplings[:] = 0.0, 0.0
     for i in range(nodes):
@@ -179,7 +178,8 @@ def prior_information(prior: Prior, scale: float, clamped: bool, normals: Points
         for a in range(2):
             for b in range(2):
                 blocks[i, a, b] = across * normals[i, a] * normals[i, b]
-            blocks[i, a, a] += ALONG * across
+            # The chords hold it along the thread.
+            blocks[i, a, a] += 1e-6 * across
     for i in range(nodes - 1):
         weight = length * length / (scale * 0.5 * (density[i] + density[i + 1]))
         for a in range(2):

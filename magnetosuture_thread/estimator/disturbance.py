@@ -17,8 +17,6 @@ Vector = NDArray[np.float64]
 
 AVERAGING_TIME = 0.4  # s; over which corrections are added up
 FOUND, LOST = 4.5, 2.5  # standard deviations at which a disturbance begins and ends
-CONFIRMED = 0.25  # of the averaging time, for which it must last
-CONTACT_TIME = 3.0  # averaging times, in which what a known contact did is forgotten
 
 
 @dataclass(frozen=True)
@@ -290,7 +288,8 @@ class DisturbanceTest:
 
         A force on node c displaces as `BendingRelaxation` says of a load there.
         """
-        touched = np.flatnonzero(self._untouched <= CONTACT_TIME * AVERAGING_TIME)
+        # What a known contact did is forgotten after three averaging times.
+        touched = np.flatnonzero(self._untouched <= 3.0 * AVERAGING_TIME)
         touched = touched[touched > 0]
         if not len(touched):
             return np.zeros_like(normals)
@@ -310,7 +309,7 @@ class DisturbanceTest:
 
     def confirmed(self, stamp: float) -> bool:
         """Return whether the camera has moved the thread too far for long."""
-        return stamp - self._since >= CONFIRMED * AVERAGING_TIME
+        return stamp - self._since >= 0.25 * AVERAGING_TIME
 
     def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
         """Return the forces that explain what the camera moves the thread by, if it does so for long."""

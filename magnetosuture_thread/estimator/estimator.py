@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.barrier import BarrierRows
+from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.estimator.association import (
     MIN_DEVIATION,
@@ -45,12 +46,9 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation,
 
 Vector = NDArray[np.float64]
 
-ERROR_CORRELATION = 0.1  # of the length, over which the model's errors are alike
 INITIAL_ERROR = 0.2  # standard deviation of the free end of a thread whose shape nobody has seen, of the length
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
-SMOOTHING = 2.0  # of a shape that is laid along a piece, in lengths over which its points err alike
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
-MIN_VARIANCE = 1e-12  # D^2
 MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
 
 
@@ -105,7 +103,8 @@ class ThreadEstimator:
         self.predictor, self.thread = predictor, predictor.thread
         self.options = options or EstimatorOptions()
         self._formulation, self._unit = formulation, self.thread.segment_length
-        self._length = max(ERROR_CORRELATION * self.thread.segments, 0.5)  # l [D]
+        # The model's errors are alike over a tenth of the length.
+        self._length = max(0.1 * self.thread.segments, 0.5)  # l [D]
         self._corrector = Corrector(predictor, formulation)
         self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
         self._now = self._forgotten()
@@ -231,7 +230,7 @@ class ThreadEstimator:
         return Prior(
             np.ascontiguousarray(state.positions / unit),
             np.ascontiguousarray(pose.heading, dtype=np.float64),
-            np.maximum(self._now.errors[1], MIN_VARIANCE),
+            np.maximum(self._now.errors[1], 1e-12),
             noise / unit**2,
             self._length,
             rod.bending_stiffness / (rod.drag_across * unit**4),
@@ -253,7 +252,7 @@ class ThreadEstimator:
         measured = math.isfinite(now.measured_at)
         if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
             return None
-        seen = smoothed_line(piece.points, piece.arcs, SMOOTHING * POINT_CORRELATION / unit) * unit
+        seen = smoothed_line(piece.points, piece.arcs, 2.0 * POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
@@ -425,3 +424,39 @@ def continued(path: Points, positions: Points, node: int) -> Points:
     turn = math.atan2(new[1], new[0]) - math.atan2(old[1], old[0])
     c, s = math.cos(turn), math.sin(turn)
     return np.vstack([path, path[-1] + rest @ np.array([[c, s], [-s, c]])])
+
+
+@dataclass(frozen=True)
+class EstimatorSettings(Configuration):
+    """Whether and how the thread is estimated; see `EstimatorOptions`."""
+
+    estimator: bool = quantity(
+        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
+    )
+    estimator_path_deviation: float = quantity(
+        2e-5,
+        "standard deviation of the points of thread/measured, used where nobody publishes thread/observation",
+        unit="m",
+        minimum=1e-7,
+        maximum=0.01,
+    )
+    estimator_history: float = quantity(
+        EstimatorOptions.history, "how late an observation of the thread may come", unit="s", minimum=0.05, maximum=5.0
+    )
+    estimator_slow_parameters: tuple[str, ...] = quantity(
+        EstimatorOptions.slow_parameters,
+        "what the estimator learns of the thread as it runs: stiffness_over_drag, or nothing; auto: stiffness over "
+        "drag, once the thread moves as the model cannot explain",
+    )
+
+    def estimator_options(self) -> EstimatorOptions:
+        """Return the options of the estimator.
+
+        Raises:
+            ConfigurationError: a slow parameter is unknown.
+        """
+        try:
+            return EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
+        except ConfigurationError as error:
+            name = error.name.replace("estimator.", f"{self.GROUP}.estimator_")
+            raise ConfigurationError(name, error.value, error.expectation) from None

@@ -33,13 +33,11 @@ GRID = 10.0 ** np.arange(-17.0, -5.5)
 """Intensities q that a window may have, from 3 nm to 1 mm in a second's root [m^2/s]."""
 QUIET = 1e-14  # before anything is measured [m^2/s]
 NOISE_TIME = 1.0  # s; over which likelihoods of intensities are forgotten
-SCALE_TIME = 5.0  # s; over which the scale of the points' variance is learned
 RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
 LEARNING_PRIOR = 0.2  # s of measurements, that the scale to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
 MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in the ratio
 SURE = 3.0  # standard deviations
-SURE_OF_ALL = 2.0  # mean square of all windows' errors over their variances: 99 % of right ones are less
 MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 SWITCHING = 1e-4  # share of the weights that every intensity gets anew each second: the noise may change at once
 
@@ -235,7 +233,8 @@ def _matched(noise: NoiseModel, mean: Vector, camera: Vector, expected: Vector, 
     if windows > 0:
         ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square / windows, MAX_SQUARE) - 1.0))
     if both > 0:
-        share = min(elapsed / (min(noise.learned_for, SCALE_TIME) + LEARNING_PRIOR), 1.0)
+        # The scale is learned over 5 s.
+        share = min(elapsed / (min(noise.learned_for, 5.0) + LEARNING_PRIOR), 1.0)
         scale = min(max(scale + share * (change / both - scale), MIN_SCALE), MAX_SCALE)
     return ratio, scale
 
@@ -295,7 +294,8 @@ def raised_intensity(
     # What the thread is wrong by as a whole is little in each window, but not in all of them together: a thread that
     # is braced between needle and wall bends as a whole under forces that hardly differ, and a rigid prior holds it.
     common, count = 0.0, tested.sum()
-    if settled and (left[tested] / doubt[tested]).sum() > SURE_OF_ALL * count:
+    # Of 99 % of right models it is less.
+    if settled and (left[tested] / doubt[tested]).sum() > 2.0 * count:
         common = np.maximum(left - doubt, 0.0).sum() / count
     return np.maximum(intensity + np.maximum(left - SURE**2 * doubt, 0.0) / interval, common / interval)
 

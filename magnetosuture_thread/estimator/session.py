@@ -16,7 +16,6 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
-MAX_LATENESS = 1.0  # s; a pose older by more than this is not late: time itself was set back
 MAX_POSES = 400  # that are kept, however many come in the time for which history is kept
 
 
@@ -93,7 +92,8 @@ class EstimatorSession:
         The first pose starts the thread: from the observation of its frame, or straight behind the needle.
         """
         last = self._estimator.predictor.pose
-        if last is not None and pose.stamp < last.stamp - MAX_LATENESS:
+        # Older by more than a second, it is not late: time itself was set back.
+        if last is not None and pose.stamp < last.stamp - 1.0:
             self.reset()
         observation = self._early.pop(pose.stamp, None)
         try:

@@ -57,7 +57,6 @@ SLOW_TIME = 10.0  # s; T, over which the stiffness may change
 BLOCK_TIME = 2.0  # s; of the blocks of scores
 STUDENT_95 = 2.262  # of 2 T / BLOCK_TIME - 1 degrees of freedom: so many blocks count, the older ones for less
 CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time, as in `calibrate`
-MAX_ELAPSED = 1.0  # s; between two frames, in which something can be forgotten
 
 
 @dataclass(frozen=True)
@@ -231,7 +230,7 @@ class StiffnessLearner:
         # Where not even the innovations that are left are as expected, a frame says less.
         trust = 1.0 / max(1.0, found.square / max(found.independent, 1.0))
         information, score = trust * found.information, trust * found.score
-        elapsed = min(stamp - state.stamp, MAX_ELAPSED) if math.isfinite(state.stamp) else 0.0
+        elapsed = min(stamp - state.stamp, 1.0) if math.isfinite(state.stamp) else 0.0
         gained = information / state.information
         kept = 1.0 - min(-math.expm1(-elapsed / SLOW_TIME), gained)
         change = score / (state.information * (kept + gained))

@@ -6,7 +6,6 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,10 @@ from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]
 
-WORST_FRAMES, WORST_ESTIMATES = 5, 2
 MIN_DISTANCE = 1.0  # s; between two of the worst frames
 MARGIN = "margin_"  # columns of margins, by the barrier's name
 BIN = 0.5  # s; of each bin the worst frame is kept
 SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
-MAP_COLUMNS = 300
 
 
 def _no_points() -> Points:
@@ -89,9 +86,14 @@ class EstimatedThread:
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
-        squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
-        found, hidden, learned = estimate.disturbances, estimate.hidden, estimate.slow_parameters
-        return cls(estimate.positions, estimate.corrected, squared, found, hidden, learned)
+        return cls(
+            estimate.positions,
+            estimate.corrected,
+            np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared,
+            estimate.disturbances,
+            estimate.hidden,
+            estimate.slow_parameters,
+        )
 
 
 @dataclass
@@ -263,9 +265,10 @@ class TimeSeries:
         """Return a column."""
         return np.array(self._columns[name])
 
-    def has(self, name: str) -> bool:
-        """Return whether a column holds any number."""
-        return bool(np.isfinite(self.column(name)).any())
+    def known(self, name: str) -> Array:
+        """Return the finite numbers of a column; none of one that there is not."""
+        values = np.array(self._columns.get(name, ()), dtype=np.float64)
+        return values[np.isfinite(values)]
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,7 @@ class WorstFrames:
         of: whose errors are added, `prediction` or `estimate`.
     """
 
-    def __init__(self, count: int = WORST_FRAMES, apart: float = MIN_DISTANCE, of: str = "prediction") -> None:
+    def __init__(self, count: int = 5, apart: float = MIN_DISTANCE, of: str = "prediction") -> None:
         self._count, self._apart, self._of = count, apart, of
         # A frame takes out the bins within `apart` of it, on both sides: no more of the worst bins are needed.
         self._enough = count * (2 * math.ceil(apart / BIN) + 3)
@@ -336,20 +339,6 @@ def with_gaps(times: Array, values: Array) -> tuple[Array, Array]:
     return np.insert(times, at, ends), np.insert(values, at, np.nan, axis=-1)
 
 
-class ErrorGrid(NamedTuple):
-    """The greatest error by time and arc length.
-
-    Attributes:
-        times: of each column [s].
-        lengths: arc length of each row, from the needle's tail on [m].
-        errors: shape (rows, columns) [% of the thread's length]; nan where nothing is known.
-    """
-
-    times: Array
-    lengths: Array
-    errors: Array
-
-
 class ErrorMap:
     """Accumulates the error along the thread: when it is full, neighbouring columns become one, with the greater error.
 
@@ -358,7 +347,7 @@ class ErrorMap:
         columns: of the map.
     """
 
-    def __init__(self, length: float, columns: int = MAP_COLUMNS) -> None:
+    def __init__(self, length: float, columns: int = 300) -> None:
         self._length, self._limit = length, 2 * columns
         self._frames = 1  # of a column
         self._filled = 0  # frames in the last column
@@ -381,10 +370,15 @@ class ErrorMap:
         self._columns.append(errors)
         self._filled = 1
 
-    def grid(self) -> ErrorGrid | None:
-        """Return the map, empty in each long gap; None if there is nothing."""
+    def grid(self) -> tuple[Array, Array, Array] | None:
+        """Return the greatest error by time and arc length, empty in each long gap; None if there is nothing.
+
+        Returns:
+            Times of the columns [s]; arc lengths of the rows, from the needle's tail on [m]; errors, shape
+            (rows, columns) [% of the thread's length].
+        """
         if not self._columns:
             return None
         times, errors = with_gaps(np.array(self._times), np.column_stack(self._columns))
         rows = errors.shape[0]
-        return ErrorGrid(times, self._length * np.arange(1, rows + 1) / rows, errors)
+        return times, self._length * np.arange(1, rows + 1) / rows, errors

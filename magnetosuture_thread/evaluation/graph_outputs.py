@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,31 +12,23 @@ import numpy as np
 from magnetosuture_thread import interface
 from magnetosuture_thread.errors import GraphError, InvalidInputError
 from magnetosuture_thread.estimator import Disturbance
-from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
 from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, finite_or_none
+from magnetosuture_thread.evaluation.metrics import (
+    EstimationFigures,
+    MinimumMargin,
+    Percentiles,
+    RunMetrics,
+    compare_errors,
+    finite_or_none,
+)
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
 from magnetosuture_thread.thread_observation import ThreadObservation
 
-CURRENT_VALID = 0.05  # s; a recorded current counts as in force for this long
 TRACKED = 1  # as in the message TrackerState
 WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
 WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
-OF_FRAMES = {
-    c.recorded
-    for c in (
-        interface.NEEDLE_POSE,
-        interface.MEASURED_THREAD,
-        interface.THREAD_OBSERVATION,
-        interface.PREDICTED_THREAD,
-        interface.ESTIMATED_THREAD,
-        interface.MARGINS,
-        interface.GROUND_TRUTH_THREAD,
-        interface.GROUND_TRUTH_PULL,
-    )
-}
 
 
 @dataclass(frozen=True)
@@ -74,29 +67,25 @@ class CurrentSeries:
         self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
 
     def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
-        """Compare with what was recorded; None where nothing can be."""
-        theirs = np.array(sorted(recorded._received))
-        apart, sizes, stops = [], [], []
-        for stamp, (currents, stopped) in sorted(self._received.items()):
-            index = int(np.searchsorted(theirs, stamp, side="right")) - 1
-            if index < 0 or stamp - theirs[index] > CURRENT_VALID * 1e9:
-                continue
-            other, other_stopped = recorded._received[int(theirs[index])]
-            if other.shape != currents.shape:
-                continue
-            apart.append(currents - other)
-            sizes.append(other)
-            stops.append(stopped != other_stopped)
-        if not apart:
+        """Compare with the currents in force when recorded, which are so for 0.05 s; None where nothing can be."""
+        stamps = sorted(recorded._received)
+        pairs = []
+        for stamp, own in self._received.items():
+            index = bisect_right(stamps, stamp) - 1
+            if index >= 0 and stamp - stamps[index] <= 50_000_000:
+                other = recorded._received[stamps[index]]
+                if other[0].shape == own[0].shape:
+                    pairs.append((own, other))
+        if not pairs:
             return None
-        difference = np.abs(np.array(apart))
+        difference = np.abs([own[0] - other[0] for own, other in pairs])
         return CurrentDifference(
-            compared=len(difference),
+            compared=len(pairs),
             difference=float(np.median(difference)),
             p99=float(np.percentile(difference, 99)),
             greatest=float(difference.max()),
-            recorded=float(np.sqrt(np.mean(np.array(sizes) ** 2))),
-            stopped_apart=float(np.mean(stops)),
+            recorded=float(np.sqrt(np.mean(np.square([other[0] for _, other in pairs])))),
+            stopped_apart=float(np.mean([own[1] != other[1] for own, other in pairs])),
         )
 
 
@@ -125,34 +114,12 @@ class GraphCollector:
         """Add one message; topics that concern no frame are ignored."""
         if topic == interface.DIAGNOSTICS.recorded:
             self.health.update({status.name.split(":")[0]: status.message for status in message.status})
-        if topic == interface.CURRENTS.recorded and not message.stop:
+        elif topic == interface.CURRENTS.recorded and not message.stop:
             self.applied.add(nanoseconds(message.command))
-        if topic not in OF_FRAMES:
-            return
-        stamp = nanoseconds(message.header.stamp)
-        frame = self._frames.setdefault(stamp, FrameResult(stamp))
-        if topic == interface.NEEDLE_POSE.recorded:
-            *tail, frame.heading = planar_pose(message.pose.pose)
-            frame.tail, self.poses = np.array(tail), self.poses + 1
-        elif topic == interface.MEASURED_THREAD.recorded:
-            frame.measured = _path(message)
-        elif topic == interface.GROUND_TRUTH_THREAD.recorded:
-            frame.ground_truth = _path(message)
-        elif topic == interface.GROUND_TRUTH_PULL.recorded:
-            frame.true_pull = _in_plane(message.wrench.force)
-        elif topic == interface.THREAD_OBSERVATION.recorded:
-            frame.observation = _observation(message)
-        elif topic == interface.ESTIMATED_THREAD.recorded:
-            frame.estimate = _estimate(message)  # a later one of the same frame takes its place
-        elif topic == interface.PREDICTED_THREAD.recorded:
-            frame.vertices = _points(message.positions)
-            frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
-            frame.residual, frame.step_time = message.residual, message.step_time
-            if len(tension := getattr(message, "tension", ())):  # older bags have none
-                frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
-        elif message.valid:
-            frame.margins = margins_of(message)
-            frame.in_contact = bool(frame.margins.in_contact)
+        elif topic in _OF_FRAMES:
+            stamp = nanoseconds(message.header.stamp)
+            _OF_FRAMES[topic](self._frames.setdefault(stamp, FrameResult(stamp)), message)
+            self.poses += topic == interface.NEEDLE_POSE.recorded
 
     def frames(self, first: int = 0, last: int | None = None) -> list[FrameResult]:
         """Return the frames with a prediction, by time; their errors are set by `metrics`.
@@ -172,46 +139,86 @@ class GraphCollector:
         return metrics
 
 
-def _in_plane(vector: Any) -> Array:
-    return np.array([vector.x, vector.y])
+def _take_pose(frame: FrameResult, message: Any) -> None:
+    *tail, frame.heading = planar_pose(message.pose.pose)
+    frame.tail = np.array(tail)
 
 
-def _path(message: Any) -> Points:
-    return _points(each.pose.position for each in message.poses)
+def _take_measured(frame: FrameResult, message: Any) -> None:
+    frame.measured = _points(each.pose.position for each in message.poses)
 
 
-def _points(points: Iterable[Any]) -> Points:
-    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
+def _take_ground_truth(frame: FrameResult, message: Any) -> None:
+    frame.ground_truth = _points(each.pose.position for each in message.poses)
 
 
-def _observation(message: Any) -> ThreadObservation:
+def _take_true_pull(frame: FrameResult, message: Any) -> None:
+    frame.true_pull = _in_plane(message.wrench.force)
+
+
+def _take_observation(frame: FrameResult, message: Any) -> None:
     try:
-        return thread_observation(message, interface.THREAD_OBSERVATION.name)
+        frame.observation = thread_observation(message, interface.THREAD_OBSERVATION.name)
     except InvalidInputError:
-        return ThreadObservation()
+        frame.observation = ThreadObservation()
 
 
-def _estimate(message: Any) -> EstimatedThread:
+def _take_estimate(frame: FrameResult, message: Any) -> None:
+    """Take an estimate; a later one of the same frame takes its place."""
     degrees = int(message.innovation_degrees)
     disturbances = tuple(
         Disturbance(
             found.arc_length,
             found.extent,
-            np.array([found.position.x, found.position.y]),
-            np.array([found.direction.x, found.direction.y]),
+            _in_plane(found.position),
+            _in_plane(found.direction),
             found.force,
             found.significance,
             nanoseconds(found.since) * 1e-9,
         )
         for found in message.disturbances
     )
-    return EstimatedThread(
+    frame.estimate = EstimatedThread(
         _points(message.positions),
         not message.prediction_only,
         np.full(degrees, message.innovation_squared / max(degrees, 1)),
         disturbances,
         message.hidden,
     )
+
+
+def _take_prediction(frame: FrameResult, message: Any) -> None:
+    frame.vertices = _points(message.positions)
+    frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
+    frame.residual, frame.step_time = message.residual, message.step_time
+    if len(tension := getattr(message, "tension", ())):  # older bags have none
+        frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
+
+
+def _take_margins(frame: FrameResult, message: Any) -> None:
+    if message.valid:
+        frame.margins = margins_of(message)
+        frame.in_contact = bool(frame.margins.in_contact)
+
+
+_OF_FRAMES: dict[str, Callable[[FrameResult, Any], None]] = {
+    interface.NEEDLE_POSE.recorded: _take_pose,
+    interface.MEASURED_THREAD.recorded: _take_measured,
+    interface.THREAD_OBSERVATION.recorded: _take_observation,
+    interface.PREDICTED_THREAD.recorded: _take_prediction,
+    interface.ESTIMATED_THREAD.recorded: _take_estimate,
+    interface.MARGINS.recorded: _take_margins,
+    interface.GROUND_TRUTH_THREAD.recorded: _take_ground_truth,
+    interface.GROUND_TRUTH_PULL.recorded: _take_true_pull,
+}
+
+
+def _in_plane(vector: Any) -> Array:
+    return np.array([vector.x, vector.y])
+
+
+def _points(points: Iterable[Any]) -> Points:
+    return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -284,9 +291,8 @@ class ReplaySummary:
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
-        figures = asdict(replace(self, estimation=EstimationFigures()))
-        del figures["estimation"]
-        events = [event.to_json() for event in self.estimation.disturbances]
+        figures = {name: value for name, value in asdict(self).items() if name != "estimation"}
+        events = [asdict(event) for event in self.estimation.disturbances]
         return figures | self.estimation.to_json() | {"disturbances": events}
 
 
@@ -365,8 +371,7 @@ class LoopCollector:
 
     def __init__(self, thread_length: float, needle_length: float, needle_curvature: float, frame_rate: float) -> None:
         self._threads = GraphCollector(thread_length)
-        self._needle = needle_length
-        self._curvature = needle_curvature
+        self._needle = needle_length, needle_curvature
         self._rate = frame_rate
         self._truth: dict[int, Array] = {}
         self._tracked: dict[int, Array] = {}
@@ -418,7 +423,7 @@ class LoopCollector:
         tail = np.hypot(apart[:, 0], apart[:, 1])
         heading = np.abs(np.angle(np.exp(1j * apart[:, 2])))
         off = np.array([np.linalg.norm(self._tip(s) - self._setpoints[s][:2]) for s in both if s in self._setpoints])
-        states = [(state, taken) for stamp, (state, taken) in self._states.items() if stamp in frames]
+        states = [found for stamp, found in self._states.items() if stamp in frames]
         return LoopSummary(
             setup=setup,
             duration=(last - first) * 1e-9,
@@ -435,7 +440,7 @@ class LoopCollector:
             path_error_greatest=float(off.max(initial=0.0)),
             processing=Percentiles.of([taken for _, taken in states]),
             step_time=metrics.percentiles("step_time"),
-            latency={name: self._latency(name) for name in self._arrived},
+            latency={name: self._latency(arrived) for name, arrived in self._arrived.items()},
             error_truth=errors["truth"],
             error_seen=errors["seen"],
             seen_share=metrics.mean("seen_share"),
@@ -447,13 +452,11 @@ class LoopCollector:
     def _tip(self, stamp: int) -> Points:
         """Return where the needle's true tip was."""
         x, y, heading = self._truth[stamp]
-        points, _ = needle_axis(np.array([x, y]), heading, self._needle, self._curvature, np.ones(1))
+        points, _ = needle_axis(np.array([x, y]), heading, *self._needle, np.ones(1))
         return np.asarray(points[0])
 
-    def _latency(self, name: str) -> Percentiles | None:
-        return Percentiles.of(
-            [(time - stamp) * 1e-9 for stamp, time in self._arrived[name].items() if stamp in self._setpoints]
-        )
+    def _latency(self, arrived: dict[int, int]) -> Percentiles | None:
+        return Percentiles.of([(time - stamp) * 1e-9 for stamp, time in arrived.items() if stamp in self._setpoints])
 
 
 def _rms(values: Array) -> float:

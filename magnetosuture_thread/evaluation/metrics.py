@@ -1,4 +1,4 @@
-"""Errors and margin statistics of predicted threads, for evaluation, replay, closed loop, calibration and the rig."""
+"""Errors, margins and times of predicted threads; consistency, hidden parts and disturbances of their estimates."""
 
 from __future__ import annotations
 
@@ -10,20 +10,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
 from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.estimator import SlowParameter
-from magnetosuture_thread.evaluation.estimation import (
-    ESTIMATE_COLUMNS,
-    DisturbanceLog,
-    EstimationFigures,
-    hidden_part,
-)
+from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import (
     MARGIN,
     MIN_DISTANCE,
     SILENT_PERIODS,
-    WORST_ESTIMATES,
     Array,
     ErrorMap,
     FrameResult,
@@ -41,8 +36,6 @@ KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the c
 COLUMNS = ("strain", "residual", "step_time", "tension", "pull", "true_pull", "pull_error", "seen_share")
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
 END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
-MAX_REASONS = 12  # kept, why the needle was not found
-CLOCK_TOLERANCE = 1.0  # s; stamps farther outside of the bag are of another clock
 
 
 @dataclass(frozen=True)
@@ -207,7 +200,7 @@ class SensorSilence:
         times = np.sort(times)
         if len(times) < 2:  # no interval is usual
             return cls(1, end - begin, end - begin, begin) if end > begin else cls()
-        within = begin - CLOCK_TOLERANCE <= times[0] and times[-1] <= end + CLOCK_TOLERANCE
+        within = begin - 1.0 <= times[0] and times[-1] <= end + 1.0  # else they are of another clock
         edges = np.concatenate([[begin], times, [end]]) if within else times
         steps = np.diff(edges)
         gaps = steps[steps > SILENT_PERIODS * float(np.median(np.diff(times)))]
@@ -238,6 +231,305 @@ class MinimumMargin:
     time: float
 
 
+ESTIMATE_COLUMNS = ("hidden", "corrected", "innovations", "innovation_squared")
+MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is
+BAND = 0.95  # of the means of a consistent filter are within
+WHOLE = 0.97  # of the length; a thread of which so much is measured is not hidden
+MAX_DISTURBANCES = 1000  # that are kept
+
+
+def hidden_part(frame: FrameResult, length: float) -> float:
+    """Return the part of the thread that a frame's measurement does not show, 0 to 1.
+
+    All of it is hidden where nothing was measured, or where no measurement went into the frame's estimate. Nothing is
+    where the observation is complete. A centreline alone, or pieces, show as much as they are long; where neither was
+    kept, it is what the estimate says.
+
+    Args:
+        frame: with what was measured in it.
+        length: of the thread [m].
+    """
+    if frame.estimate is not None and not frame.estimate.corrected:
+        return 1.0
+    if frame.observation is None:
+        if frame.estimate is not None and not len(frame.measured):
+            return frame.estimate.hidden
+        pieces = [frame.measured]
+    elif frame.observation.complete:
+        return 0.0
+    else:
+        pieces = [piece.points for piece in frame.observation.pieces]
+    pieces = [points[np.isfinite(points).all(axis=1)] for points in pieces]
+    measured = sum(float(arc_lengths(points)[-1]) for points in pieces if len(points) > 1)
+    return max(0.0, 1.0 - measured / length)
+
+
+@dataclass(frozen=True)
+class HiddenShares:
+    """How much of the thread was hidden, for how long. Each frame counts for the time until the next one.
+
+    Attributes:
+        time: share of the time in which a part of the thread was hidden: more than 3 % of its length.
+        all_time: share of the time in which all of it was: the estimate is a prediction only.
+        length: part of the length that was hidden, mean over the time.
+    """
+
+    time: float
+    all_time: float
+    length: float
+
+    @classmethod
+    def of(cls, series: TimeSeries) -> HiddenShares | None:
+        """Return the shares; None if no frame has an estimate."""
+        hidden, corrected = series.column("hidden"), series.column("corrected")
+        known = np.isfinite(hidden) & np.isfinite(corrected)
+        if not known.any():
+            return None
+        weights = _durations(series.times)[known]
+        hidden, corrected = hidden[known], corrected[known]
+        return cls(
+            float(np.average(hidden > 1.0 - WHOLE, weights=weights)),
+            float(np.average(corrected == 0.0, weights=weights)),
+            float(np.average(hidden, weights=weights)),
+        )
+
+
+def _durations(times: Array) -> Array:
+    """Return the time from each frame to the next; the usual interval for the last one and before a gap [s]."""
+    steps = np.diff(times)
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    durations = np.append(steps, usual)
+    return np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
+
+
+def mean_band(count: ArrayLike) -> tuple[Array, Array]:
+    """Return between what 95 % of the means of so many squared standard normal values are.
+
+        chi2_N^{-1}(0.025) / N,    chi2_N^{-1}(0.975) / N
+
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+    5.4. Deviation: none.
+    """
+    given = np.asarray(count, dtype=np.float64)
+    low, high = (chdtri(given, 0.5 - side * 0.5 * BAND) / given for side in (-1.0, 1.0))
+    return np.asarray(low), np.asarray(high)
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised innovations squared in equal windows of 5 s or more, and the band of 95 % of such means.
+
+    Innovations are what the camera says against the prediction from the last estimate, for sixteen parts of the
+    thread's length; each is divided by the standard deviation that the filter expects of it. A mean of 1 says that the
+    filter knows how wrong it is; one above the band that it trusts itself too much.
+
+    Attributes:
+        begins: of each window, since the bag's start, shape (k,) [s].
+        width: of each [s].
+        means: of the normalised innovations squared, shape (k,); nan where nothing was measured.
+        low: lower end of the band of each, shape (k,).
+        high: upper end of it, shape (k,).
+        mean: of all normalised innovations squared.
+    """
+
+    begins: Array
+    width: float
+    means: Array
+    low: Array
+    high: Array
+    mean: float
+
+    @classmethod
+    def of(cls, series: TimeSeries) -> Consistency | None:
+        """Return the consistency of a run; None if no measurement went into an estimate."""
+        squared, counts, times = series.column("innovation_squared"), series.column("innovations"), series.times
+        known = np.isfinite(squared)
+        if not known.any():
+            return None
+        squared, counts, times = squared[known], counts[known], times[known]
+        first, last = float(times.min()), float(times.max())
+        windows = max(1, math.floor((last - first) / MIN_WINDOW))
+        width = max((last - first) / windows, 1e-3)
+        index = np.minimum(np.floor((times - first) / width).astype(np.int64), windows - 1)
+        total = np.bincount(index, squared * counts, windows)
+        count = np.bincount(index, counts, windows)
+        with np.errstate(invalid="ignore"):
+            means = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        low, high = mean_band(np.where(count > 0, count, np.nan))
+        begins = first + width * np.arange(windows, dtype=np.float64)
+        return cls(np.asarray(begins), width, means, low, high, float((squared * counts).sum() / counts.sum()))
+
+    @property
+    def ends(self) -> Array:
+        """End of each window, shape (k,) [s]."""
+        return self.begins + self.width
+
+    @property
+    def windows(self) -> int:
+        """Number of windows in which anything was measured."""
+        return int(np.isfinite(self.means).sum())
+
+    @property
+    def within(self) -> int:
+        """Number of windows whose mean is within its band."""
+        return int(((self.low <= self.means) & (self.means <= self.high)).sum())
+
+    @property
+    def share(self) -> float:
+        """Share of the windows whose mean is within its band."""
+        return self.within / self.windows
+
+    @property
+    def band(self) -> tuple[float, float]:
+        """The band of a usual window: the median of both ends."""
+        return float(np.nanmedian(self.low)), float(np.nanmedian(self.high))
+
+
+@dataclass(frozen=True)
+class DisturbanceEvent:
+    """Something that the model does not know and that acted on the thread, from when it was found until it was over.
+
+    Attributes:
+        begin_s: since the bag's start [s].
+        end_s: since the bag's start [s].
+        arc_length_m: of the middle of the force, from the needle's tail [m].
+        extent_m: length of the stretch of thread that it acts on [m].
+        x_m: of the middle, in the dish frame [m].
+        y_m: of the middle, in the dish frame [m].
+        direction_rad: of the force, from the x axis [rad].
+        force_n: [N]
+        significance: in standard deviations; the largest, and all of the above except the times are of that frame.
+    """
+
+    begin_s: float
+    end_s: float
+    arc_length_m: float
+    extent_m: float
+    x_m: float
+    y_m: float
+    direction_rad: float
+    force_n: float
+    significance: float
+
+
+class DisturbanceLog:
+    """Collects the disturbances of a run; those with one beginning are one event.
+
+    Attributes:
+        events: by their beginning.
+        count: of all, also of those beyond the number that is kept.
+    """
+
+    def __init__(self) -> None:
+        self.events: list[DisturbanceEvent] = []
+        self.count = 0
+        self._since = math.nan
+
+    def add(self, time: float, frame: FrameResult) -> None:
+        """Add a frame at a time since the bag's start [s]."""
+        found = frame.estimate.disturbances if frame.estimate is not None else ()
+        if not found:
+            self._since = math.nan
+            return
+        strongest = max(found, key=lambda each: each.significance)
+        (x, y), (along_x, along_y) = strongest.position.tolist(), strongest.direction.tolist()
+        event = DisturbanceEvent(
+            begin_s=time - (frame.stamp * 1e-9 - strongest.since),
+            end_s=time,
+            arc_length_m=strongest.arc_length,
+            extent_m=strongest.extent,
+            x_m=x,
+            y_m=y,
+            direction_rad=math.atan2(along_y, along_x),
+            force_n=strongest.force,
+            significance=strongest.significance,
+        )
+        is_new, self._since = strongest.since != self._since, strongest.since
+        self.count += is_new
+        if is_new and self.count <= MAX_DISTURBANCES:
+            self.events.append(event)
+        elif not is_new and self.count <= MAX_DISTURBANCES:
+            before = self.events[-1]
+            larger = max(before, event, key=lambda each: each.significance)
+            self.events[-1] = replace(larger, begin_s=before.begin_s, end_s=time)
+
+
+def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
+    """Return the errors of `prediction` and `estimate`, under the same names; None where there is none.
+
+    `error_ground_truth_mean_percent` is the mean over time of the mean over nodes, `..._max_percent` its maximum over
+    time, and `..._max_node_percent` the maximum over nodes and time, in % of the length; `error_measured_...` are the
+    same against the measured centreline. The estimate at a frame has used that frame's measurement.
+
+    Args:
+        series: columns of a run.
+    """
+    found: dict[str, dict[str, float | None]] = {}
+    for kind, own in (("prediction", ""), ("estimate", "estimate_")):
+        found[kind] = {}
+        for name, target in (("ground_truth", "truth"), ("measured", "seen")):
+            means, nodes = series.known(f"{own}error_{target}"), series.known(f"max_node_{own}error_{target}")
+            found[kind] |= {
+                f"error_{name}_mean_percent": float(means.mean()) if len(means) else None,
+                f"error_{name}_max_percent": float(means.max()) if len(means) else None,
+                f"error_{name}_max_node_percent": float(nodes.max()) if len(nodes) else None,
+            }
+    return found
+
+
+@dataclass(frozen=True)
+class EstimationFigures:
+    """What a run tells of its estimate beside the errors.
+
+    Attributes:
+        corrected: number of frames whose estimate took a measurement; of the others it is a prediction only.
+        consistency: of the innovations; None where no measurement went in.
+        hidden: how much of the thread was hidden; None where nothing was estimated.
+        disturbances: what the model does not know, by its beginning.
+        disturbance_count: of all, also of those that are not kept.
+        learned: slow parameters in the end, where any are learned.
+    """
+
+    corrected: int = 0
+    consistency: Consistency | None = None
+    hidden: HiddenShares | None = None
+    disturbances: tuple[DisturbanceEvent, ...] = ()
+    disturbance_count: int = 0
+    learned: tuple[SlowParameter, ...] = ()
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the thread was estimated at all."""
+        return self.hidden is not None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the figures as plain values, None where there is none."""
+        hidden, found = self.hidden, self.consistency
+        low, high = found.band if found else (None, None)
+        learned = self.learned[0] if self.learned else None
+        return {
+            "corrected_frames": self.corrected,
+            "consistency": {
+                "normalised_innovation_squared_mean": found.mean if found else None,
+                "band_95_low": low,
+                "band_95_high": high,
+                "window_s": found.width if found else None,
+                "windows": found.windows if found else 0,
+                "windows_within_band": found.within if found else 0,
+                "windows_within_band_share": found.share if found else None,
+            },
+            "hidden_time_share": hidden.time if hidden else None,
+            "all_hidden_time_share": hidden.all_time if hidden else None,
+            "hidden_length_share": hidden.length if hidden else None,
+            "disturbances": self.disturbance_count,
+            "learned": {
+                STIFFNESS_OVER_DRAG: learned.value if learned else None,
+                f"{STIFFNESS_OVER_DRAG}_95_low": learned.low if learned else None,
+                f"{STIFFNESS_OVER_DRAG}_95_high": learned.high if learned else None,
+            },
+        }
+
+
 class RunMetrics:
     """Accumulates errors, margins and times of a run.
 
@@ -253,7 +545,7 @@ class RunMetrics:
         targets: as given, the better one first.
         observed: column `processing` of all frames [s].
         tracked: frames with a needle.
-        lost: from and to when the needle was not found [s].
+        lost: from and to when the needle was not found, less than a second apart as one [s].
         reasons: why not.
         contact_frames: those in which the thread touches an obstacle or the wall.
         disturbances: that the estimate reported.
@@ -290,9 +582,11 @@ class RunMetrics:
         self.tracked += observation.found
         if not observation.found:
             reason = observation.reason or "not said"
-            known = observation.reason in self.reasons or len(self.reasons) < MAX_REASONS
+            known = observation.reason in self.reasons or len(self.reasons) < 12
             self.reasons[reason if known else "others"] += 1
-            if self._found:
+            if self._found and not (
+                self.lost and time - self.lost[-1][1] < MIN_DISTANCE
+            ):  # else no plot tells them apart
                 self.lost.append([time, time])
             self.lost[-1][1] = time
         self._found = observation.found
@@ -313,13 +607,11 @@ class RunMetrics:
     def _lower(self, time: float, margins: Margins) -> None:
         """Lower the minimum of each barrier to that of a frame."""
         for row in margins.minima:
-            held, value = self._minimum.get(row.barrier), margins[row.barrier].minimum
-            if held is None or row.clearance[0] < held.clearance:
-                value = value if held is None else min(value, held.value)
-                place = int(row.node[0]), int(row.obstacle[0]), time
-                self._minimum[row.barrier] = MinimumMargin(row.barrier, float(row.clearance[0]), value, *place)
-            elif value < held.value:
-                self._minimum[row.barrier] = replace(held, value=value)
+            clearance, place = float(row.clearance[0]), (int(row.node[0]), int(row.obstacle[0]), time)
+            found = MinimumMargin(row.barrier, clearance, margins[row.barrier].minimum, *place)
+            held = self._minimum.get(row.barrier, found)
+            lower = found if clearance < held.clearance else held
+            self._minimum[row.barrier] = replace(lower, value=min(found.value, held.value))
 
     def _compare(self, time: float, frame: FrameResult) -> dict[str, float]:
         """Return the columns of a frame's errors."""
@@ -357,17 +649,11 @@ class RunMetrics:
     @property
     def target(self) -> str:
         """What error map and worst frames are compared with: the truth where there is any; empty for nothing."""
-        return next((target for target in self.targets if self.series.has(f"error_{target}")), "")
+        return next((target for target in self.targets if len(self.series.known(f"error_{target}"))), "")
 
-    @property
-    def error_map(self) -> ErrorMap | None:
-        """The map of the prediction's error along the thread."""
-        return self._maps.get(("prediction", self.target))
-
-    @property
-    def estimate_map(self) -> ErrorMap | None:
-        """The map of the estimate's error along the thread."""
-        return self._maps.get(("estimate", self.target))
+    def error_map(self, kind: str = "prediction") -> ErrorMap | None:
+        """Return the map of the error along the thread, of `prediction` or `estimate`."""
+        return self._maps.get((kind, self.target))
 
     def worst_frames(self) -> list[WorstFrame]:
         """Return the frames with the greatest errors of prediction, then of estimate, each time the worst first."""
@@ -375,7 +661,7 @@ class RunMetrics:
             return []
         found, others = (self._worst[kind, self.target].found() for kind in KINDS)
         apart = [each for each in others if all(abs(each.time - one.time) >= MIN_DISTANCE for one in found)]
-        return found + apart[:WORST_ESTIMATES]
+        return found + apart[:2]
 
     @property
     def worst_measured(self) -> FrameResult | None:
@@ -386,16 +672,20 @@ class RunMetrics:
     def errors(self, prefix: str = "error") -> dict[str, dict[str, float] | None]:
         """Return the figures of the columns `PREFIX_TARGET` that there are, by target; see `error_figures`."""
         columns = {target: f"{prefix}_{target}" for target in self.targets}
-        return {
-            target: error_figures(self.series.column(name))
-            for target, name in columns.items()
-            if name in self.series.names
-        }
+        there = self.series.names
+        return {target: error_figures(self.series.column(name)) for target, name in columns.items() if name in there}
 
     @property
     def estimation(self) -> EstimationFigures:
         """What the run tells of its estimate beside the errors."""
-        return EstimationFigures.of(self.series, self.disturbances, self.learned)
+        return EstimationFigures(
+            int(np.nansum(self.series.column("corrected"))),
+            Consistency.of(self.series),
+            HiddenShares.of(self.series),
+            tuple(self.disturbances.events),
+            self.disturbances.count,
+            self.learned,
+        )
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""
@@ -403,11 +693,13 @@ class RunMetrics:
 
     def maximum(self, column: str) -> float:
         """Return the greatest value of a column; nan if there is none."""
-        return float(np.nanmax(self.series.column(column))) if self.series.has(column) else math.nan
+        known = self.series.known(column)
+        return float(known.max()) if len(known) else math.nan
 
     def mean(self, column: str) -> float:
         """Return the mean of a column; nan if there is none."""
-        return float(np.nanmean(self.series.column(column))) if self.series.has(column) else math.nan
+        known = self.series.known(column)
+        return float(known.mean()) if len(known) else math.nan
 
     @property
     def pull_error_percent(self) -> float:
@@ -415,10 +707,8 @@ class RunMetrics:
 
         Over the frames with both; nan where there are none, or where nothing pulls.
         """
-        peak = self.maximum("true_pull")
-        if not (self.series.has("pull_error") and peak > 0.0):
-            return math.nan
-        return 100.0 * float(np.sqrt(np.nanmean(self.series.column("pull_error") ** 2))) / peak
+        peak, errors = self.maximum("true_pull"), self.series.known("pull_error")
+        return 100.0 * float(np.sqrt(np.mean(errors**2))) / peak if len(errors) and peak > 0.0 else math.nan
 
     def _time(self, stamp: int) -> float:
         return (stamp - self._start) * 1e-9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,30 +14,25 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import PathCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from magnetosuture_thread.evaluation import colours
+from magnetosuture_thread.evaluation.figures import AGAINST, COLOURS, format_number
 from magnetosuture_thread.evaluation.frames import FrameResult, WorstFrame
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import node_errors, target_points
-from magnetosuture_thread.evaluation.reference_scores import CaseResult
-from magnetosuture_thread.evaluation.report.figures import AGAINST, format_number
+from magnetosuture_thread.evaluation.reference import CaseResult
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene import KINDS, Scene
 from magnetosuture_thread.texts import printable
 
-INK, FAINT = colours.INK.light, "#7b8794"
-SEEN, TRUTH = colours.MEASURED.light, colours.GROUND_TRUTH.light
-PREDICTED, ESTIMATED = colours.PREDICTED.light, colours.ESTIMATED.light
-WIDE = {"color": SEEN, "alpha": 0.35, "solid_capstyle": "round"}  # where a thread was, beside what is predicted
-OBSTACLE = "#e9d8d3"
+SEEN, TRUTH, PREDICTED, ESTIMATED = (light for light, _ in COLOURS.values())
+INK, FAINT = TRUTH, "#7b8794"
 KIND_COLOURS = {
     "tissue": ("#f0b9b4", "#b8665f"),
     "instrument": ("#b9c6d2", "#56697a"),
@@ -46,12 +41,8 @@ KIND_COLOURS = {
 BAD = "#c8102e"
 MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])
 FULL_CLEARANCE_MM = 1.0  # from which on a node is green
-INSTANTS = 6  # of a trajectory
 CLOSE_UP = 0.08  # of the thread's length: half of the side of what is magnified
 BARS = (0.1e-3, 0.2e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # m; lengths of a scale bar
-PLAN_PIXELS, PLAN_SHARE = 620, 0.94  # side of a drawn dish, and the share of it that the dish takes
-JPEG_QUALITY = 84
-SCENE_SIDE, SCENE_TITLE, SCENE_BORDER = 7.0, 0.45, 0.06  # in, in, of the dish's diameter around it
 
 
 class Photo(NamedTuple):
@@ -145,12 +136,12 @@ def draw_worst_frame(
         scene.text(0.02, 0.98, "simulated", transform=scene.transAxes, color="#5c4300", fontsize=11, va="top", bbox=box)
     kind = "Plan of the dish" if photo is None else "Simulated camera frame" if simulated else "Camera frame"
     words = (
-        f"{kind} at {worst.time:.2f} s with {_threads_of(frame)}, and a close-up of node {node} of the {worst.of}, "
+        f"{kind} at {worst.time:.2f} s with the threads, and a close-up of node {node} of the {worst.of}, "
         f"which is {format_number(1e3 * greatest)} mm from {AGAINST[target]}; "
         f"error of the {worst.of} {format_number(worst.error)} % of the length."
     )
     stream = io.BytesIO()
-    figure.savefig(stream, format="jpeg", pil_kwargs={"quality": JPEG_QUALITY, "optimize": True})
+    figure.savefig(stream, format="jpeg", pil_kwargs={"quality": 84, "optimize": True})
     source = "data:image/jpeg;base64," + base64.b64encode(stream.getvalue()).decode()
     return ReportPicture(worst, source, words, photo is None)
 
@@ -176,21 +167,15 @@ def _draw_dish_and_close_up(
     return scene, close
 
 
-def _threads_of(frame: FrameResult) -> str:
-    names = ["predicted"]
-    names += ["estimated"] if frame.estimate is not None else []
-    names += ["measured"] if len(frame.measured) > 1 else []
-    names += ["true"] if len(frame.ground_truth) > 1 else []
-    return f"{', '.join(names[:-1])} and {names[-1]} thread" if len(names) > 1 else "predicted thread"
-
-
 def draw_plan(dish_diameter: float) -> Photo:
     """Return a drawn dish, where no camera saw the real one."""
-    middle = 0.5 * (PLAN_PIXELS - 1.0)
-    view = DishView((middle, middle), dish_diameter / (PLAN_SHARE * PLAN_PIXELS))
-    v, u = np.mgrid[:PLAN_PIXELS, :PLAN_PIXELS]
-    inside = np.hypot(u - middle, v - middle) < 0.5 * PLAN_SHARE * PLAN_PIXELS
-    return Photo(np.where(inside, 244, 200).astype(np.uint8), view)
+    side, share = 620, 0.94  # px; of it that the dish takes
+    middle = 0.5 * (side - 1.0)
+    v, u = np.mgrid[:side, :side]
+    inside = np.hypot(u - middle, v - middle) < 0.5 * share * side
+    return Photo(
+        np.where(inside, 244, 200).astype(np.uint8), DishView((middle, middle), dish_diameter / (share * side))
+    )
 
 
 def draw_threads(
@@ -200,14 +185,11 @@ def draw_threads(
     chosen: FrameResult,
     obstacles: Sequence[Obstacle],
     magnified: float,
-) -> PathCollection:
+) -> None:
     """Draw a frame, obstacles, and the threads that there are, without axes.
 
     The measured thread is wide, the predicted one a line below the estimated one, the ground truth dashed. The nodes
     of the estimated thread, else of the predicted one, have the colours of their margins.
-
-    Returns:
-        The nodes.
     """
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_xticks([])
@@ -221,33 +203,32 @@ def draw_threads(
             axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=0.9))
         elif isinstance(obstacle, Polygon):
             for ring in obstacle.rings:
-                corners = view.to_pixels(np.vstack([ring, ring[:1]]))
-                axes.plot(corners[:, 0], corners[:, 1], color=INK, linewidth=0.9)
-    if len(chosen.measured) > 1:
-        measured = view.to_pixels(chosen.measured)
-        axes.plot(
-            measured[:, 0], measured[:, 1], color=SEEN, linewidth=5.0 * magnified, alpha=0.45, solid_capstyle="round"
-        )
-    nodes = view.to_pixels(chosen.vertices)
-    axes.plot(nodes[:, 0], nodes[:, 1], color=PREDICTED, linewidth=3.0 * magnified, solid_capstyle="round")
-    if chosen.estimate is not None:
-        nodes = view.to_pixels(chosen.estimate.vertices)
-        axes.plot(nodes[:, 0], nodes[:, 1], color=ESTIMATED, linewidth=1.7 * magnified, solid_capstyle="round")
-    if len(chosen.ground_truth) > 1:
-        points = view.to_pixels(chosen.ground_truth).T
-        axes.plot(*points, color=TRUTH, linewidth=0.9 * magnified, linestyle=(0, (4, 4)))
-    clearance = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM)
-    norm = Normalize(0.0, FULL_CLEARANCE_MM)
-    size = 9.0 * magnified**2
-    return axes.scatter(
-        nodes[:, 0], nodes[:, 1], s=size, c=clearance, cmap=MARGIN_COLOURS, norm=norm, linewidths=0.0, zorder=2.5
+                axes.plot(*view.to_pixels(np.vstack([ring, ring[:1]])).T, color=INK, linewidth=0.9)
+    nodes = chosen.vertices if chosen.estimate is None else chosen.estimate.vertices
+    styles: list[tuple[Points, dict[str, Any]]] = [
+        (chosen.measured, {"color": SEEN, "linewidth": 5.0, "alpha": 0.45}),
+        (chosen.vertices, {"color": PREDICTED, "linewidth": 3.0}),
+        (nodes if chosen.estimate is not None else nodes[:0], {"color": ESTIMATED, "linewidth": 1.7}),
+        (chosen.ground_truth, {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (4, 4))}),
+    ]
+    for points, style in styles:
+        if len(points) > 1:
+            style["linewidth"] *= magnified
+            axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
+    axes.scatter(
+        *view.to_pixels(nodes).T,
+        s=9.0 * magnified**2,
+        c=np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM),
+        cmap=MARGIN_COLOURS,
+        norm=Normalize(0.0, FULL_CLEARANCE_MM),
+        linewidths=0.0,
+        zorder=2.5,
     )
 
 
 def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
     """Show a square of a picture, by its middle and half of its side [px]."""
-    axes.set_xlim(centre[0] - half, centre[0] + half)
-    axes.set_ylim(centre[1] + half, centre[1] - half)
+    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] + half, centre[1] - half))
 
 
 def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
@@ -279,62 +260,30 @@ def draw_case(path: Path, case: CaseResult, formulation: str) -> None:
     title = printable(f"{reference.name}, formulation {formulation}")
     figure.text(0.02, 0.945, title, fontsize=13, color=INK, weight="bold", parse_math=False)
     words = (
-        f"mean error {score.mean_error_percent:.3f} % of the length, maximum {score.max_error_percent:.3f} %; "
-        f"n = {case.vertices.shape[1] - 1}; the reference is simulated, by another method"
+        f"wide: the reference, simulated by another method; magenta: predicted, n = {case.vertices.shape[1] - 1}; "
+        f"mean error {score.mean_error_percent:.3f} % of the length, maximum {score.max_error_percent:.3f} %"
     )
     figure.text(0.02, 0.9, words, fontsize=9.5, color=INK)
-    chosen = sorted({*np.linspace(0, len(reference.times) - 1, INSTANTS).astype(int).tolist(), worst})
-    draw_instants(
-        scene,
-        reference.tails,
-        reference.discs,
-        [
-            ("reference", {**WIDE, "linewidth": 5.0}),
-            ("predicted", {"color": PREDICTED, "marker": "o", "markersize": 1.6}),
-        ],
-        [(f"{reference.times[k]:.0f} s", (reference.threads[k], case.vertices[k])) for k in chosen],
-    )
+    scene.plot(*(1e3 * reference.tails.T), color=FAINT, linewidth=0.7, alpha=0.6)
+    for disc in reference.discs:
+        scene.add_patch(shape_patch(disc, facecolor="#e9d8d3", edgecolor=INK, linewidth=0.8))
+    for k in sorted({*np.linspace(0, len(reference.times) - 1, 6).astype(int).tolist(), worst}):
+        measured, tail = 1e3 * reference.threads[k], 1e3 * reference.threads[k][0]
+        scene.plot(*measured.T, color=SEEN, alpha=0.35, linewidth=5.0, solid_capstyle="round")
+        scene.plot(*(1e3 * case.vertices[k].T), color=PREDICTED, linewidth=1.0, marker="o", markersize=1.6)
+        scene.plot(*tail, "o", color=INK, markersize=4)
+        label = f"{reference.times[k]:.0f} s"
+        scene.annotate(label, tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
+    scene.set_aspect("equal", adjustable="datalim")
+    scene.set_title("threads and the needle's way [mm]", fontsize=9.5, color=INK, loc="left")
     error.plot(reference.times, case.error_percent, color=PREDICTED, linewidth=1.3)
     error.plot(reference.times[worst], case.error_percent[worst], "o", color=INK, markersize=4)
     error.set_ylim(0.0, 1.15 * max(float(case.error_percent.max()), 1e-6))
-    error.set_xlim(reference.times[0], reference.times[-1])
     error.set_xlabel("time [s]", color=INK)
     error.set_title("mean distance of the nodes [% of the length]", fontsize=9.5, color=INK, loc="left")
-    tidy(error)
+    for axes in (scene, error):
+        tidy(axes)
     figure.savefig(path)
-
-
-def draw_instants(
-    axes: Axes,
-    tails: Points,
-    obstacles: Sequence[Obstacle],
-    styles: Sequence[tuple[str, dict[str, Any]]],
-    instants: Iterable[tuple[str, Sequence[Points]]],
-) -> None:
-    """Draw the needle's way, obstacles, and threads at some instants, in millimetres.
-
-    Args:
-        axes: to draw in.
-        tails: the needle's tail over time, shape (T, 2) [m].
-        obstacles: discs and polygons [m].
-        styles: name and line of each thread of an instant.
-        instants: label, empty for none, and threads from the needle's tail on, each of shape (m, 2) [m].
-    """
-    axes.plot(*(1e3 * tails.T), color=FAINT, linewidth=0.7, alpha=0.6)
-    for shape in obstacles:
-        if isinstance(shape, Disc | Polygon):
-            axes.add_patch(shape_patch(shape, facecolor=OBSTACLE, edgecolor=INK, linewidth=0.8))
-    for index, (label, threads) in enumerate(instants):
-        for (name, style), points in zip(styles, threads, strict=True):
-            axes.plot(*(1e3 * points.T), label=name if index == 0 else None, **{"linewidth": 1.0, **style})
-        tail = 1e3 * threads[0][0]
-        axes.plot(*tail, "o", color=INK, markersize=4, label="needle's tail" if index == 0 else None)
-        axes.annotate(label, tail, xytext=(5, 4), textcoords="offset points", fontsize=8, color=INK)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [mm]", color=INK)
-    axes.set_ylabel("y [mm]", color=INK)
-    axes.legend(loc="best", fontsize=8.5, frameon=True, framealpha=0.8, edgecolor="none")
-    tidy(axes)
 
 
 def tidy(axes: Axes) -> None:
@@ -359,24 +308,19 @@ def plot_scene(path: Path, scene: Scene, name: str) -> None:
     # The same scene gives the same bytes; in SVG, text stays text.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": scene.version}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # of a name in a script that the font does not have
-        figure = Figure(figsize=(SCENE_SIDE, SCENE_SIDE + SCENE_TITLE), dpi=150)
+        figure = Figure(figsize=(7.0, 7.45), dpi=150)
         FigureCanvasAgg(figure)
-        _draw_scene(figure.add_axes((0.0, 0.0, 1.0, SCENE_SIDE / (SCENE_SIDE + SCENE_TITLE))), scene)
+        _draw_scene(figure.add_axes((0.0, 0.0, 1.0, 7.0 / 7.45)), scene)
         dish = f"dish of {1e3 * scene.dish.diameter:g} mm, {1e3 * scene.dish.depth:g} mm deep"
-        style: dict[str, Any] = {"color": INK, "parse_math": False}
-        figure.text(0.03, 0.972, name, fontsize=14, va="top", weight="bold", **style)
-        figure.text(0.97, 0.968, f"{dish}, version {scene.version}", fontsize=9, va="top", ha="right", **style)
+        style: dict[str, Any] = {"color": INK, "parse_math": False, "va": "top"}
+        figure.text(0.03, 0.972, name, fontsize=14, weight="bold", **style)
+        figure.text(0.97, 0.968, f"{dish}, version {scene.version}", fontsize=9, ha="right", **style)
         figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
-    radius, reach = 1e3 * scene.dish.radius, 1e3 * (0.5 + SCENE_BORDER) * scene.dish.diameter
-    axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#f4f1ec", edgecolor="#8f877b", linewidth=2.5, zorder=0))
+    draw_empty_dish(axes, scene, 0.12)
     axes.plot([0.0], [0.0], "+", color=FAINT, markersize=9.0, markeredgewidth=0.8, zorder=1)
-    axes.set_aspect("equal")
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_axis_off()
     ground = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.7}
     text: dict[str, Any] = {"bbox": ground, "ha": "center", "fontsize": 9.5, "color": INK, "parse_math": False}
     for shape in scene.shapes:
@@ -387,12 +331,21 @@ def _draw_scene(axes: Axes, scene: Scene) -> None:
         name = axes.text(x, y, shape.name, va="center", zorder=5, **text)
         room = axes.transData.inverted().transform_bbox(name.get_window_extent())
         if room.width > right - left or room.height > top - bottom:  # does not fit into the shape: above it
-            name.set(position=(0.5 * (left + right), top + 0.01 * radius), verticalalignment="bottom")
+            name.set(position=(0.5 * (left + right), top + 5.0 * scene.dish.diameter), verticalalignment="bottom")
     draw_scale_bar(axes, 1e-3, 0.2)
     there = [kind for kind in KINDS if any(shape.kind == kind for shape in scene.shapes)]
     if there:
         faces = [Patch(facecolor=KIND_COLOURS[kind][0], edgecolor=KIND_COLOURS[kind][1], label=kind) for kind in there]
         axes.legend(handles=faces, loc="lower right", fontsize=9, frameon=False, labelcolor=INK)
+
+
+def draw_empty_dish(axes: Axes, scene: Scene, border: float) -> None:
+    """Draw an empty dish in millimetres, without axes, with a border around it as a share of its radius."""
+    radius = 1e3 * scene.dish.radius
+    axes.add_patch(Circle((0.0, 0.0), radius, facecolor="#f4f1ec", edgecolor="#8f877b", linewidth=2.0, zorder=0))
+    reach = (1.0 + border) * radius
+    axes.set(aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
+    axes.set_axis_off()
 
 
 def shape_patch(geometry: Disc | Polygon, **style: Any) -> Circle | PathPatch:

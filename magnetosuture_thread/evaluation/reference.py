@@ -1,23 +1,33 @@
-"""Reads reference trajectories: needle poses and the thread that an independent simulator found."""
+"""Reference trajectories, needle poses and the thread that an independent simulator found, and scores on them."""
 
 from __future__ import annotations
 
 import json
+import time
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.evaluation.metrics import Percentiles, node_errors
 from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Medium, Thread
+from magnetosuture_thread.thread.paper import PaperOptions
+from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
+from magnetosuture_thread.thread.predictor import ThreadPredictor
+from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 
+Progress = Callable[[float], None]
 # What numpy and json raise on files that are something else.
 NOT_ONE = (
     *(OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, MemoryError, RecursionError),
@@ -101,3 +111,291 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     return ReferenceTrajectory(
         str(metadata.get("name", path.stem)), times, poses[:, :2], poses[:, 2], threads, discs, metadata
     )
+
+
+@dataclass(frozen=True)
+class CaseScore:
+    """How a formulation did on one trajectory.
+
+    Attributes:
+        name: of the case.
+        mean_error_percent: mean over time of the mean distance of the nodes [% of the length].
+        max_error_percent: the largest over time.
+        max_stretch: greatest length of a segment over what it should be, less one.
+        max_penetration_m: deepest that a node was in the obstacle, 0 if none was.
+        step_median_s: of the wall-clock time of a sample's step, without the margins' message [s].
+        step_p99_s: of the same [s].
+        max_residual: the largest scaled residual of a solve.
+        fallbacks: steps that needed another solver or a cold start, or did not converge.
+    """
+
+    name: str
+    mean_error_percent: float
+    max_error_percent: float
+    max_stretch: float
+    max_penetration_m: float
+    step_median_s: float
+    step_p99_s: float
+    max_residual: float
+    fallbacks: int
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The scores of a set of trajectories, simulated ones unless their metadata names another source.
+
+    Attributes:
+        formulation: its name.
+        solver: its name.
+        cases: one score for each trajectory.
+    """
+
+    formulation: str
+    solver: str
+    cases: tuple[CaseScore, ...]
+
+    @property
+    def mean_error_percent(self) -> float:
+        """Mean over the cases."""
+        return float(np.mean([case.mean_error_percent for case in self.cases]))
+
+    @property
+    def worst_error_percent(self) -> float:
+        """The largest mean of a case."""
+        return max(case.mean_error_percent for case in self.cases)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what goes into JSON."""
+        return {
+            "formulation": self.formulation,
+            "solver": self.solver,
+            "cases": [asdict(case) for case in self.cases],
+            "mean_error_percent": self.mean_error_percent,
+            "worst_error_percent": self.worst_error_percent,
+        }
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One evaluated trajectory over time.
+
+    Attributes:
+        reference: the trajectory.
+        vertices: predicted, shape (T, n + 1, 2) [m].
+        error_percent: shape (T,).
+        score: the figures.
+    """
+
+    reference: ReferenceTrajectory
+    vertices: NDArray[np.float64]
+    error_percent: NDArray[np.float64]
+    score: CaseScore
+
+
+def find_references(folder: Path) -> list[Path]:
+    """Return the trajectories of a folder, in the order of their names.
+
+    Raises:
+        BagError: there are none.
+    """
+    if folder.is_file():
+        return [folder]
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        raise BagError(folder, "holds no reference trajectories (.npz)" if folder.is_dir() else "does not exist")
+    return paths
+
+
+def score(
+    paths: Sequence[Path],
+    *,
+    formulation: str,
+    solver: str,
+    segments: int | None = None,
+    progress: Callable[[float], None],
+    keep: Callable[[CaseResult], None] = lambda result: None,
+) -> Evaluation:
+    """Score a formulation on trajectories: each with its own thread and parameters, nothing tuned for a case.
+
+    Args:
+        paths: the trajectories.
+        formulation: its name.
+        solver: its name.
+        segments: n, of all cases; without it each case has the paper's.
+        progress: called with the share done, 0 to 1.
+        keep: called with each case's result.
+
+    Raises:
+        BagError: a file is no reference trajectory.
+        SolverError: a step could not be solved.
+    """
+
+    def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
+        thread, paper = reference_thread(reference, path, segments)
+        predictor = ThreadPredictor(
+            thread,
+            Workspace(reference.discs, 3e-3),  # m; within this of an obstacle, depths are looked at
+            formulation=formulation,
+            solver=solver,
+            paper=paper,
+            residual_tolerance=1e-6,
+        )
+        predictor.warm_up()
+        headings = np.column_stack([np.cos(reference.headings), np.sin(reference.headings)])
+        poses = [NeedlePose(*each) for each in zip(reference.times, reference.tails, headings, strict=True)]
+        initial = resampled(reference.threads[0], thread.segments)
+        predictor.start_at(poses[0], initial)
+
+        def figures(prediction: Prediction) -> StepFigures:
+            strain = float(prediction.strain.max())
+            return StepFigures(prediction.positions, strain, prediction.residual, int(prediction.status != SOLVED))
+
+        def step(index: int) -> Prediction:
+            return predictor.step(poses[index])
+
+        return run_case(reference, initial, thread.length, thread.diameter, step, figures, share)
+
+    return Evaluation(formulation, solver, score_each(paths, score_case, progress, keep))
+
+
+def score_each(
+    paths: Sequence[Path],
+    one: Callable[[ReferenceTrajectory, Path, Progress], CaseResult],
+    progress: Progress,
+    keep: Callable[[CaseResult], None],
+) -> tuple[CaseScore, ...]:
+    """Score trajectories one after another.
+
+    Args:
+        paths: the trajectories.
+        one: scores one of them; its last argument is called with the share done.
+        progress: called with the share of all that is done.
+        keep: called with each case's result.
+
+    Raises:
+        BagError: a file is no reference trajectory.
+    """
+    scores = []
+    for index, path in enumerate(paths):
+
+        def share(part: float, index: int = index) -> None:
+            progress((index + part) / len(paths))
+
+        result = one(read_reference(path), path, share)
+        scores.append(result.score)
+        keep(result)
+    return tuple(scores)
+
+
+class StepFigures(NamedTuple):
+    """What one step of a simulated or predicted thread gave.
+
+    Attributes:
+        vertices: of the thread, shape (n + 1, 2) [m].
+        strain: greatest of a segment.
+        residual: of the solve.
+        fallbacks: of it; see `CaseScore`.
+    """
+
+    vertices: Points
+    strain: float
+    residual: float
+    fallbacks: int
+
+
+_StepResult = TypeVar("_StepResult")
+
+
+def run_case(
+    reference: ReferenceTrajectory,
+    initial: Points,
+    length: float,
+    diameter: float,
+    step: Callable[[int], _StepResult],
+    figures: Callable[[_StepResult], StepFigures],
+    progress: Progress,
+) -> CaseResult:
+    """Step a thread along a reference trajectory and score it.
+
+    Args:
+        reference: the trajectory.
+        initial: the thread at its first sample, shape (n + 1, 2) [m].
+        length: of the thread [m].
+        diameter: of the thread [m].
+        step: goes to a sample, given by its index; this alone is timed.
+        figures: reads what a step gave.
+        progress: called with the share done, 0 to 1.
+
+    Source: reference set, "How a prediction is scored". Deviation: none.
+    """
+    count = len(reference.times)
+    vertices, took = np.empty((count, *initial.shape)), np.zeros(count)
+    vertices[0] = initial
+    strain, depth, residual, fallbacks = -np.inf, 0.0, 0.0, 0
+    for k in range(1, count):
+        began = time.perf_counter()
+        result = step(k)
+        took[k] = time.perf_counter() - began
+        found = figures(result)
+        vertices[k] = found.vertices
+        strain, residual = max(strain, found.strain), max(residual, found.residual)
+        fallbacks += found.fallbacks
+        for disc in reference.discs:
+            # The needle's own way is given, so only the thread's nodes can be blamed.
+            outside = disc.signed_distance(found.vertices[1:])[0] - 0.5 * diameter
+            depth = max(depth, -float(outside.min()))
+        if k % 50 == 0:
+            progress(k / count)
+    truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
+    error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
+    times = Percentiles.of(took[1:])
+    assert times is not None  # a trajectory has two samples or more
+    score = CaseScore(
+        name=reference.name,
+        mean_error_percent=float(error.mean()),
+        max_error_percent=float(error.max()),
+        max_stretch=strain,
+        max_penetration_m=depth,
+        step_median_s=times.median,
+        step_p99_s=times.p99,
+        max_residual=residual,
+        fallbacks=fallbacks,
+    )
+    return CaseResult(reference, vertices, error, score)
+
+
+def reference_thread(
+    reference: ReferenceTrajectory, path: Path, segments: int | None = None
+) -> tuple[Thread, PaperOptions]:
+    """Return the thread that a trajectory's metadata describes, and the options of `paper` for its material.
+
+    Those are of silk where the kind says silk, else of polyamide: W_stiff is tuned for these two only.
+
+    Raises:
+        BagError: the metadata lacks something, or holds what is none.
+    """
+    try:
+        given = reference.metadata["material"]
+        kind = str(given["kind"])
+        attachment = {"pinned": Attachment.PINNED, "clamped": Attachment.CLAMPED}[reference.metadata["boundary"]]
+        thread = Thread(
+            material=kind,
+            length=float(given["L_m"]),
+            segments=segments or int(given["paper_nodes"]),
+            diameter=float(given["diameter_m"]),
+            bending_stiffness=float(given["EI_Nm2"]),
+            medium=Medium(float(given["zeta_perp_Pa_s"]), float(given["zeta_par_Pa_s"])),
+            attachment=attachment,
+        )
+    except (*NOT_ONE, ConfigurationError) as error:
+        raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
+    if not thread.bending_stiffness * thread.medium.drag_along > 0.0:
+        raise BagError(path, "has a thread whose stiffness or drag are not positive")
+    family = "silk_6_0" if "silk" in kind else "polyamide_7_0"
+    return thread, PaperOptions.tuned(MATERIALS[family].stiffness_weight)
+
+
+def resampled(curve: Points, segments: int) -> Points:
+    """Return n + 1 points of a curve whose own points are equally spaced in arc length."""
+    given, wanted = np.linspace(0.0, 1.0, len(curve)), np.linspace(0.0, 1.0, segments + 1)
+    return np.column_stack([np.interp(wanted, given, curve[:, axis]) for axis in range(curve.shape[1])])

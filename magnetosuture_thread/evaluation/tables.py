@@ -14,11 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from magnetosuture_thread.barrier import BUILT_IN
-from magnetosuture_thread.evaluation.estimation import EstimationFigures
-from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics, finite_or_none
-from magnetosuture_thread.evaluation.reference_scores import Evaluation
-from magnetosuture_thread.evaluation.report.figures import (
+from magnetosuture_thread.evaluation.figures import (
     AGAINST,
     STAGES,
     BagDetails,
@@ -28,12 +24,20 @@ from magnetosuture_thread.evaluation.report.figures import (
     micronewtons,
     milliseconds,
 )
+from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary
+from magnetosuture_thread.evaluation.metrics import (
+    EstimationFigures,
+    Percentiles,
+    RunMetrics,
+    compare_errors,
+    finite_or_none,
+)
+from magnetosuture_thread.evaluation.reference import Evaluation
 from magnetosuture_thread.texts import printable
 
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 
-ERRORS = {"mean": "mean", "median": "median", "p99": "p99", "maximum": "max"}
 SIMULATED, UNVERIFIED, SILENT = "*", "?", "!"  # marks of a bag
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes the beginning of a formula for
 
@@ -43,6 +47,7 @@ def row_of(about: BagDetails, figures: Figures) -> Row:
 
     `prediction`, `estimate` and `consistency` are mappings; in a table they are a column for each of their values.
     """
+    metrics = figures.metrics
     row: Row = {
         "bag": about.name,
         "path": about.path,
@@ -58,28 +63,31 @@ def row_of(about: BagDetails, figures: Figures) -> Row:
         "max_silence_s": figures.silence.max_gap,
         "silences": figures.silence.gaps,
     }
-    for prefix, errors in (("error", figures.error), ("recorded_error", figures.recorded_error)):
+    for prefix in ("error", "recorded_error"):
+        errors = metrics.errors(prefix)
         for target in AGAINST:
             found = errors.get(target) or {}
             row[f"{prefix}_{target}_frames"] = found.get("count", 0)
-            row |= {f"{prefix}_{target}_{short}_percent": found.get(name) for name, short in ERRORS.items()}
-    row |= {kind: dict(errors) for kind, errors in figures.compared.items()} | figures.estimation.to_json()
+            for name, short in (("mean", "mean"), ("median", "median"), ("p99", "p99"), ("maximum", "max")):
+                row[f"{prefix}_{target}_{short}_percent"] = found.get(name)
+    row |= {**compare_errors(metrics.series), **metrics.estimation.to_json()}
     row |= {
-        "seen_share": figures.measured_share,
-        "stretch_max": figures.strain,
-        "residual_max": figures.residual,
-        "tension_max_n": figures.tension,
-        "needle_pull_max_n": figures.pull,
-        "needle_pull_error_percent": figures.pull_error,
-        "contact_frames": figures.contact_frames,
+        "seen_share": metrics.mean("seen_share"),
+        "stretch_max": metrics.maximum("strain"),
+        "residual_max": metrics.maximum("residual"),
+        "tension_max_n": metrics.maximum("tension"),
+        "needle_pull_max_n": metrics.maximum("pull"),
+        "needle_pull_error_percent": metrics.pull_error_percent,
+        "contact_frames": metrics.contact_frames,
     }
-    for barrier in BUILT_IN:
-        row[f"least_{barrier}_m"] = figures.minimum[barrier].clearance if barrier in figures.minimum else None
-    added = [f"{name}: {margin.clearance:.3e}" for name, margin in figures.minimum.items() if name not in BUILT_IN]
-    row["least_added_m"] = "; ".join(added) or None
-    row |= _percentiles("step", figures.step_time) | _percentiles("tracker", figures.processing)
-    for stage in STAGES:
-        row |= _percentiles(f"latency_{stage.replace(' ', '_')}", figures.live.latency.get(stage))
+    minimum = {name: margin.clearance for name, margin in metrics.minimum_margins.items()}
+    row |= {f"least_{barrier}_m": minimum.pop(barrier, None) for barrier in BUILT_IN}
+    row["least_added_m"] = "; ".join(f"{name}: {clearance:.3e}" for name, clearance in minimum.items()) or None
+    times = {"step": metrics.percentiles("step_time"), "tracker": Percentiles.of(metrics.observed.column("processing"))}
+    times |= {f"latency_{stage.replace(' ', '_')}": figures.live.latency.get(stage) for stage in STAGES}
+    for name, spread in times.items():
+        row[f"{name}_median_s"] = spread.median if spread else None
+        row[f"{name}_p99_s"] = spread.p99 if spread else None
     row |= {"damage": "; ".join(about.damage), "unverified": about.unverified}
     row |= {"refused": sum(about.refused.values()), "problem": ""}
     return {column: finite_or_none(value) for column, value in row.items()}
@@ -92,13 +100,8 @@ def failed_row(name: str, path: str, problem: str) -> Row:
     return row | {"bag": name, "path": path, "problem": problem}
 
 
-def _percentiles(name: str, found: Percentiles | None) -> Row:
-    return {f"{name}_median_s": found.median if found else None, f"{name}_p99_s": found.p99 if found else None}
-
-
 _EMPTY = row_of(BagDetails("", "", ""), Figures.of(RunMetrics(1.0)))
-COLUMNS = tuple(_EMPTY)
-TIMES = tuple(column for column in COLUMNS if column.startswith(("step_", "tracker_")))  # differ from run to run
+TIMES = tuple(column for column in _EMPTY if column.startswith(("step_", "tracker_")))  # differ from run to run
 
 
 def table_csv(rows: Sequence[Row]) -> str:
@@ -107,10 +110,9 @@ def table_csv(rows: Sequence[Row]) -> str:
     A text that a spreadsheet would take for a formula gets an apostrophe before it.
     """
     stream = io.StringIO(newline="")
-    writer = csv.writer(stream, lineterminator="\r\n")
-    writer.writerow(flat(_EMPTY))
-    for row in rows:
-        writer.writerow([_cell(value) for value in flat(row).values()])
+    writer = csv.DictWriter(stream, list(flat(_EMPTY)))
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in flat(row).items()} for row in rows)
     return stream.getvalue()
 
 
@@ -272,11 +274,11 @@ def summary_table(summary: ReplaySummary) -> Table:
     margins: list[Line] = [("minimum margin", "", "0 or more is safe; lengths are met to 0.1 %")]
     for margin in summary.least_margins:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
-        value = f"{margin.clearance * 1e6:+.3f}" if abs(margin.clearance) > 1e-9 else "0.000"  # within the tolerance
-        margins.append((f"  {margin.kind}", f"{value} µm", f"{where}, at {margin.time:.2f} s"))
-    touching = _share(summary.contact_frames, summary.predicted)
-    margins.append(("frames in contact", str(summary.contact_frames), touching))
-    margins.append(("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment"))
+        margins.append((f"  {margin.kind}", micrometres(margin.clearance), f"{where}, at {margin.time:.2f} s"))
+    margins += [
+        ("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted)),
+        ("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment"),
+    ]
     if summary.peak_tension is not None and summary.needle_pull is not None:
         pull = f"on the needle at most {micronewtons(summary.needle_pull)}"
         margins.append(("peak tension", micronewtons(summary.peak_tension), pull))
@@ -284,9 +286,8 @@ def summary_table(summary: ReplaySummary) -> Table:
     sections = [frames, times, margins, [*_errors(summary), *_estimation(summary.estimation)]]
     if (apart := summary.currents) is not None:
         tail = f"{apart.p99:.2f}, {apart.greatest:.2f} A; recorded: {apart.recorded:.2f} A rms"
-        stopped = f"{100.0 * apart.stopped_apart:.1f} %"
-        difference = ("currents off the recorded", f"{apart.difference:.3f} A", tail)
-        sections.append([difference, ("  stopped in one only", stopped, f"of {apart.compared}")])
+        stopped = ("  stopped in one only", f"{100.0 * apart.stopped_apart:.1f} %", f"of {apart.compared}")
+        sections.append([("currents off the recorded", f"{apart.difference:.3f} A", tail), stopped])
     return _figures_table(f"{summary.bag}, setup {summary.setup}", sections)
 
 
@@ -325,25 +326,16 @@ def _figures_table(title: str, sections: Sequence[Sequence[Line]]) -> Table:
 
 
 def _errors(summary: ReplaySummary | LoopSummary) -> list[Line]:
-    curves = {"measured": "measured centreline", "ground_truth": "ground truth"}
-    scored = {"measured": summary.error_seen, "ground_truth": summary.error_truth}
-    lines: list[Line] = [
-        ("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length"),
-        ("prediction error, mean", "", "maximum; % of the length"),
-    ]
-    for name, title in curves.items():
-        if (found := scored[name]) is not None:
-            remark = f"{found['maximum']:.3f} %; {found['count']:.0f} frames scored"
-            lines.append((f"  against the {title}", f"{found['mean']:.3f} %", remark))
-        elif name == "measured":
-            lines.append((f"  against the {title}", "none", "no frame could be scored"))
-    estimate = summary.estimate
-    if any(value is not None for value in estimate.values()):
-        lines.append(("estimate error, mean", "", "maximum; % of the length"))
-    for name, title in curves.items():
-        if (mean := estimate.get(f"error_{name}_mean_percent")) is not None:
-            remark = f"{estimate[f'error_{name}_max_percent']:.3f} %"
-            lines.append((f"  against the {title}", f"{mean:.3f} %", remark))
+    lines: list[Line] = [("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")]
+    for kind, errors in (("prediction", summary.prediction), ("estimate", summary.estimate)):
+        found = [
+            (f"  against the {title}", f"{mean:.3f} %", f"{errors[f'error_{name}_max_percent']:.3f} %")
+            for name, title in (("measured", "measured centreline"), ("ground_truth", "ground truth"))
+            if (mean := errors.get(f"error_{name}_mean_percent")) is not None
+        ]
+        if found or kind == "prediction":
+            value = "" if found else "none"
+            lines += [(f"{kind} error, mean", value, "maximum; % of the length"), *found]
     return lines
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from magnetosuture_thread.compiled import compiled, compiled_uncounted, compiled_uncounted_without_gil
 from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
-from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distance
+from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.safety.certificate import FilterData
 from magnetosuture_thread.safety.motion import (

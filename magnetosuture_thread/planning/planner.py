@@ -39,7 +39,7 @@ from magnetosuture_thread.planning.procedure import (
     Withdraw,
     Wrap,
 )
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Scene, SceneShape
 
 Vector = NDArray[np.float64]

@@ -27,7 +27,7 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath, body_clearance
 from magnetosuture_thread.planning.planner import NeedlePlanner, chains, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
@@ -17,19 +16,19 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.simulate import measure_loop, simulate
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation.figures import AGAINST
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.graph_outputs import LoopSummary
-from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, tidy
+from magnetosuture_thread.evaluation.plots import FAINT, INK, SEEN, TRUTH, draw_threads, look_at, tidy
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
+from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.images import decode_image
 
 TESTS = ("petri_35mm_polyamide", "petri_150mm_silk")
 SHOWN = 4  # instants of each run
-BORDER = 0.06  # of the dish's diameter, around it in a picture
-ROW = 2.9  # height of a run [inch]
 
 Log = Callable[[str], None]
 Progress = Callable[[float], None]
@@ -106,21 +105,14 @@ def _evaluated(path: Path, setup: Setup) -> BehaviorRun:
     wanted = {instant.stamp for instant in chosen_instants(collector.instants)}
     frames = {}
     for record in bag.records({COMPRESSED_IMAGE.recorded}):
-        message = record.decode()
-        stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-        if stamp in wanted:
-            frames[stamp] = decode_image(message.data)
+        if (stamp := stamp_of(record)) in wanted:
+            frames[stamp] = decode_image(record.decode().data)
     model = setup.model
-    material = model.material.replace("_", " ", 1).replace("_", "-")
-    return BehaviorRun(
-        name=f"{material}, {1e3 * model.thread_length:g} mm, {model.segments} segments, "
-        f"{model.attachment} to the needle, dish of {1e3 * setup.scene.dish.diameter:g} mm",
-        summary=summary,
-        instants=collector.instants,
-        frames=frames,
-        view=setup.rig.view(setup.scene),
-        scene=setup.scene,
+    name = (
+        f"{model.material.replace('_', ' ', 1).replace('_', '-')}, {1e3 * model.thread_length:g} mm, "
+        f"{model.segments} segments, {model.attachment} to the needle, dish of {1e3 * setup.scene.dish.diameter:g} mm"
     )
+    return BehaviorRun(name, summary, collector.instants, frames, setup.rig.view(setup.scene), setup.scene)
 
 
 def behavior_table(runs: Sequence[BehaviorRun]) -> Table:
@@ -152,57 +144,40 @@ def chosen_instants(instants: Sequence[FrameResult]) -> list[FrameResult]:
 
 
 def draw_behavior(path: Path, runs: Sequence[BehaviorRun]) -> None:
-    """Draw the tests below one another and write the picture as PNG.
+    """Draw the tests below one another, each with some instants and its errors over time, and write the picture (.png).
 
     Args:
         path: of the picture.
         runs: the tests.
     """
-    height = ROW * len(runs) + 0.72
+    row = 2.9  # height of a run [inch]
+    height = row * len(runs) + 0.72
     figure = Figure(figsize=(15.0, height), dpi=100, facecolor="white")
-    figure.text(0.012, 1.0 - 0.32 / height, "Thread behaviour in closed loop, simulated", fontsize=13, color=INK)
-    figure.text(
-        0.012,
-        1.0 - 0.58 / height,
+    words = (
         "wide and blue: measured by the camera; magenta: predicted from the needle's pose alone; "
-        "teal, with nodes: estimated by both; dashed: ground truth",
-        fontsize=9.5,
-        color=FAINT,
+        "teal, with nodes: estimated by both; dashed: ground truth"
     )
+    top = 1.0 - 0.32 / height
+    figure.text(0.012, top, "Thread behaviour in closed loop, simulated", fontsize=13, color=INK)
+    figure.text(0.012, top - 0.26 / height, words, fontsize=9.5, color=FAINT)
     for index, run in enumerate(runs):
-        bottom = (ROW * (len(runs) - 1 - index) + 0.12) / height
-        _draw_row(figure, run, bottom, (ROW - 0.42) / height)
+        bottom, tall = (row * (len(runs) - 1 - index) + 0.12) / height, (row - 0.42) / height
+        figure.text(0.012, bottom + tall + 0.012, run.name, fontsize=10.5, color=INK)
+        times = np.array([(instant.stamp - run.instants[0].stamp) * 1e-9 for instant in run.instants])
+        for column, instant in enumerate(chosen_instants(run.instants)):
+            axes = figure.add_axes((0.012 + 0.168 * column, bottom, 0.163, tall))
+            draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.scene.obstacles, magnified=0.8)
+            look_at(axes, run.view.to_pixels(np.zeros(2)), 0.56 * run.scene.dish.diameter / run.view.metres_per_pixel)
+            time = f"{(instant.stamp - run.instants[0].stamp) * 1e-9:.1f} s"
+            axes.text(0.03, 0.97, time, transform=axes.transAxes, fontsize=9, color=INK, va="top")
+        plot = figure.add_axes((0.725, bottom + 0.055, 0.262, tall - 0.06))
+        for target, colour in (("seen", SEEN), ("truth", TRUTH)):
+            errors = [instant.errors[target] for instant in run.instants]
+            label = f"against {AGAINST[target]}, mean {np.nanmean(errors):.2f}"
+            plot.plot(times, errors, color=colour, linewidth=1.2, label=label)
+        plot.set_ylim(0.0, 1.35 * plot.get_ylim()[1])  # room for the legend
+        plot.set_title("prediction error [% of the length]", fontsize=9.5, color=INK, loc="left")
+        plot.set_xlabel("time [s]", fontsize=8.5, color=INK, labelpad=1)
+        plot.legend(loc="upper right", fontsize=8.0, frameon=False, ncols=1)
+        tidy(plot)
     figure.savefig(path)
-
-
-def _draw_row(figure: Figure, run: BehaviorRun, bottom: float, height: float) -> None:
-    figure.text(0.012, bottom + height + 0.012, run.name, fontsize=10.5, color=INK)
-    began = run.instants[0].stamp
-    for column, instant in enumerate(chosen_instants(run.instants)):
-        axes = figure.add_axes((0.012 + 0.168 * column, bottom, 0.163, height))
-        _draw_instant(axes, run, instant, (instant.stamp - began) * 1e-9)
-    plot = figure.add_axes((0.725, bottom + 0.055, 0.262, height - 0.06))
-    times = np.array([(instant.stamp - began) * 1e-9 for instant in run.instants])
-    for label, colour, errors in (
-        ("against the measured centreline", SEEN, [instant.errors["seen"] for instant in run.instants]),
-        ("against the ground truth", TRUTH, [instant.errors["truth"] for instant in run.instants]),
-    ):
-        mean = float(np.nanmean(errors))
-        plot.plot(times, errors, color=colour, linewidth=1.2, label=f"{label}, mean {mean:.2f}")
-    plot.set_ylim(0.0, 1.35 * plot.get_ylim()[1])  # room for the legend
-    plot.set_xlim(times[0], times[-1])
-    plot.set_title("prediction error [% of the length]", fontsize=9.5, color=INK, loc="left")
-    plot.set_xlabel("time [s]", fontsize=8.5, color=INK, labelpad=1)
-    plot.legend(loc="upper right", fontsize=8.0, frameon=False, ncols=1)
-    tidy(plot)
-
-
-def _draw_instant(axes: Axes, run: BehaviorRun, instant: FrameResult, time: float) -> None:
-    draw_threads(axes, run.frames[instant.stamp], run.view, instant, run.scene.obstacles, magnified=0.8)
-    centre = run.view.to_pixels(np.zeros(2))
-    half = (0.5 + BORDER) * run.scene.dish.diameter / run.view.metres_per_pixel
-    axes.set_xlim(centre[0] - half, centre[0] + half)
-    axes.set_ylim(centre[1] + half, centre[1] - half)
-    axes.text(0.03, 0.97, f"{time:.1f} s", transform=axes.transAxes, fontsize=9, color=INK, va="top")
-    for side in axes.spines.values():
-        side.set_visible(False)

@@ -17,11 +17,9 @@ LEAN, DEPTH = 0.1, 1e-5  # rad and m; so far beyond its bound, a point that slid
 MAX_ROWS = 2048
 BAND = 2e-6  # m; by which the barriers keep farther away than the certificate, so that a needle can slide there
 PASSES = 4  # of the projection, each with what the motion of the one before bends into and meets
-STUCK = 1e-9  # of the velocity commanded; less is none
 ACTIVE = 1e-6  # of the speed; a barrier that leaves less room than this is active
 SURE = 1.0 - 1e-9  # of the certified time, against rounding
 ROUNDING = 1e-12  # of a projection beyond a line, relative to the size of the projected point
-SLACK = 1e-14  # of its intermediate results: without it, rounding would make two nearly equal lines exclude each other
 
 
 class AddedRows(NamedTuple):
@@ -56,14 +54,12 @@ class Rows(NamedTuple):
     Attributes:
         margin: h, shape (k,) [m].
         gradient: of h by the point, unit vectors, shape (k, 2).
-        bend: second derivative of h along the boundary, shape (k,) [1/m].
         point: index of the point, shape (k,).
         shape: index of the shape, or `WALL`, shape (k,).
     """
 
     margin: NDArray[np.float64]
     gradient: Points
-    bend: NDArray[np.float64]
     point: NDArray[np.int64]
     shape: NDArray[np.int64]
 
@@ -83,7 +79,7 @@ def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
         away = math.hypot(x, y)
         at_end = not data.body.straight or i == 0 or i == count - 1
         if at_end and scene.wall_radius - away - keep_wall <= reach and used < room and away > 1e-9:
-            rows.margin[used], rows.bend[used] = scene.wall_radius - away - keep_wall, -1.0 / away
+            rows.margin[used] = scene.wall_radius - away - keep_wall
             rows.gradient[used, 0], rows.gradient[used, 1] = -x / away, -y / away
             rows.point[used], rows.shape[used] = i, WALL
             used += 1
@@ -100,8 +96,7 @@ def find_rows(needle: PosedNeedle, reach: float, rows: Rows) -> int:
                 used += 1
             for k in range(start, used):
                 rows.margin[k] -= keep
-                # A disc, or a corner for all that is known here, bends away from the point: that is left out.
-                rows.bend[k], rows.point[k], rows.shape[k] = 0.0, i, scene.shapes[s]
+                rows.point[k], rows.shape[k] = i, scene.shapes[s]
     return used
 
 
@@ -130,7 +125,8 @@ def project_onto_half_planes(
         px, py, low, high = least * nx, least * ny, -np.inf, np.inf
         for j in range(len(work)):
             slope = work[j, 1] * nx - work[j, 0] * ny
-            missing = work[j, 2] - work[j, 0] * px - work[j, 1] * py - SLACK
+            # Without slack, rounding would make two nearly equal lines exclude each other.
+            missing = work[j, 2] - work[j, 0] * px - work[j, 1] * py - 1e-14
             if slope > 0.0:
                 low = max(low, missing / slope)
             elif slope < 0.0:
@@ -184,21 +180,10 @@ def _projected(
     if not holds:
         return False, 0.0, 0.0
     size = math.hypot(found[0], found[1])
-    if not size > STUCK * speed:
+    if not size > 1e-9 * speed:
         return False, 0.0, 0.0
     shorter = min(1.0, speed / size)
     return True, shorter * found[0], shorter * found[1]
-
-
-@compiled
-def _all_hold(
-    vx: float, vy: float, rows: Points, least: NDArray[np.float64], depth: NDArray[np.float64], count: int
-) -> bool:
-    """Return whether no row forbids a velocity, and none has to be left."""
-    free = True
-    for k in range(count):
-        free = free and depth[k] <= 0.0 and rows[k, 0] * vx + rows[k, 1] * vy >= least[k]
-    return free
 
 
 @compiled
@@ -241,9 +226,9 @@ def nearest_clear(
     for i in range(len(points)):
         swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
     reach = math.hypot(1.0, swiftest) * speed / rate
-    margin, gradient, bend = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2)), np.empty(MAX_ROWS)
+    margin, gradient = np.empty(MAX_ROWS), np.empty((MAX_ROWS, 2))
     point, shape = np.empty(MAX_ROWS, np.int64), np.empty(MAX_ROWS, np.int64)
-    count = find_rows(needle, reach, Rows(margin, gradient, bend, point, shape))
+    count = find_rows(needle, reach, Rows(margin, gradient, point, shape))
     fixed = count + len(added.margin)
     room = fixed + PASSES
     rows, least, depth, who = np.empty((room, 2)), np.empty(room), np.empty(room), np.empty(room, np.int64)
@@ -255,7 +240,8 @@ def nearest_clear(
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
     rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0) - added.drift
     depth[count:fixed], who[count:fixed] = -added.margin, added.barrier
-    if time >= hold and _all_hold(vx, vy, rows, least, depth, fixed):
+    holding = rows[:fixed, 0] * vx + rows[:fixed, 1] * vy >= least[:fixed]
+    if time >= hold and holding.all() and not (depth[:fixed] > 0.0).any():
         return vx, vy
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
@@ -286,7 +272,9 @@ def nearest_clear(
             px, py = forwards * chord_x + across * turning[i, 0], forwards * chord_y + across * turning[i, 1]
             gx, gy = gradient[k, 0], gradient[k, 1]
             aside = -px * gy + py * gx
-            second = omega * (-gx * py + gy * px) + bend[k] * aside * aside
+            # A disc, or a corner for all that is known here, bends away from the point: that is left out.
+            bend = -1.0 / math.hypot(points[i, 0], points[i, 1]) if shape[k] == WALL else 0.0
+            second = omega * (-gx * py + gy * px) + bend * aside * aside
             bounded[k] = least[k] + max(0.0, -0.5 * hold * second)
         # And what it meets: after the hold, the point has to be on the near side of the tangent there.
         if total < room:

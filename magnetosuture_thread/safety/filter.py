@@ -19,25 +19,21 @@ from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
 from magnetosuture_thread.geometry.obstacles.distances import pack_obstacles
 from magnetosuture_thread.safety.barriers import SURE, AddedRows, nearest_clear, no_rows
 from magnetosuture_thread.safety.certificate import NOTHING, BodyData, FilterData, PosedNeedle, safe_time
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
-from magnetosuture_thread.safety.motion import STUCK, limit_velocity, needle_margin, pose_needle
+from magnetosuture_thread.safety.motion import STUCK, NeedleKinematics, limit_velocity, needle_margin, pose_needle
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
 
 EAST = np.array([1.0, 0.0])
 FINITE = Quantity("", "m/s")
+POSITION = bounded("m", -1.0, 1.0)  # no dish is larger
 COARSEST = 5e-4  # m; distance at most between the points that stand for the needle, where that are not too many
 MAX_POINTS = 129
-MAX_SPEED = 10.0  # m/s; a faster command is shortened first, as rounding grows with its size
 SIDESTEP_MARGIN = 2e-4  # m; beyond keep_out, within which the needle is taken off sideways
 SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
 SIDESTEP_BALANCE = 1e-6  # m; of depth on both sides, from which on the needle is in a gap
-POSITION = bounded("m", -1.0, 1.0)  # no dish is larger
-WALL_NAME = "wall"
 SPEED, ACCELERATION, FRICTION = "speed", "acceleration", "friction"
 CHECKS = 8  # instants of a hold at which an added barrier is checked
-BISECTIONS = 10  # of the share that an added barrier leaves of a velocity
 
 
 @dataclass(frozen=True)
@@ -114,7 +110,7 @@ class AddedNeedleBarriers:
         if not broken:
             return 1.0, ""
         low, high = 0.0, 1.0
-        for _ in range(BISECTIONS):
+        for _ in range(10):
             middle = 0.5 * (low + high)
             is_broken = bool(self._broken(middle * velocity, tail, heading, middle * drift))
             low, high = (low, middle) if is_broken else (middle, high)
@@ -236,12 +232,13 @@ class NeedleSafetyFilter:
             keep_out + 0.125 * bend * spacing**2,
             keep_out,
             min(approach_rate, 1.0 / hold_time),
-            min(max_speed, MAX_SPEED),
+            # Faster commands are shortened first, as rounding grows with their size.
+            min(max_speed, 10.0),
             max_acceleration,
             pack_obstacles(scene.obstacles, scene.dish.radius),
         )
         self._added = AddedNeedleBarriers(barriers, self.kinematics, self._data, len(scene.names))
-        self._names = (*scene.names, *[barrier.name for barrier in barriers], WALL_NAME)  # so that -1 is the wall
+        self._names = (*scene.names, *[barrier.name for barrier in barriers], "wall")  # so that -1 is the wall
         self._pose: tuple[tuple[float, ...], PosedNeedle] | None = None  # the last one, by tail and heading
         # Compiled now, not in the first step.
         middle = np.array([-0.5 * chord, 0.0])
@@ -400,7 +397,10 @@ class NeedleSafetyFilter:
 
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
-        tail, heading = finite_array("tail", tail, (2,), POSITION), finite_array("heading", heading, (2,), FINITE)
+        tail, heading = (
+            finite_array("tail", tail, (2,), POSITION),
+            finite_array("heading", heading, (2,), FINITE),
+        )
         key = (*tail.tolist(), *heading.tolist())
         last = self._pose  # read once, as forecasts have the same filter in a thread of their own
         if last is not None and last[0] == key:

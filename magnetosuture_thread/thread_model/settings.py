@@ -12,7 +12,7 @@ from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, autostart_parameter, configuration_fields, quantity
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimator
-from magnetosuture_thread.estimator.settings import EstimatorSettings
+from magnetosuture_thread.estimator.estimator import EstimatorSettings
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion

@@ -1,26 +1,24 @@
-"""Bags there and back, and damage that is found."""
+"""Bags there and back, and bags of other recorders: mcap and sqlite3, split, with definitions of their own."""
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
-from mcap.writer import CompressionType, Writer
-from rosbags.rosbag2 import Reader
+import zstandard
+from rosbags.rosbag2 import Reader, StoragePlugin
 
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
+from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
 
 COUNT = 300
-HEADER = "std_msgs/msg/Header"
-
-
-def header(index: int):
-    """Return a small message that knows its index."""
-    types = typestore().types
-    return types[HEADER](types["builtin_interfaces/msg/Time"](index, 0), f"frame {index}")
 
 
 def write(folder: Path) -> Path:
@@ -29,7 +27,7 @@ def write(folder: Path) -> Path:
         bag.add_topic("/one", HEADER)
         bag.add_topic("/two", HEADER)
         for index in range(COUNT):
-            bag.write_message("/one" if index % 3 else "/two", 10**9 + index * 10**7, header(index))
+            bag.write_message("/one" if index % 3 else "/two", 10**9 + index * 10**7, stamped(index, f"frame {index}"))
     return folder / f"{folder.name}_0.mcap"
 
 
@@ -62,36 +60,14 @@ def test_another_tool_reads_it_whole(good: Path):
         assert sum(1 for _ in reader.messages()) == COUNT
 
 
-@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
-def test_bags_of_other_writers_are_read_and_their_damage_is_found(tmp_path: Path, compression: CompressionType):
-    path = tmp_path / "other.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, compression=compression, chunk_size=2000)
-        writer.start("ros2")
-        schema = writer.register_schema(HEADER, "ros2msg", b"builtin_interfaces/Time stamp\nstring frame_id")
-        # Two channels on one topic, as in bags that were merged.
-        channels = [writer.register_channel("/one", "cdr", schema) for _ in range(2)]
-        for index in range(100):
-            data = bytes(typestore().serialize_cdr(header(index), HEADER))
-            writer.add_message(channels[index % 2], index, data, index)
-        writer.finish()
-    bag = Bag(path)
-    assert bag.damage is None
-    assert bag.counts == {"/one": 100}
-    whole = path.read_bytes()
-    refused = 0
-    for place in range(60, len(whole), 37):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
-        try:
-            refused += Bag(path).damage is not None
-        except BagError:
-            refused += 1
-    assert refused > 20
-
-
 def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
     (tmp_path / "text.mcap").write_text("not a bag, but long enough to be one")
     (tmp_path / "folder").mkdir()
+    for name, content in (("empty", b""), ("text", b"text" * 99), ("broken", b"SQLite format 3\0" * 9)):
+        (tmp_path / f"{name}.db3").write_bytes(content)
+    (tmp_path / "two").mkdir()
+    for name in ("one", "other"):
+        (tmp_path / "two" / f"{name}.mcap").write_bytes(good.read_bytes())
     with BagWriter(tmp_path / "hollow") as bag:
         bag.add_topic("/one", HEADER)
     for name, words in (
@@ -99,6 +75,10 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         ("text.mcap", "is no mcap file"),
         ("folder", "holds no .mcap or .db3 file"),
         ("hollow", "holds no messages"),
+        ("two", "holds 2 .mcap files; name one of them"),
+        ("empty.db3", "is empty"),
+        ("text.db3", "is no sqlite3"),
+        ("broken.db3", "is damaged"),
     ):
         with pytest.raises(BagError) as caught:
             Bag(tmp_path / name)
@@ -106,13 +86,125 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         assert name in str(caught.value)
 
 
-def test_a_bag_is_readable_whatever_interrupts_it(tmp_path: Path):
-    def interrupted() -> None:
-        with BagWriter(tmp_path / "short") as bag:
-            bag.add_topic("/one", HEADER)
-            bag.write_message("/one", 1, header(0))
-            raise ValueError("stop")
+PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
+TYPES = {"/text": STRING, "/header": HEADER}
 
-    with pytest.raises(ValueError, match="stop"):
-        interrupted()
-    assert Bag(tmp_path / "short").counts == {"/one": 1}
+
+def messages(count: int = 200):
+    header = stamped(3)
+    both = texts(count) + [("/header", time + 5, cdr(HEADER, header.stamp, "dish")) for _, time, _ in texts(count)]
+    return sorted(both, key=lambda message: message[1])
+
+
+@pytest.mark.parametrize("plugin", PLUGINS)
+def test_bags_of_rosbag2_are_read(tmp_path: Path, plugin: StoragePlugin):
+    folder = write_rosbag(tmp_path / "bag", plugin, messages(), TYPES)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    bag = Bag(folder)
+    assert read(bag) == messages()
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+    assert (bag.topics, bag.counts) == (TYPES, {"/text": 200, "/header": 200})
+    assert bag.damage is None
+    assert "no checksums" in bag.unchecked
+    assert [r.decode().data for r in bag.records({"/text"}, start=1.0, duration=0.02)] == [
+        "text 100",
+        "text 101",
+        "text 102",
+    ]
+    (folder / "metadata.yaml").unlink()
+    assert read(Bag(folder)) == messages()
+    file = next(path for path in folder.iterdir() if path.suffix in (".db3", ".mcap"))
+    assert read(Bag(file)) == messages()
+
+
+def test_a_file_that_is_packed_as_a_whole_says_how_to_unpack_it(tmp_path: Path):
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    file = write_mcap(tmp_path / "a.mcap", texts(5), {"/text": STRING})
+    (folder / "a.mcap.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    for path in (folder, folder / "a.mcap.zstd"):
+        with pytest.raises(BagError, match=r"compressed as a whole; decompress it first: zstd -d a\.mcap\.zstd"):
+            Bag(path)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_split_bag_is_one_bag(tmp_path: Path, named: bool):
+    """Eleven parts, so that by name alone the last would come second."""
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for part in range(11):
+        write_mcap(folder / f"split_{part}.mcap", texts(20, start=(1 + part) * 10**9), {"/text": STRING})
+    if named:
+        names = "".join(f"  - split_{part}.mcap\n" for part in range(11))
+        (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{names}")
+    bag = Bag(folder)
+    assert bag.counts == {"/text": 220}
+    assert [time for _, time, _ in read(bag)] == sorted(time for _, time, _ in read(bag))
+    assert [r.decode().data for r in bag.records(start=5.0, duration=0.01)] == ["text 0", "text 1"]
+    middle = folder / "split_4.mcap"
+    middle.write_bytes(middle.read_bytes()[:-300])
+    (folder / "split_5.mcap").write_bytes(b"")
+    (folder / "split_6.mcap").unlink()
+    damage = Bag(folder).damage
+    assert damage is not None
+    said = "\n".join(map(str, damage.regions))
+    assert "split_4.mcap" in said
+    assert "split_5.mcap, byte 0: is empty" in said
+    assert ("split_6.mcap, byte 0: it is missing" in said) == named
+    assert Bag(folder).counts["/text"] >= 160
+
+
+def test_the_bags_own_definitions_are_taken(tmp_path: Path):
+    """Of a type that we do not know, and of one that was different once."""
+    theirs = MessageDefinition("their_msgs/msg/Thing", "ros2msg", "std_msgs/Header header\nint32 number\n")
+    older = MessageDefinition(STRING, "ros2msg", "int32 size\nstring data\n")
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/thing", theirs.type_name, theirs)
+        bag.add_topic("/older", STRING, older)
+        bag.add_topic("/text", STRING)
+        bag.write("/thing", 1, cdr(HEADER, stamped(3).stamp, "dis") + b"\7\0\0\0")
+        bag.write("/older", 2, b"\0\1\0\0\5\0\0\0\2\0\0\0a\0")
+        bag.write("/text", 3, cdr(STRING, "b"))
+    thing, old, text = (record.decode() for record in Bag(tmp_path / "bag").records())
+    assert (thing.header.frame_id, thing.number) == ("dis", 7)
+    assert (old.size, old.data, text.data) == (5, "a", "b")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\0\1\0\0",
+        b"\0\1\0\0\xff\xff\xff\xff",
+        b"\0\1\0\0\xff\xff\xff\x7fabc\0",
+        b"\0\1\0\0\2\0\0\0\xff\0",
+        b"\0\7\0\0\2\0\0\0a\0",
+        b"\x28\xb5\x2f\xfd\0\0",
+    ],
+)
+def test_bytes_that_are_no_message_name_the_topic(tmp_path: Path, data: bytes):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", STRING)
+        bag.write("/text", 1, data)
+
+    def decode() -> None:
+        for record in Bag(tmp_path / "bag").records():
+            record.decode()
+
+    with pytest.raises(BagError, match=r"/text: a (packed )?message cannot be"):
+        decode()
+
+
+def test_a_topic_with_two_types_spoils_no_other(tmp_path: Path):
+    path = tmp_path / "two"
+    shutil.copytree(write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, messages(), TYPES), path)
+    with closing(sqlite3.connect(path / "bag.db3")) as database:
+        database.execute("UPDATE topics SET name = '/text' WHERE name = '/header'")
+        database.execute("INSERT INTO topics VALUES (9, '/other', 'std_msgs/msg/String', 'cdr', '', '')")
+        database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (9, 1, ?)", (cdr(STRING, "a"),))
+        database.commit()
+    bag = Bag(path)
+    assert bag.conflicts == {"/text": (STRING, HEADER)}
+    assert [topic for topic, _, _ in read(bag)] == ["/other"]
+    with pytest.raises(BagError, match=f"topic /text has two types, {STRING} and {HEADER}; expected one"):
+        bag.records({"/text"})

@@ -1,4 +1,4 @@
-"""Small files that ask for hours or gigabytes are refused or read in one line, and in little memory."""
+"""Small files that ask for hours or gigabytes are refused or read in one line; large ones take little memory."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from magnetosuture_thread.bags.message_types import DecoderCache
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
+from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError
-from test.bags.bags import read, texts
+from test.bags.bags import STRING, cdr, read, texts
 from test.bags.bombs import ALIASES, BOMBS, metadata_bomb
 
 MAX_MEGABYTES, MAX_SECONDS = 300, 5.0
@@ -69,3 +71,41 @@ def test_metadata_past_its_budget_is_not_used_and_said(tmp_path: Path):
     bag = Bag(metadata_bomb(tmp_path / "bag", ALIASES))
     assert read(bag) == texts(5)
     assert bag.remarks == ["metadata.yaml is not used: has an anchor or alias (& or *) in line 3"]
+
+
+LIMIT = 60.0  # MB above what a small bag takes
+
+READER = """
+import resource, sys
+from pathlib import Path
+from magnetosuture_thread.bags.reader import Bag
+count = sum(1 for record in Bag(Path(sys.argv[1])).records())
+print(count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def write(folder: Path, size: int) -> Path:
+    """Write a bag of so many bytes: the same frames again and again, which within a chunk are all different."""
+    noise = np.random.default_rng(1)
+    frames = [b"\0\1\0\0" + bytes(8) + (50_000).to_bytes(4, "little") + noise.bytes(50_000) for _ in range(40)]
+    with BagWriter(folder) as bag:
+        bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")
+        bag.add_topic("/text", STRING)
+        for index in range(size // 50_000):
+            bag.write("/noise", 10**9 + index * 10**7, frames[index % len(frames)])
+            bag.write("/text", 10**9 + index * 10**7 + 1, cdr(STRING, str(index)))
+    return folder
+
+
+def peak(folder: Path) -> tuple[int, float]:
+    """Return number of messages and the greatest memory taken [MB] when a process of its own reads a bag."""
+    command = [sys.executable, "-c", READER, str(folder)]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout.split()
+    return int(said[0]), float(said[1])
+
+
+def test_memory_is_flat(tmp_path: Path):
+    _, small = peak(write(tmp_path / "small", 500_000))
+    count, taken = peak(write(tmp_path / "large", 100_000_000))
+    assert count == 4000
+    assert taken < small + LIMIT

@@ -19,7 +19,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError
 from test.bags.bags import STRING, Message, chunks_of, read, texts, write_many_chunks, write_mcap
 
-FLIPS, CUTS = 500, 100
+FLIPS, CUTS = 300, 60
 
 
 Untouched = Callable[[int, int], bool]
@@ -33,11 +33,6 @@ def around(place: int) -> Untouched:
 def outside(first: int, after: int | None) -> Untouched:
     """Return what says of a chunk whether it lies before `first` or from `after` on."""
     return lambda start, end: end <= first or (after is not None and start >= after)
-
-
-def both(one: Untouched, other: Untouched) -> Untouched:
-    """Return what says of a chunk what two others say of it."""
-    return lambda start, end: one(start, end) and other(start, end)
 
 
 class Whole:
@@ -105,17 +100,8 @@ def test_a_cut_bag_gives_every_chunk_before_the_cut(whole: Whole, tmp_path: Path
     for _ in range(CUTS):
         size = chance.randrange(len(whole.data))
         bag = whole.judge(tmp_path / "cut.mcap", whole.data[:size], outside(size, None))
-        assert bag is None or bag.damage is not None
-
-
-def test_a_block_of_zeros(whole: Whole, tmp_path: Path):
-    chance = random.Random(4)
-    for _ in range(60):
-        place = chance.randrange(len(whole.data) - 4096)
-        data = whole.data[:place] + bytes(4096) + whole.data[place + 4096 :]
-        bag = whole.judge(tmp_path / "zeros.mcap", data, outside(place, place + 4096))
-        assert bag is not None
-        assert bag.damage is not None
+        # What says that a bag is simulated must not be the first that goes.
+        assert bag is None or (bag.damage is not None and bag.notes == whole.notes != {})
 
 
 def test_bytes_put_in_or_taken_away(whole: Whole, tmp_path: Path):
@@ -244,10 +230,3 @@ def test_a_message_index_that_becomes_a_message_is_not_passed_on(tmp_path: Path)
     bag = Bag(path)
     assert sorted(read(bag)) == sorted(messages)
     assert bag.damage is not None
-
-
-def test_a_cut_leaves_the_notes_at_the_head(whole: Whole, tmp_path: Path):
-    """What says that a bag is simulated must not be the first that goes."""
-    path = tmp_path / "cut.mcap"
-    path.write_bytes(whole.data[: whole.chunks[1][0]])
-    assert Bag(path).notes == whole.notes != {}

@@ -9,10 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from rosbags.rosbag2 import Reader
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.writer import BagWriter, RecordingEndedError
+from magnetosuture_thread.bags.writer import BagWriter
 from test.bags.bags import STRING, cdr, read
 
 # Writes messages that cannot be packed until something stops it, and says how many.
@@ -62,46 +61,7 @@ def test_a_disk_that_takes_no_more(tmp_path: Path, limit: int):
     assert "is closed" in second
     assert bag.counts["/noise"] >= limit // 40_100 - 7
     assert bag.counts["/noise"] == len(read(bag))
-    assert not (folder / ".reserve").exists()
     assert bag.damage is None or bag.damage.chunks == 0
-
-
-def test_with_room_for_its_summary_a_bag_that_was_ended_early_is_whole(tmp_path: Path, monkeypatch):
-    """A full disk: the reserve that is then given free takes summary and metadata.yaml."""
-    bag = BagWriter(tmp_path / "full", {"setup": "example"})
-    bag.add_topic("/text", STRING)
-    stream = bag._stream
-
-    class Full:
-        """A disk with no room until the reserve is gone."""
-
-        def write(self, data: bytes) -> int:
-            if (bag.folder / ".reserve").exists() and stream.tell() > 300_000:
-                stream.write(data[:1000])
-                raise OSError(28, "No space left on device")
-            return stream.write(data)
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(stream, name)
-
-    monkeypatch.setattr(bag._writer, "_stream", Full())
-    written = 0
-
-    def fill() -> None:
-        nonlocal written
-        while True:
-            bag.write("/text", written * 10**8, cdr(STRING, f"{written} " + hex(hash(str(written))) * 100))
-            written += 1
-
-    with pytest.raises(RecordingEndedError, match=r"the disk is full after \d+ messages"):
-        fill()
-    bag.close()
-    found = Bag(tmp_path / "full")
-    assert found.damage is None
-    assert 0 < found.counts["/text"] < written
-    assert found.notes == {"setup": "example"}
-    with Reader(tmp_path / "full") as reader:
-        assert reader.message_count == found.counts["/text"]
 
 
 def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
@@ -120,21 +80,6 @@ def test_a_killed_recorder_leaves_what_it_had_flushed(tmp_path: Path):
     assert "truncated" in str(bag.damage)
     assert bag.counts["/noise"] >= said - 7  # a chunk holds seven
     assert [time for _, time, _ in read(bag)] == [10**9 + k * 10**7 for k in range(bag.counts["/noise"])]
-
-
-def test_every_chunk_can_be_read_on_its_own(tmp_path: Path):
-    """Also without the summary and all other chunks: each tells its topics and types anew."""
-    with BagWriter(tmp_path / "bag") as bag:
-        bag.add_topic("/text", STRING)
-        for index in range(60):
-            bag.write("/text", index * 10**10, cdr(STRING, str(index)))
-    file = tmp_path / "bag" / "bag_0.mcap"
-    whole = file.read_bytes()
-    middle = len(whole) // 2
-    (tmp_path / "half.mcap").write_bytes(bytes(2000) + whole[2000:middle])
-    records = list(Bag(tmp_path / "half.mcap").records())
-    assert records
-    assert all(record.decode().data == str(record.time // 10**10) for record in records)
 
 
 def test_whatever_interrupts_a_recorder_what_it_wrote_is_whole(tmp_path: Path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -113,30 +112,8 @@ def test_an_attachment_that_cannot_be_told_is_left_out():
     assert "    attachment: " not in text
 
 
-def test_the_paper_s_file_says_so(tmp_path: Path):
-    settings = replace(SETTINGS, formulation="paper", paper_damping=0.9, paper_stiffness_weight=3.0)
-    estimates = (
-        Estimate("kappa", "paper_damping", "", 0.9, 0.95, 0.8, 0.95),
-        Estimate("W_stiff", "paper_stiffness_weight", "", 3.0, 0.01, 1.0, 9.0),
-    )
-    text = to_yaml(found(settings=settings, estimates=estimates, attachment=None))
-    assert loaded(text, tmp_path) == settings
-    assert "EI / zeta_perp" not in text
-
-
 def test_what_is_not_finished_says_so():
     unfinished = replace(found(), finished=False)
     assert to_yaml(unfinished).startswith("# BEST SO FAR, NOT FINISHED")
     assert unfinished.to_json()["finished"] is False
     assert "not finished" in str(parameter_table(unfinished.to_json()).title)
-
-
-def test_nodes_that_are_farther_off_after_the_fit_are_a_warning():
-    assert BagErrors("a", 100, 0.2, 0.2, across_before=0.1, across_after=0.05).warning == ""
-    assert BagErrors("a", 100, math.nan, math.nan).warning == ""
-    words = BagErrors("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.05).warning
-    assert words.startswith("a: the nodes are 0.21 % of the length off after the fit, 0.15 % before")
-    assert (
-        "across the thread, which is what was fitted, 0.05 % after, 0.1 % before: what is left lies along it" in words
-    )
-    assert BagErrors("a", 100, 0.15, 0.21, across_before=0.1, across_after=0.2).warning.endswith("do not use")

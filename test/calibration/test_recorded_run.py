@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.calibration.recorded_run import MAX_FRAMES, SETTLING, read_run
-from magnetosuture_thread.calibration.residuals import (
+from magnetosuture_thread.calibration.recorded_run import (
+    MAX_FRAMES,
+    SETTLING,
     across_residuals,
     mean_error,
     offset_residuals,
+    read_run,
     replay_with_parameters,
 )
 from magnetosuture_thread.errors import BagError, InvalidInputError

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.calibration.recorded_run import read_run
-from magnetosuture_thread.calibration.residuals import BestSettings
+from magnetosuture_thread.calibration.recorded_run import BestSettings, read_run
 from magnetosuture_thread.calibration.result import FIXED, IDENTIFIED, CalibrationResult, Estimate
 from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from test.calibration.runs import SETTINGS, SILK, model_run, noisy, rig_passage, rig_run, stiff

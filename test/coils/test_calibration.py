@@ -37,7 +37,7 @@ def test_what_is_written_is_read(tmp_path: Path):
     [
         ("model: [", "coil calibration: got .* expected valid YAML"),
         ("- 1", "expected keys name, date"),
-        ("model: loops", "coils: got None, expected a value"),
+        ("model: loops", "coils: got None, expected a list of at least 3"),
         (f"model: dipoles\ncoils: {THREE}", "model: got 'dipoles', expected loops, the only model"),
         (f"model: loops\nunits: mm\ncoils: {THREE}", "units: got 'mm', expected one of name"),
         (f"model: loops\nname: 7\ncoils: {THREE}", "name: got 7, expected text"),

@@ -165,16 +165,6 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path: Pa
     assert not (tmp_path / "bag").exists()
 
 
-def test_a_node_that_cannot_start_ends_the_run_with_its_last_words(tmp_path: Path):
-    path = tmp_path / "odd.yaml"
-    # What a barrier's class is only the node finds out.
-    other = "/**/thread_model: {ros__parameters: {barriers: ['no_such_module:Thing']}}\n"
-    path.write_text(SHORT.replace("FAULTS", "") + other)
-    with pytest.raises(GraphError, match=r"perception ended with exit code 1: error: .*no_such_module"):
-        simulate(str(path), tmp_path / "bag")
-    assert not (tmp_path / "bag").exists()
-
-
 def test_an_interrupted_run_on_a_simulated_clock_keeps_what_was_recorded(scenario: Path, tmp_path: Path):
     command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "simulate", str(scenario)]
     command += ["--output", str(tmp_path / "bag"), "--duration", "60", "--rate", "1.5"]

@@ -9,14 +9,9 @@ import pytest
 
 from magnetosuture_thread import Disc
 from magnetosuture_thread.estimator.association import (
-    MIN_DEVIATION,
-    POINT_CORRELATION,
     measured_points,
-    path_lengths,
-    path_without_outliers,
     place_pieces,
     project,
-    read_piece,
 )
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -33,37 +28,6 @@ from test.estimator.threads import (
 )
 
 NAN = (float("nan"), float("nan"))
-
-
-def test_points_far_aside_are_left_out_of_the_path() -> None:
-    rng = np.random.default_rng(1)
-    angle = np.linspace(0.0, 4.0, 100)
-    points = 3.0 * np.column_stack([np.cos(angle), np.sin(angle)]) + rng.normal(0.0, 0.02, (100, 2))
-    wrong = np.zeros(100, dtype=np.bool_)
-    wrong[[0, 7, 8, 40, 41, 42, 77, 99]] = True
-    points[wrong] += rng.choice([-1.0, 1.0], (8, 2)) * 4.0
-    np.testing.assert_array_equal(path_without_outliers(points, 0.12, 0.3), ~wrong)
-
-
-@pytest.mark.parametrize("count", [99, 120, 350])
-def test_a_piece_of_many_points_keeps_both_ends_and_its_points_share_information(count: int) -> None:
-    points = np.column_stack([np.linspace(0.0, 0.019, count), np.zeros(count)])
-    points[5] = np.nan, 0.0
-    points[7] = 0.0, 20.0  # out of bounds
-    path, deviation, arcs, share = read_piece(points, np.full(count, 1e-7), 1e-3, 100)
-    assert 50 <= len(path) <= 100
-    np.testing.assert_allclose(path[[0, -1], 0], [0.0, 19.0])
-    np.testing.assert_allclose(deviation, MIN_DEVIATION / 1e-3)  # none is better than that
-    np.testing.assert_allclose(arcs, path[:, 0])
-    np.testing.assert_allclose(share, np.minimum(np.gradient(arcs) * 1e-3 / POINT_CORRELATION, 1.0))
-
-
-def test_length_of_a_noisy_path_is_not_that_of_its_noise() -> None:
-    rng = np.random.default_rng(2)
-    points = np.column_stack([np.linspace(0.0, 10.0, 200), rng.normal(0.0, 0.02, 200)])
-    arcs = path_lengths(points, 0.4)
-    assert abs(arcs[-1] - 10.0) < 0.05 < 0.2 < np.hypot(*np.diff(points, axis=0).T).sum() - 10.0
-    assert np.all(np.diff(arcs) >= 0.0)
 
 
 @pytest.mark.parametrize("turn", [0.1, -0.1])

@@ -99,30 +99,20 @@ def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
 STRAIGHT = np.column_stack([-np.arange(float(NODES)), np.zeros(NODES)])
 
 
-def correct_straight(
-    points: MeasuredPoints, density: float, discs: tuple[Disc, ...] = ()
-) -> tuple[int, float, float, CorrectionBuffers]:
-    """Correct a straight thread; return how it ended, how far off the constraints are, residual and memory."""
-    formulation = predictor_of(thread_of(NODES - 1), discs).formulation
-    assert isinstance(formulation, RodFormulation)
-    memory = CorrectionBuffers.of(NODES)
-    memory.known[0] = True
-    prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, density), np.ones(NODES), 2.0, 0.5)
-    code, _, off, residual, _ = correct(formulation.rod, formulation.workspace.data, memory, prior, points)
-    return code, off, residual, memory
-
-
 def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     """A straight thread has no constraint across it, so that across it the update is the plain one."""
     rng = np.random.default_rng(4)
     points = measured(rng, 40)
     points = points._replace(innovation=1e-3 * points.innovation, variance=np.full(40, 1e-4), share=np.ones(40))
-    code, off, residual, memory = correct_straight(points, 3e-4)
+    formulation, memory = predictor_of(thread_of(NODES - 1)).formulation, CorrectionBuffers.of(NODES)
+    assert isinstance(formulation, RodFormulation)
+    memory.known[0] = True
+    prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, 3e-4), np.ones(NODES), 2.0, 0.5)
+    code, _, off, residual, _ = correct(formulation.rod, formulation.workspace.data, memory, prior, points)
     assert code == CORRECTED
     assert off <= 1.0
     assert residual < 1e-6
     check = StepBuffers.of(NODES, 2, 1)
-    prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, 3e-4), np.ones(NODES), 2.0, 0.5)
     prior_information(prior, 1.0, False, memory.normals, check)
     information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
     rows = dense_rows(points, STRAIGHT)[:, 3::2]
@@ -133,18 +123,6 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     left = covariance - gain @ rows @ covariance
     np.testing.assert_allclose(memory.covariance[1:, 1, 1], np.diag(left), rtol=1e-3)
     assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
-
-
-def test_points_in_an_obstacle_correct_the_thread_up_to_it() -> None:
-    """The points are a tenth of a segment aside, and a disc is a fiftieth of one away from the thread."""
-    thread = thread_of(NODES - 1)
-    unit, radius = thread.segment_length, 2e-3
-    disc = Disc((-6.0 * unit, radius + 0.5 * thread.diameter + 0.02 * unit), radius)
-    points = MeasuredPoints(np.linspace(3.0, 9.0, 25), np.full(25, -0.1), np.full(25, 1e-2), *np.ones((2, 25)))
-    code, off, _, memory = correct_straight(points, 1e-2, (disc,))
-    assert (code, off <= 1.0) == (CORRECTED, True)
-    away = np.linalg.norm(unit * (STRAIGHT + memory.moved) - np.array(disc.centre), axis=1)
-    assert -2e-7 < away.min() - radius - 0.5 * thread.diameter < 2e-6
 
 
 def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:

@@ -115,9 +115,3 @@ def test_what_a_known_contact_could_push_with_is_no_disturbance() -> None:
 def test_a_force_elsewhere_than_at_a_known_contact_is_found_where_it_is() -> None:
     (found,) = forces_found(25, 12)[-1]
     assert found.arc_length == pytest.approx(12 / 25 * 0.019, abs=2e-3)
-
-
-def test_the_first_frame_after_a_gap_between_poses_says_nothing_of_disturbances() -> None:
-    in_time, late = (forces_found(None, 12, interval) for interval in (1.0 / RATE, 3.0))
-    first = [next(k for k, each in enumerate(found) if each) for found in (in_time, late)]
-    assert first[1] == first[0] + 1

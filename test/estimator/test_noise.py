@@ -17,7 +17,6 @@ from magnetosuture_thread.estimator.noise import (
     NoiseModel,
     learn,
     learn_intensity,
-    propagate_errors,
     raised_intensity,
 )
 
@@ -40,15 +39,6 @@ def test_errors_of_all_windows_together_raise_the_noise_of_all(side: float) -> N
     np.testing.assert_array_equal(*raised_by(errors, settled=False))
 
 
-def test_an_error_of_one_window_that_is_sure_raises_the_noise_there_and_expected_ones_nowhere() -> None:
-    errors = np.zeros(WINDOWS)
-    errors[4] = 4.0
-    raised, before = raised_by(errors)
-    assert raised[4] == pytest.approx(before[4] + 1e-10 * (16.0 - 9.0) / 0.1)
-    np.testing.assert_array_equal(np.delete(raised, 4), np.delete(before, 4))
-    np.testing.assert_array_equal(*raised_by(np.random.default_rng(1).normal(0.0, 1.0, WINDOWS)))
-
-
 def test_each_intensity_has_a_kalman_filter_and_the_likelihood_of_its_innovation() -> None:
     rng, interval, model = np.random.default_rng(2), 0.03, NoiseModel.new()
     error, variance = 1e-5 * rng.normal(size=(2, 12)), 1e-10 * rng.uniform(0.5, 2.0, (2, 12))
@@ -68,16 +58,6 @@ def test_each_intensity_has_a_kalman_filter_and_the_likelihood_of_its_innovation
     np.testing.assert_allclose(after[1][1], prior[1])
     for old, new in ((error, after[0]), (before.likelihood, after[2]), (before.intensity, after[3])):
         np.testing.assert_array_equal(new[1], old[1])
-
-
-def test_over_a_step_errors_go_with_the_thread_and_grow_by_its_noise() -> None:
-    """The thread slides by 0.3 segments along itself, and moves aside by 0.1."""
-    unit, nodes = 2e-3, np.column_stack([-np.arange(9.0), np.zeros(9)])
-    before, after = unit * nodes, unit * (nodes + np.array([0.3, 0.1]))
-    errors, added = np.array([np.linspace(0.0, 0.8, 9), np.linspace(0.0, 1.6, 9)]) ** 2, np.full((2, 9), 0.5)
-    places = np.maximum(np.arange(9) - 0.3, 0.0)
-    expected = [np.interp(places, np.arange(9), each) + 0.5 for each in errors]
-    np.testing.assert_allclose(propagate_errors(after, before, unit, added, errors), expected)
 
 
 def test_of_the_first_frame_no_noise_is_known_and_later_ones_count_by_the_time_before() -> None:

@@ -118,16 +118,6 @@ def test_bad_pieces_are_survived_with_the_reason(index: int) -> None:
     assert error_percent(result.estimate.positions, truth[-1]) < 0.2
 
 
-def test_time_set_back_starts_anew() -> None:
-    session, way = session_of(), poses(60)
-    for pose in way:
-        session.on_pose(pose)
-    result = session.on_pose(way[0])
-    assert result.problem is None
-    assert result.estimate is not None
-    assert result.estimate.unmeasured_for == math.inf
-
-
 def test_a_centreline_that_ends_early_is_taken() -> None:
     way = poses(60)
     truth = true_shapes(thread_of(viscosity=1.5), way)

@@ -5,48 +5,20 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
-from dataclasses import replace
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
-from magnetosuture_thread.evaluation.report.figures import BagDetails, Figures, LiveFigures, headlines
-from magnetosuture_thread.evaluation.tables import (
-    Row,
-    bags_table,
-    failed_row,
-    flat,
-    row_of,
-    table_csv,
-    table_json,
-)
+from magnetosuture_thread.evaluation.figures import BagDetails, Figures, LiveFigures, headlines
+from magnetosuture_thread.evaluation.frames import Observation
+from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
+from magnetosuture_thread.evaluation.tables import Row, bags_table, failed_row, flat, row_of, table_csv, table_json
+from test.evaluation.runs import LENGTH, made_metrics
 
-ERROR = {"count": 9, "mean": 0.1 + 0.2, "median": 0.2, "p99": 0.5, "maximum": 0.75}
-NOTHING = Figures.of(RunMetrics(1.0))
-FIGURES = replace(
-    NOTHING,
-    compared={
-        "prediction": {**NOTHING.compared["prediction"], "error_ground_truth_mean_percent": 0.3},
-        "estimate": NOTHING.compared["estimate"],
-    },
-    frames=10,
-    tracked=9,
-    predicted=9,
-    error={"truth": ERROR, "seen": None},
-    recorded_error={"truth": ERROR},
-    target="truth",
-    measured_share=1.0,
-    strain=math.nan,
-    residual=1e-9,
-    minimum={"obstacle": MinimumMargin("obstacle", -2e-6, -2e-6, 7, 0, 1.5)},
-    contact_frames=3,
-    step_time=Percentiles(1e-4, 2e-4, 3e-4),
-    processing=None,
-    interval=1 / 30,
-    live=LiveFigures({"frame to prediction": Percentiles(0.012, 0.018, 0.02)}),
-)
+LIVE = LiveFigures({"frame to prediction": Percentiles(0.012, 0.018, 0.02)})
+FIGURES = Figures.of(made_metrics(10, ("truth",)), LIVE)
+MEAN = 100.0 * 2e-6 * 4.5 / LENGTH  # %, of ten frames
 
 
 def row(name: str, simulated: str = "") -> Row:
@@ -59,14 +31,22 @@ def read(rows: list[Row]) -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(table_csv(rows), newline="")))
 
 
+def shown(*rows: Row) -> str:
+    """Return the table as a terminal of 80 columns shows it."""
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(bags_table(rows))
+    return console.export_text()
+
+
 def test_a_row_has_the_figures_with_all_digits():
     (found,) = read([row("a")])
     assert tuple(found) == tuple(flat(row("a")))  # each value of a mapping has a column
-    assert float(found["error_truth_mean_percent"]) == 0.1 + 0.2
-    assert found["error_seen_mean_percent"] == found["stretch_max"] == found["tracker_median_s"] == ""
+    assert float(found["error_truth_mean_percent"]) == pytest.approx(MEAN, rel=1e-12)
+    assert float(found["estimate_error_measured_mean_percent"] or "nan") != 0.0
+    assert found["error_seen_mean_percent"] == found["least_wall_m"] == ""
     assert found["error_seen_frames"] == "0"
-    assert float(found["recorded_error_truth_max_percent"]) == 0.75
-    assert float(found["least_obstacle_m"]) == -2e-6
+    assert float(found["recorded_error_truth_max_percent"]) == pytest.approx(100.0 * 9e-6 / LENGTH)
+    assert float(found["least_obstacle_m"]) == 1e-3 - 9e-5
     assert float(found["latency_frame_to_prediction_p99_s"]) == 0.018
 
 
@@ -83,32 +63,29 @@ def test_json_says_the_same_with_mean_and_worst():
     found = json.loads(table_json(rows))
     assert found["bags"] == rows
     assert found["bags"][1]["problem"] == "is broken"
-    assert found["mean"] == {"error_truth_mean_percent": 0.1 + 0.2, "error_seen_mean_percent": None}
-    assert found["worst"]["error_truth_mean_percent"] == 0.1 + 0.2
+    assert found["mean"] == {"error_truth_mean_percent": pytest.approx(MEAN), "error_seen_mean_percent": None}
+    assert found["worst"]["error_truth_mean_percent"] == pytest.approx(MEAN)
 
 
 def test_the_terminal_s_table_fits_and_shows_names_as_they_are():
-    console = Console(width=80, file=io.StringIO(), record=True)
-    console.print(bags_table([row("[bold]x"), failed_row("b", "p", "q")]))
-    text = console.export_text()
-    assert "[bold]x" in text
-    assert "9/10" in text
-    assert "failed" in text
-    assert "0.300" in text
+    text = shown(row("[bold]x"), failed_row("b", "p", "q"))
+    for words in ("[bold]x", "10/10", "failed", f"{MEAN:.4f}"):
+        assert words in text
     assert "…" not in text
 
 
 def test_the_silence_of_a_sensor_is_in_table_row_and_headline():
-    """4 of 6 minutes without frames read as 1383 of 1387 frames."""
-    figures = replace(FIGURES, frames=1387, predicted=1383, silence=SensorSilence(1, 240.0, 240.0, 60.0), span=360.0)
-    about = BagDetails("loop", "/data/loop", "petri", duration=360.0)
+    """4 of 6 minutes without frames read as all of the frames."""
+    metrics = RunMetrics(LENGTH)
+    for time in np.concatenate([np.arange(0.0, 60.0, 0.5), np.arange(300.0, 360.5, 0.5)]):
+        metrics.observe(Observation(round(time * 1e9), np.zeros(2), np.array([1.0, 0.0])))
+        metrics.series.add(time, {})
+    figures, about = Figures.of(metrics), BagDetails("loop", "/data/loop", "petri", duration=360.0)
     (found,) = read([row_of(about, figures)])
-    assert (found["silent_s"], found["max_silence_s"], found["silences"]) == ("240.0", "240.0", "1")
-    console = Console(width=80, file=io.StringIO(), record=True)
-    console.print(bags_table([row_of(about, figures), row("other")]))
-    text = console.export_text()
+    assert (found["silent_s"], found["max_silence_s"], found["silences"]) == ("240.5", "240.5", "1")
+    text = shown(row_of(about, figures), row("other"))
     assert "loop !" in text
-    assert "! without frames for 240.0 s in all" in text
+    assert "! without frames for 240.5 s in all" in text
     frames = next(each for each in headlines(about, figures) if each.name == "frames predicted")
-    assert "none at all for 240 s, the longest 240 s at 60.0 s" in frames.detail
+    assert "none at all for 240 s, the longest 240 s at 59.5 s" in frames.detail
     assert frames.grade == "bad"

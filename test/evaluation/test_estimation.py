@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -12,17 +10,16 @@ import pytest
 from scipy.stats import chi2
 
 from magnetosuture_thread.estimator import Disturbance
-from magnetosuture_thread.evaluation import colours
-from magnetosuture_thread.evaluation.estimation import (
+from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult
+from magnetosuture_thread.evaluation.metrics import (
     Consistency,
     DisturbanceLog,
     HiddenShares,
+    RunMetrics,
     compare_errors,
     hidden_part,
     mean_band,
 )
-from magnetosuture_thread.evaluation.frames import EstimatedThread, FrameResult
-from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 NODES = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])  # a thread 1 m long
@@ -146,12 +143,3 @@ def test_disturbances_of_one_beginning_are_one_event():
     assert [first.significance, first.arc_length_m] == pytest.approx([7.0, 2.1])
     assert [first.x_m, first.y_m, first.direction_rad] == pytest.approx([0.1, 0.2, math.pi / 2])
     assert second.begin_s == pytest.approx(0.85)
-
-
-def test_the_colours_are_those_of_the_operator_s_page():
-    page = files("magnetosuture_thread.console").joinpath("page/colours.js").read_text(encoding="utf-8")
-    given = dict(re.findall(r'export const (\w+) = "(#\w{6}|rgba\([^)]*\))"', page))
-    assert given["ESTIMATED"] == colours.ESTIMATED.light
-    assert given["MODEL"] == colours.PREDICTED.light
-    parts = [int(part) for part in re.findall(r"\d+", given["MEASURED"])[:3]]
-    assert "#" + "".join(f"{part:02x}" for part in parts) == colours.MEASURED.light

@@ -1,4 +1,4 @@
-"""Putting outputs side by side."""
+"""Messages of a graph put side by side: the figures of a replay and of a closed loop."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.evaluation.estimation import compare_errors
-from magnetosuture_thread.evaluation.graph_outputs import GraphCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import Percentiles, stage_latencies
+from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector, ReplaySummary
+from magnetosuture_thread.evaluation.metrics import Percentiles, compare_errors, stage_latencies
 from magnetosuture_thread.evaluation.tables import summary_table
 
 
@@ -155,56 +155,154 @@ def test_latencies_pair_stamps():
     assert found["command to currents"] is None
 
 
-def test_the_table_says_what_is_simulated_and_fits_a_terminal():
-    spread = Percentiles(0.012, 0.02, 0.03)
-    summary = ReplaySummary(
-        bag="bag",
-        setup="petri",
-        simulated="all of it",
-        frames=10,
-        tracked=9,
-        predicted=8,
-        commands=0,
-        driven=0,
-        latency={"frame to needle pose": spread, "command to currents": None},
-        step_time=spread,
-        least_margins=[],
-        contact_frames=2,
-        stretch=1e-6,
-        residual=1e-9,
-        seen_share=0.9,
-        error_seen={"count": 8, "mean": 0.5, "median": 0.4, "p99": 0.9, "maximum": 1.0},
-        error_truth=None,
-    )
+def shown(summary: ReplaySummary) -> str:
+    """Return a summary as a terminal of 80 columns shows it."""
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(summary_table(summary))
     text = console.export_text()
-    for words in ("simulated", "90.0 %", "12.0 ms", "no pairs", "0.500 %", "8 frames scored", "90.0 %"):
+    assert max(len(line) for line in text.splitlines()) <= 80
+    return text
+
+
+def test_the_table_says_what_is_simulated_and_fits_a_terminal():
+    spread, latency = Percentiles(0.012, 0.02, 0.03), {"frame to needle pose": None}
+    summary = ReplaySummary(
+        *("bag", "petri", "all of it", 10, 9, 8, 0, 0, {**latency, "command to currents": spread}, spread, [], 2),
+        *(1e-6, 1e-9, 0.9, None, None),
+        prediction={"error_measured_mean_percent": 0.5, "error_measured_max_percent": 1.0},
+        dropped={"frames not taken by vision_tracker": 3, "poses without an answer": 0},
+    )
+    text = shown(summary)
+    for words in ("simulated", "90.0 %", "12.0 ms", "no pairs", "0.500 %", "1.000 %", "dropped", "frames not taken"):
         assert words in text
     assert "truth" not in text
-    assert max(len(line) for line in text.splitlines()) <= 80
-    poses = replace(
-        summary,
-        source="poses",
-        speed=52.4,
-        latency={},
-        refused={"a pose that is none": 2},
-        damage="the end is missing",
-        remark="it is another thread",
-    )
-    text = shown(poses)
+    assert "without an answer" not in text
+    given = {"refused": {"a pose that is none": 2}, "damage": "the end is missing", "remark": "it is another thread"}
+    text = shown(replace(summary, source="poses", speed=52.4, latency={}, **given))
     for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
         assert words in text
     for words in ("camera frames", "velocity", "latency", "dropped"):
         assert words not in text
-    text = shown(replace(summary, dropped={"frames not taken by vision_tracker": 3, "poses without an answer": 0}))
-    assert "messages dropped" in text
-    assert "frames not taken" in text
-    assert "without an answer" not in text
 
 
-def shown(summary: ReplaySummary) -> str:
-    """Return a summary as a terminal shows it."""
-    console = Console(width=100, record=True, file=io.StringIO())
-    console.print(summary_table(summary))
-    return console.export_text()
+def currents(time: float, *currents: float, stop: str = "") -> Message:
+    """Return what a message of currents amounts to."""
+    return Message(header=header(round(time * 1e9)), current=list(currents), stop=stop)
+
+
+def series(*messages: Message) -> CurrentSeries:
+    """Return a series of messages."""
+    made = CurrentSeries()
+    for each in messages:
+        made.add(each)
+    return made
+
+
+def test_the_current_in_force_is_the_one_to_compare_with():
+    recorded = series(currents(1.0, 1.0, 0.0), currents(1.01, 2.0, 0.0), currents(1.02, 3.0, 0.0, stop="no command"))
+    found = series(currents(1.013, 2.5, 0.0), currents(1.0199, 2.0, 0.0), currents(1.03, 3.0, 0.0)).against(recorded)
+    assert found is not None
+    assert (found.compared, found.greatest, found.difference) == (3, 0.5, 0.0)
+    assert found.recorded == pytest.approx((17.0 / 6.0) ** 0.5)
+    assert found.stopped_apart == pytest.approx(1.0 / 3.0)
+
+
+def test_what_has_nothing_beside_it_is_not_compared():
+    recorded = series(currents(1.0, 1.0))
+    assert series(currents(0.9, 1.0), currents(1.06, 1.0)).against(recorded) is None
+    assert series(currents(1.0, 1.0, 2.0)).against(recorded) is None
+    assert series().against(recorded) is None
+    assert series(currents(1.0, 1.0)).against(series()) is None
+
+
+LENGTH = 0.007
+
+
+def planar(x: float, y: float, angle: float) -> Message:
+    """Return a pose in the plane."""
+    turned = Message(x=0.0, y=0.0, z=math.sin(0.5 * angle), w=math.cos(0.5 * angle))
+    return Message(position=Message(x=x, y=y, z=0.0), orientation=turned)
+
+
+class Loop:
+    """A collector that is told of frames."""
+
+    def __init__(self, curvature: float = 0.0) -> None:
+        self.collector = LoopCollector(0.019, LENGTH, curvature, 100.0)
+
+    def truth(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0) -> None:
+        """Say where the needle really was."""
+        message = Message(header=header(stamp), pose=planar(x, y, angle))
+        self.collector.add("/ground_truth/needle", stamp, message)
+
+    def pose(self, stamp: int, x: float = 0.0, y: float = 0.0, angle: float = 0.0, after: int = 0) -> None:
+        """Say where it was tracked, and what the tracker said of the frame."""
+        message = Message(header=header(stamp), pose=Message(pose=planar(x, y, angle)))
+        self.collector.add("/needle/measured_cp", stamp + after, message)
+        self.state(stamp, 1)
+
+    def state(self, stamp: int, state: int) -> None:
+        """Say what the tracker said of a frame."""
+        message = Message(header=header(stamp), state=state, processing_time=0.004)
+        self.collector.add("/needle/tracker_state", stamp, message)
+
+    def wish(self, stamp: int, x: float, y: float = 0.0) -> None:
+        """Say where the path wanted the tip."""
+        self.collector.add("/needle/setpoint_cp", stamp, Message(header=header(stamp), pose=planar(x, y, 0.0)))
+
+
+def test_errors_are_against_the_truth_of_the_same_frame():
+    loop = Loop()
+    for index in range(4):
+        stamp = 10**9 + index * 10**7
+        loop.truth(stamp, x=1e-3 * index, angle=0.1)
+        loop.pose(stamp, x=1e-3 * index + 3e-5, y=4e-5, angle=0.11, after=5_000_000)
+        tip = 1e-3 * index + LENGTH * math.cos(0.1), LENGTH * math.sin(0.1)
+        loop.wish(stamp, tip[0] + 2e-4, tip[1])
+    summary = loop.collector.summary("x")
+    assert summary.tail_error == pytest.approx(5e-5)
+    assert summary.heading_error == pytest.approx(0.01)
+    assert summary.path_error == pytest.approx(2e-4)
+    assert summary.path_error_greatest == pytest.approx(2e-4)
+    assert (summary.frames, summary.tracked, summary.lost, summary.wrong) == (4, 4, 0, 0)
+    assert summary.duration == pytest.approx(0.03)
+    latency = summary.latency["needle/measured_cp"]
+    assert latency is not None
+    assert latency.median == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(
+    ("x", "angle", "wrong"), [(2.9e-4, 0.0, 0), (3.1e-4, 0.0, 1), (0.0, 0.08, 0), (0.0, 0.09, 1), (0.0, math.pi, 1)]
+)
+def test_a_pose_far_from_the_truth_is_counted_as_wrong(x: float, angle: float, wrong: int):
+    loop = Loop()
+    loop.truth(10**9)
+    loop.wish(10**9, LENGTH)
+    loop.pose(10**9, x=x, angle=angle)
+    assert loop.collector.summary("x").wrong == wrong
+
+
+def test_only_the_time_of_steering_counts():
+    loop = Loop()
+    for index in range(10):
+        stamp = 10**9 + index * 10**7
+        loop.truth(stamp)
+        if 3 <= index <= 6:
+            loop.wish(stamp, LENGTH)
+        if index != 5:
+            loop.pose(stamp)
+        else:
+            loop.state(stamp, 2)
+    done = Message(name="path_follower: state", message="done")
+    loop.collector.add("/diagnostics", 10**9, Message(header=header(10**9), status=[done]))
+    summary = loop.collector.summary("x")
+    assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (4, 3, 1, 0)
+
+
+def test_a_run_without_a_pose_says_what_the_nodes_said():
+    loop = Loop()
+    loop.truth(10**9)
+    status = Message(name="vision_tracker: state", message="searching: no dish in the image")
+    loop.collector.add("/diagnostics", 10**9, Message(header=header(10**9), status=[status]))
+    with pytest.raises(GraphError, match="no dish in the image"):
+        loop.collector.summary("x")

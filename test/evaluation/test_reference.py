@@ -1,4 +1,4 @@
-"""Reference trajectories."""
+"""Reference trajectories, and scores on them."""
 
 from __future__ import annotations
 
@@ -10,65 +10,133 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.reference import read_reference
+from magnetosuture_thread.evaluation.plots import draw_case
+from magnetosuture_thread.evaluation.reference import CaseResult, Evaluation, find_references, read_reference, score
+from magnetosuture_thread.evaluation.tables import evaluation_table
+
+MATERIAL = {
+    "kind": "polyamide USP 7-0 monofilament",
+    "L_m": 0.019,
+    "EI_Nm2": 1.27e-9,
+    "zeta_perp_Pa_s": 0.974,
+    "zeta_par_Pa_s": 0.487,
+    "diameter_m": 6e-5,
+    "paper_nodes": 25,
+}
+TIMES = np.arange(40) / 66.0
 
 
-def save(path: Path, **changes: object) -> Path:
-    """Write a small trajectory, with some of its arrays changed."""
-    times = np.linspace(0.0, 1.0, 11)
-    threads = np.zeros((11, 5, 2))
-    threads[:, :, 0] = times[:, None] - 0.01 * np.arange(5)
-    obstacle = {"type": "circle", "cx": 0.1, "cy": 0.2, "R": 0.05}
-    content: dict[str, Any] = {
-        "t": times,
-        "pose": np.column_stack([times, np.zeros(11), 0.1 * times]),
-        "X": threads,
-        "meta": json.dumps({"name": "small", "obstacle": obstacle}),
-    }
-    content.update(changes)
+def write(folder: Path, name: str, offset: float = 0.0, arrays: dict[str, Any] | None = None, **changes: Any) -> Path:
+    """Write a straight thread that is pulled along itself, its truth off by a length to one side from then on.
+
+    `arrays` are in place of the file's, `changes` of entries of its metadata.
+    """
+    poses = np.column_stack([5e-3 * TIMES, np.zeros(40), 0.1 * TIMES])
+    threads = np.column_stack([-np.linspace(0.0, 0.019, 101), np.zeros(101)]) + poses[:, None, :2]
+    threads[1:, :, 1] += offset
+    metadata = {"name": name, "material": MATERIAL, "boundary": "pinned", "obstacle": None, **changes}
+    content = {"t": TIMES, "pose": poses, "X": threads, "meta": json.dumps(metadata), **(arrays or {})}
+    path = folder / f"{name}.npz"
     np.savez(path, **{key: value for key, value in content.items() if value is not None})
     return path
 
 
 def test_a_trajectory_is_read_and_interpolated(tmp_path: Path):
-    reference = read_reference(save(tmp_path / "small.npz"))
-    assert reference.name == "small"
-    assert reference.discs[0].radius == 0.05
-    tail, heading, thread = reference.at(0.55)
-    assert tail == pytest.approx([0.55, 0.0])
-    assert heading == pytest.approx(0.055)
-    assert thread[:, 0] == pytest.approx(0.55 - 0.01 * np.arange(5))
-    assert reference.at(1.0)[0] == pytest.approx([1.0, 0.0])
+    reference = read_reference(write(tmp_path, "small", obstacle={"type": "circle", "cx": 0.1, "cy": 0.2, "R": 0.05}))
+    assert (reference.name, reference.discs[0].radius) == ("small", 0.05)
+    tail, heading, thread = reference.at(0.2)
+    assert tail == pytest.approx([1e-3, 0.0])
+    assert heading == pytest.approx(0.02)
+    assert thread[[0, -1], 0] == pytest.approx([1e-3, 1e-3 - 0.019])
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("arrays", "words"),
     [
         ({"X": None}, "the keys t, pose, X, meta"),
         ({"meta": "no json"}, "the keys t, pose, X, meta"),
-        ({"pose": np.zeros((11, 2))}, "pose (11, 2)"),
-        ({"t": np.zeros(11)}, "times that do not increase"),
-        ({"pose": np.full((11, 3), np.nan)}, "not finite"),
-        ({"t": np.append(np.arange(10.0), np.inf)}, "not finite"),
-        ({"meta": "[1, 2]"}, "the keys t, pose, X, meta"),
         ({"meta": json.dumps({"obstacle": {"R": 1.0}})}, "the keys t, pose, X, meta"),
+        ({"pose": np.zeros((40, 2))}, r"pose \(40, 2\)"),
+        ({"t": np.zeros(40)}, "times that do not increase"),
+        ({"pose": np.full((40, 3), np.nan)}, "not finite"),
     ],
 )
-def test_what_is_no_trajectory_is_refused(tmp_path: Path, changes: dict[str, object], words: str):
-    path = save(tmp_path / "bad.npz", **changes)
-    with pytest.raises(BagError) as caught:
-        read_reference(path)
-    assert words in str(caught.value)
-    assert str(path) in str(caught.value)
+def test_what_is_no_trajectory_is_refused(tmp_path: Path, arrays: dict[str, Any], words: str):
+    with pytest.raises(BagError, match=rf"bad\.npz.*{words}"):
+        read_reference(write(tmp_path, "bad", arrays=arrays))
 
 
 def test_a_missing_or_broken_file_is_refused(tmp_path: Path):
     with pytest.raises(BagError, match="does not exist"):
         read_reference(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("hello")
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    whole = save(tmp_path / "whole.npz").read_bytes()
-    (tmp_path / "damaged.npz").write_bytes(whole[:200] + bytes(60) + whole[260:])
-    for name in ("text.npz", "array.npy", "damaged.npz"):
+    whole = write(tmp_path, "whole").read_bytes()
+    for name, content in (("text", b"hello"), ("damaged", whole[:200] + bytes(60) + whole[260:])):
+        (tmp_path / f"{name}.npz").write_bytes(content)
         with pytest.raises(BagError, match="no reference trajectory"):
-            read_reference(tmp_path / name)
+            read_reference(tmp_path / f"{name}.npz")
+
+
+def scored(paths: list[Path], formulation: str = "rod", solver: str = "banded") -> tuple[Evaluation, list[CaseResult]]:
+    """Return the scores and the results."""
+    results: list[CaseResult] = []
+    shares: list[float] = []
+    found = score(paths, formulation=formulation, solver=solver, progress=shares.append, keep=results.append)
+    return found, results
+
+
+@pytest.mark.parametrize("solver", ["banded", "osqp"])
+def test_a_thread_that_follows_its_needle_is_predicted(tmp_path: Path, solver: str):
+    found, results = scored([write(tmp_path, "straight")], solver=solver)
+    case = found.cases[0]
+    assert case.mean_error_percent < 1e-3
+    assert case.max_stretch < 1e-4
+    assert case.max_residual < 1e-6
+    assert (case.max_penetration_m, case.fallbacks) == (0.0, 0)
+    assert 0.0 < case.step_median_s <= case.step_p99_s
+    assert results[0].vertices.shape == (40, 26, 2)
+
+
+def test_the_error_is_in_percent_of_the_length_and_over_all_samples(tmp_path: Path):
+    found, results = scored([write(tmp_path, "straight"), write(tmp_path, "off", offset=1.9e-4)])
+    assert found.cases[1].max_error_percent == pytest.approx(1.0, rel=1e-4)
+    assert found.cases[1].mean_error_percent == pytest.approx(39.0 / 40.0, rel=1e-4)  # the first is right
+    assert found.worst_error_percent == found.cases[1].mean_error_percent
+    assert found.mean_error_percent == pytest.approx(0.5 * found.worst_error_percent, rel=1e-3)
+    mapping = found.to_mapping()
+    assert json.loads(json.dumps(mapping)) == mapping
+    assert set(mapping) == {"formulation", "solver", "cases", "mean_error_percent", "worst_error_percent"}
+    assert evaluation_table(found).row_count == 4
+    draw_case(picture := tmp_path / "off.png", results[1], "rod")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_depth_in_an_obstacle_is_seen(tmp_path: Path):
+    """The needle pulls nodes around a disc that they start inside of, so the first samples are too deep."""
+    obstacle = {"type": "disc", "cx": -0.0105, "cy": 0.0, "R": 3e-4}
+    found, _ = scored([write(tmp_path, "inside", obstacle=obstacle)], formulation="paper")
+    assert found.cases[0].max_penetration_m > 1e-5
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"material": None}, "has no thread in its metadata"),
+        ({"material": {**MATERIAL, "L_m": "long"}}, "has no thread in its metadata"),
+        ({"material": {k: v for k, v in MATERIAL.items() if k != "EI_Nm2"}}, "EI_Nm2"),
+        ({"material": {**MATERIAL, "L_m": -0.019}}, "thread.length: got -0.019"),
+        ({"material": {**MATERIAL, "EI_Nm2": 0.0}}, "not positive"),
+        ({"boundary": "knotted"}, "knotted"),
+    ],
+)
+def test_a_file_without_a_thread_is_refused(tmp_path: Path, changes: dict[str, Any], words: str):
+    with pytest.raises(BagError, match=words):
+        scored([write(tmp_path, "bad", **changes)])
+
+
+def test_a_folder_without_trajectories_is_refused(tmp_path: Path):
+    with pytest.raises(BagError, match="holds no reference trajectories"):
+        find_references(tmp_path)
+    with pytest.raises(BagError, match="does not exist"):
+        find_references(tmp_path / "nowhere")
+    path = write(tmp_path, "one")
+    assert find_references(tmp_path) == [path] == find_references(path)

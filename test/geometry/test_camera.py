@@ -30,14 +30,6 @@ def test_there_and_back(rotation: float):
     np.testing.assert_allclose(view.directions_to_dish(view.directions_to_pixels(directions)), directions, atol=1e-15)
 
 
-def test_without_a_rotation_it_is_as_it_always_was():
-    view = DishView((300.5, 200.25), 1.3e-4)
-    points = np.random.default_rng(1).uniform(-0.02, 0.02, (20, 2))
-    np.testing.assert_array_equal(view.to_pixels(points), points / 1.3e-4 * (1.0, -1.0) + (300.5, 200.25))
-    matrix = view.intrinsics(0.3)
-    np.testing.assert_allclose(matrix @ [0.001, -0.002, 0.3] / 0.3, [*view.to_pixels(np.array([0.001, 0.002])), 1.0])
-
-
 @pytest.mark.parametrize("factor", [4.0, 0.5])
 def test_in_a_shrunk_image_a_point_is_as_far_from_the_images_corner(factor: float):
     """The corner of the top left pixel is at (-0.5, -0.5) in both; from there a pixel is as long as `factor` ones."""

@@ -36,7 +36,7 @@ from magnetosuture_thread.interface import (
 )
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Scene, SceneShape, read_scene
 from test.nodes import wire
 from test.nodes.scenes import scene_told

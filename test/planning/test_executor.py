@@ -22,7 +22,7 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner
 from magnetosuture_thread.planning.procedure import parse_procedure
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 NEEDLE = NeedleKinematics(0.0025)

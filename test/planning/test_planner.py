@@ -14,7 +14,7 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
 from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.setups import Setup
 

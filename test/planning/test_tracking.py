@@ -15,7 +15,7 @@ from magnetosuture_thread.planning.tracking import (
     TACK_SHARE,
     PathTracker,
 )
-from magnetosuture_thread.safety.kinematics import NeedleKinematics
+from magnetosuture_thread.safety.motion import NeedleKinematics
 
 NEEDLE = NeedleKinematics(0.0025)
 COIL_ANGLES = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)

@@ -77,7 +77,7 @@ def test_a_rig_that_finds_no_next_state_says_so_once_and_tries_again_after_a_res
         return -1, 1.0, 1.0
 
     with monkeypatch.context() as context:
-        context.setattr("magnetosuture_thread.rig.mechanics.dynamics.advance", fail)
+        context.setattr("magnetosuture_thread.rig.mechanics.dynamics.minimise", fail)
         with pytest.raises(SolverError):
             made.advance(1.1)
         assert made.currents.tolist() == [0.0] * 4

@@ -103,23 +103,6 @@ def test_an_added_barrier_holds_whatever_is_commanded(barrier: Barrier, length: 
     assert barrier.name in active
 
 
-def test_a_bound_that_comes_nearer_lets_a_needle_flee_and_not_wait_for_it():
-    safety = needle(MovingHalfPlane(0.002, rate=-0.01))
-    tail, heading = np.array([0.0, 0.0]), np.array([1.0, 0.0])
-    free = safety.filter(np.array([0.01, 0.0]), tail, heading, time=0.0)
-    assert free.active == ()  # at the end of the hold the bound is at the needle
-    pushed = needle(MovingHalfPlane(0.002, rate=-0.01), length=0.0).filter(
-        np.array([0.01, 0.0]), tail, heading, time=0.15
-    )
-    assert pushed.active == ("half_plane",)
-    assert pushed.filtered[1] < -0.005  # as fast as it is commanded, and off the bound
-    assert math.hypot(*pushed.filtered) == pytest.approx(0.01)
-    towards = safety.filter(np.array([0.0, 0.01]), tail, np.array([0.0, 1.0]), time=0.15)
-    assert towards.reason == "stopped by half_plane"
-    fleeing = safety.filter(np.array([0.0, -0.012]), tail, np.array([0.0, -1.0]), time=0.15)
-    assert fleeing.filtered.tolist() == [0.0, -0.012]
-
-
 def test_the_share_that_the_bridge_asks_for_knows_added_barriers():
     safety = needle(HalfPlane(0.001))
     share, name = safety.safe_share(np.array([0.0, 0.02]), np.array([0.0, 0.0]), np.array([0.0, 1.0]))

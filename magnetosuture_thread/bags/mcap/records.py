@@ -1,4 +1,4 @@
-"""Strict parsing and encoding of mcap records, and of chunks with their checksums.
+"""Strict parsing and encoding of mcap records, of chunks with their checksums, and of a file's summary.
 
 The package `mcap` accepts short reads and trailing bytes. Here a record must be as long as its header says, which is
 how a corrupt header is noticed.
@@ -11,7 +11,10 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from array import array
 from collections.abc import Callable, Iterator
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, field
 from importlib import import_module
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple
@@ -22,7 +25,14 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, MAX_BLOCK_RECORDS, MAX_RECORD_BYTES, UnpackBudget
+from magnetosuture_thread.bags.storage import Connection, MessageDefinition
+from magnetosuture_thread.untrusted import (
+    LONE_RECORD,
+    MAX_BLOCK_BYTES,
+    MAX_BLOCK_RECORDS,
+    MAX_RECORD_BYTES,
+    UnpackBudget,
+)
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
@@ -46,7 +56,8 @@ _READERS: dict[int, Callable[[ReadDataStream], Any]] = {
 # First and last time, uncompressed size, its checksum, length of the compression's name.
 _CHUNK_HEADER = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
-_READ_BYTES = 1 << 20  # decompressed at a time where the size is not known in advance
+_FOOTER = struct.Struct("<QQI")  # offsets of summary and summary offsets, checksum
+_FOOTER_BYTES = RECORD_HEADER.size + _FOOTER.size + len(MAGIC)  # from the footer to the file's end
 # Opcode, length of less than a terabyte, times, size and checksum, a known compression.
 _CHUNK_PATTERN = re.compile(rb"\x06.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}", re.DOTALL)
 _WINDOW_BYTES = 1 << 22
@@ -92,19 +103,6 @@ def _check_length(opcode: int, length: int) -> None:
     """Check the length of a record that is parsed as a whole, before it is copied."""
     if opcode in _READERS and length > MAX_RECORD_BYTES:
         raise CorruptRecordError(f"a {_name(opcode)} of {length} bytes, more than {MAX_RECORD_BYTES}")
-
-
-def parse_attachment(body: bytes) -> tuple[mcap_records.Attachment | None, bool]:
-    """Return an attachment, and whether it has a checksum; None where it is corrupt."""
-    stream = ReadDataStream(BytesIO(body))
-    try:
-        record = mcap_records.Attachment.read(stream)
-    except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError):
-        return None, False
-    crc = int.from_bytes(body[-4:], "little")
-    if stream.count != len(body) or (crc and zlib.crc32(body[:-4]) != crc):
-        return None, False
-    return record, bool(crc)
 
 
 def iterate_records(content: bytes) -> Iterator[tuple[int, int, int]]:
@@ -185,9 +183,9 @@ def decompress_chunk(body: bytes, budget: UnpackBudget | None = None) -> ChunkCo
     return ChunkContent(data, found, bool(crc), compression.decode())
 
 
-def has_chunk_checksum(stream: BinaryIO, position: int) -> bool:
-    """Return whether a chunk with a checksum begins at a position; the checksum is not verified."""
-    stream.seek(position + RECORD_HEADER.size)
+def has_chunk_checksum(stream: BinaryIO, offset: int) -> bool:
+    """Return whether the content of a chunk's record at an offset has a checksum, which is not verified."""
+    stream.seek(offset)
     head = stream.read(_CHUNK_HEADER.size)
     return len(head) == _CHUNK_HEADER.size and bool(_CHUNK_HEADER.unpack(head)[3])
 
@@ -201,14 +199,10 @@ def _decompress(compression: bytes, compressed: bytes, size: int) -> bytes:
             data: bytes = _lz4.LZ4FrameDecompressor().decompress(compressed, max_length=size + 1)
             return data
         if compression == b"zstd":
-            if zstandard.frame_content_size(compressed) == size:
-                return zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES).decompress(compressed)
-            parts, count = [], 0
-            with zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES).stream_reader(compressed) as stream:
-                while count <= size and (part := stream.read(_READ_BYTES)):
-                    parts.append(part)
-                    count += len(part)
-            return b"".join(parts)
+            if zstandard.frame_content_size(compressed) not in (-1, size):  # -1: not known
+                raise CorruptRecordError("a chunk of a wrong size")
+            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_BLOCK_BYTES)
+            return unpacker.decompress(compressed, max_output_size=size)
     except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError):
         raise CorruptRecordError("a chunk that cannot be decompressed") from None
     raise CorruptRecordError("a chunk of an unknown compression")
@@ -261,3 +255,171 @@ def is_intact_chunk(stream: BinaryIO, position: int, limit: int, budget: UnpackB
     except CorruptRecordError:
         return False
     return content.has_checksum
+
+
+class Block(NamedTuple):
+    """A chunk, or a run of messages outside of chunks.
+
+    Attributes:
+        offset: where its bytes begin: those after a chunk's record header, or the first message's record header.
+        length: number of bytes.
+        is_chunk: whether it is a chunk.
+        has_checksum: whether it has a checksum of its own.
+        crc: checksum of its records, computed; None where it is not read yet.
+        size: bytes of its records.
+        start: time of its first message [ns].
+        end: time of its last message [ns].
+        channels: channels with messages in it, 2 bytes each: a set of them takes thirty times as much.
+    """
+
+    offset: int
+    length: int
+    is_chunk: bool
+    has_checksum: bool
+    crc: int | None
+    size: int
+    start: int
+    end: int
+    channels: bytes
+
+    def holds(self, channels: AbstractSet[int]) -> bool:
+        """Return whether it has messages of one of these channels."""
+        return not channels.isdisjoint(self.channel_numbers())
+
+    def channel_numbers(self) -> array[int]:
+        """Return the channels with messages in it."""
+        return array("H", self.channels)
+
+
+@dataclass
+class ChannelTable:
+    """Channels and schemas as they are defined in some part of a file.
+
+    Attributes:
+        schemas: definitions by schema id; two or more conflict.
+        channels: definitions by channel id; two or more conflict.
+    """
+
+    schemas: dict[int, list[mcap_records.Schema]] = field(default_factory=dict)
+    channels: dict[int, list[mcap_records.Channel]] = field(default_factory=dict)
+
+    def add(self, record: mcap_records.Schema | mcap_records.Channel) -> None:
+        """Add a definition unless the same one is known."""
+        table: dict[int, list[Any]] = self.schemas if isinstance(record, mcap_records.Schema) else self.channels
+        versions = table.setdefault(record.id, [])
+        if len(versions) < 2 and record not in versions:  # two are a conflict already
+            versions.append(record)
+
+    def update(self, other: ChannelTable) -> None:
+        """Add all definitions of another table."""
+        tables: list[dict[int, list[Any]]] = [other.schemas, other.channels]
+        for record in (record for table in tables for versions in table.values() for record in versions):
+            self.add(record)
+
+    def connections(self) -> dict[int, Connection]:
+        """Return the channels whose definition, and that of their schema, is without conflict."""
+        known: dict[int, Connection] = {}
+        for number, versions in self.channels.items():
+            channel = versions[0]
+            schemas = self.schemas.get(channel.schema_id, [])
+            if len(versions) > 1 or len(schemas) > 1 or (channel.schema_id and not schemas):
+                continue
+            definition = MessageDefinition("")
+            if schemas:
+                text = schemas[0].data.decode("utf-8", "surrogateescape")
+                definition = MessageDefinition(schemas[0].name, schemas[0].encoding, text)
+            known[number] = Connection(channel.topic, definition, channel.message_encoding, channel.metadata)
+        return known
+
+
+@dataclass
+class McapSummary:
+    """The content of a summary section.
+
+    It has a checksum of its own, so it can be trusted where the rest of the file is corrupt, and lists what is missing.
+
+    Attributes:
+        start: where it begins in the file; the data ends there, its last record included.
+        end: where its footer begins.
+        trusted: whether it has a checksum that is correct.
+        channels: channels and their schemas.
+        chunks: the chunk index, as blocks that have not been read.
+        metadata: offset and length of the metadata records.
+        lengths: of all that the summary lists, a chunk's message indexes included, by offset [bytes].
+        statistics: counts and times of all messages, if present.
+    """
+
+    start: int
+    end: int
+    trusted: bool
+    channels: ChannelTable = field(default_factory=ChannelTable)
+    chunks: list[Block] = field(default_factory=list)
+    metadata: list[tuple[int, int]] = field(default_factory=list)
+    lengths: dict[int, int] = field(default_factory=dict)
+    statistics: mcap_records.Statistics | None = None
+
+
+def read_summary(stream: BinaryIO, size: int, budget: UnpackBudget) -> McapSummary | None:
+    """Return the summary of a file; None where there is none, or its checksum is wrong.
+
+    One without a checksum is accepted if it consists of valid records.
+
+    Args:
+        stream: the file.
+        size: its length.
+        budget: of the bag.
+
+    Raises:
+        BudgetError: there is too much in it.
+    """
+    stream.seek(max(0, size - _FOOTER_BYTES))
+    end = stream.read()
+    if len(end) < _FOOTER_BYTES or RECORD_HEADER.unpack_from(end) != (Opcode.FOOTER, _FOOTER.size):
+        return None
+    start, _, crc = _FOOTER.unpack_from(end, RECORD_HEADER.size)
+    start = start or size - _FOOTER_BYTES
+    in_range = max(len(MAGIC), size - MAX_BLOCK_BYTES) <= start <= size - _FOOTER_BYTES
+    if not end.endswith(MAGIC) or not in_range:
+        return None
+    stream.seek(start)
+    data = stream.read(size - len(MAGIC) - start)
+    budget.spend(len(data), LONE_RECORD)
+    if crc and zlib.crc32(data[:-4]) != crc:
+        return None
+    summary = McapSummary(start, size - _FOOTER_BYTES, bool(crc))
+    try:
+        _parse_summary(data, summary, budget)
+    except CorruptRecordError:
+        return None
+    return summary
+
+
+def _parse_summary(data: bytes, summary: McapSummary, budget: UnpackBudget) -> None:
+    channel_sets: dict[bytes, bytes] = {}
+    for opcode, first, last in iterate_records(data):
+        budget.spend(0, 1)
+        record = parse_record(opcode, data[first:last])
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            budget.keep(last - first, len(getattr(record, "metadata", ())))
+            summary.channels.add(record)
+        elif opcode == Opcode.CHUNK_INDEX:
+            channels = array("H", sorted(record.message_index_offsets)).tobytes()
+            block = Block(
+                offset=record.chunk_start_offset + RECORD_HEADER.size,
+                length=record.chunk_length - RECORD_HEADER.size,
+                is_chunk=True,
+                has_checksum=True,
+                crc=None,
+                size=record.uncompressed_size,
+                start=record.message_start_time,
+                end=record.message_end_time,
+                channels=channel_sets.setdefault(channels, channels),
+            )
+            summary.chunks.append(block)
+            summary.lengths[record.chunk_start_offset] = record.chunk_length + record.message_index_length
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            summary.lengths[record.offset] = record.length
+            if opcode == Opcode.METADATA_INDEX:
+                summary.metadata.append((record.offset, record.length))
+        elif opcode == Opcode.STATISTICS:
+            summary.statistics = record

@@ -11,11 +11,10 @@ from array import array
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
 from mcap.records import Metadata
@@ -25,7 +24,10 @@ from magnetosuture_thread.bags.mcap.records import (
     MESSAGE_HEADER,
     MIN_PRIVATE_OPCODE,
     RECORD_HEADER,
+    Block,
+    ChannelTable,
     CorruptRecordError,
+    McapSummary,
     decompress_chunk,
     find_chunk,
     is_intact_chunk,
@@ -33,47 +35,12 @@ from magnetosuture_thread.bags.mcap.records import (
     iterate_records,
     parse_record,
 )
-from magnetosuture_thread.bags.mcap.summary import ChannelTable, McapSummary
 from magnetosuture_thread.bags.storage import CorruptRegion
 from magnetosuture_thread.untrusted import LONE_RECORD, MAX_BLOCK_BYTES, UnpackBudget
 
 _SKIP_BYTES = 1 << 20  # read at a time where a record is skipped
 _EMPTY_INDEX = 6  # bytes of a message index without entries: channel and length
 _RUN_BYTES = 1 << 20  # of messages outside of chunks in one block
-
-
-class Block(NamedTuple):
-    """A chunk, or a run of messages outside of chunks.
-
-    Attributes:
-        offset: where its bytes begin: those after a chunk's record header, or the first message's record header.
-        length: number of bytes.
-        is_chunk: whether it is a chunk.
-        has_checksum: whether it has a checksum of its own.
-        crc: checksum of its records, computed; None where it is not read yet.
-        size: bytes of its records.
-        start: time of its first message [ns].
-        end: time of its last message [ns].
-        channels: channels with messages in it, 2 bytes each: a set of them takes thirty times as much.
-    """
-
-    offset: int
-    length: int
-    is_chunk: bool
-    has_checksum: bool
-    crc: int | None
-    size: int
-    start: int
-    end: int
-    channels: bytes
-
-    def holds(self, channels: AbstractSet[int]) -> bool:
-        """Return whether it has messages of one of these channels."""
-        return not channels.isdisjoint(self.channel_numbers())
-
-    def channel_numbers(self) -> array[int]:
-        """Return the channels with messages in it."""
-        return array("H", self.channels)
 
 
 @dataclass
@@ -88,7 +55,7 @@ class ScanResult:
         unchecked_channels: channels defined elsewhere.
         metadata: metadata records.
         compressions: of the chunks.
-        attachments: offset and length of the bodies of attachment records.
+        attachments: number of attachment records.
         corrupt: regions that could not be read.
         chunks_lost: number of chunks among them, as far as it can be seen.
         ended: whether the data end record was reached.
@@ -96,8 +63,6 @@ class ScanResult:
         data_crc: checksum of the data section as stored; 0 if there is none.
         data_crc_matches: whether it is correct.
         private_records: number of records of private opcodes.
-        profile: of the file, as its header says.
-        library: that wrote it, as its header says.
     """
 
     blocks: list[Block] = field(default_factory=list)
@@ -107,7 +72,7 @@ class ScanResult:
     unchecked_channels: ChannelTable = field(default_factory=ChannelTable)
     metadata: list[Metadata] = field(default_factory=list)
     compressions: set[str] = field(default_factory=set)
-    attachments: list[tuple[int, int]] = field(default_factory=list)
+    attachments: int = 0
     corrupt: list[CorruptRegion] = field(default_factory=list)
     chunks_lost: int = 0
     ended: bool = False
@@ -115,8 +80,6 @@ class ScanResult:
     data_crc: int = 0
     data_crc_matches: bool = False
     private_records: int = 0
-    profile: str = ""
-    library: str = ""
 
 
 class Scanner:
@@ -153,9 +116,9 @@ class Scanner:
         self._channel_sets: dict[bytes, bytes] = {}
         self._definitions: set[bytes] = set()  # hashes of those that were added
         self._offsets: list[int] = []  # of records, by the summary
-        if summary is not None and summary.trusted and not summary.shifted:
-            offsets = [chunk.offset for chunk in summary.chunks]
-            offsets += [record.offset for record in summary.metadata]
+        if summary is not None and summary.trusted:
+            offsets = [chunk.offset - RECORD_HEADER.size for chunk in summary.chunks]
+            offsets += [offset for offset, _ in summary.metadata]
             self._offsets = sorted([*offsets, summary.start - RECORD_HEADER.size - 4])
 
     def scan(self) -> ScanResult:
@@ -206,8 +169,6 @@ class Scanner:
         record = parse_record(opcode, body)
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._add_definition(opcode, body, checked=False)
-        elif opcode == Opcode.HEADER:
-            self.result.profile, self.result.library = record.profile, record.library
         elif opcode == Opcode.METADATA:
             self._budget.keep(length, len(record.metadata))
             self.result.metadata.append(record)
@@ -243,8 +204,7 @@ class Scanner:
         self._crc = zlib.crc32(self._read(position, RECORD_HEADER.size), self._crc)
         for at in range(start, start + length, _SKIP_BYTES):
             self._crc = zlib.crc32(self._read(at, min(_SKIP_BYTES, start + length - at)), self._crc)
-        if opcode == Opcode.ATTACHMENT:
-            self.result.attachments.append((start, length))
+        self.result.attachments += opcode == Opcode.ATTACHMENT
         return start + length
 
     def _scan_chunk(self, start: int, length: int, body: bytes) -> None:

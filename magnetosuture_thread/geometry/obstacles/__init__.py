@@ -8,10 +8,10 @@ from magnetosuture_thread.geometry.obstacles.contacts import (
     Contacts,
     Workspace,
     find_contacts,
+    half_segment_distances,
     wall_contact,
 )
 from magnetosuture_thread.geometry.obstacles.distances import WorkspaceData
-from magnetosuture_thread.geometry.obstacles.half_segments import half_segment_distances
 from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon, triangulate
 
 __all__ = [

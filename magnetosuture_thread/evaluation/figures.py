@@ -1,4 +1,4 @@
-"""The figures of one evaluated bag, the facts about it, and the headlines that grade them."""
+"""The figures of one evaluated bag, the facts about it, the headlines that grade them, and how figures are written."""
 
 from __future__ import annotations
 
@@ -8,17 +8,27 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magnetosuture_thread.evaluation.estimation import EstimationFigures, compare_errors
-from magnetosuture_thread.evaluation.metrics import MinimumMargin, Percentiles, RunMetrics, SensorSilence
+from magnetosuture_thread.evaluation.metrics import (
+    Consistency,
+    HiddenShares,
+    MinimumMargin,
+    Percentiles,
+    RunMetrics,
+    SensorSilence,
+)
 from magnetosuture_thread.thread.margins import SOLID
 
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
-GOOD, MIDDLING, BAD, NONE = "good", "middling", "bad", "none"
-CLOSE, FAIR = 1.0, 5.0  # % of the length
+AGAINST = {"truth": "the ground truth", "seen": "the measured centreline"}
 EXACT = 1e-3  # of a segment's length: what the solvers' tolerance leaves
 TOUCH = 1e-6  # m; a node this deep in an obstacle still counts as touching it
-
-AGAINST = {"truth": "the ground truth", "seen": "the measured centreline"}
+# Of threads on light and on dark ground, told apart by red-green blind readers too; as on the operator's page.
+COLOURS = {
+    "measured": ("#2f7bff", "#5b8cff"),
+    "ground-truth": ("#1d2833", "#e3e9ee"),
+    "predicted": ("#99107f", "#e83aae"),
+    "estimated": ("#00a3a8", "#35e6cb"),
+}
 
 
 @dataclass(frozen=True)
@@ -36,62 +46,19 @@ class LiveFigures:
 
 @dataclass(frozen=True)
 class Figures:
-    """How prediction and estimate did on one bag. Lengths in m, times in s.
+    """How prediction and estimate did on one bag.
 
     Attributes:
-        frames: camera frames, or recorded poses.
-        tracked: of these with a needle.
-        predicted: of these with a predicted thread.
-        error: prediction error by `truth` and `seen`: count, mean, median, p99, maximum [% of length]; None for none.
-        recorded_error: the same of the predictions that the bag holds; empty without any.
-        target: what the worst frames are compared with, `truth` or `seen`; empty if nothing could be scored.
-        measured_share: part of the thread's length that is measured, mean over the predicted frames.
-        strain: greatest absolute strain of a segment.
-        residual: greatest scaled residual of a solve.
-        tension: greatest tension of a segment [N]; nan where no force is known.
-        pull: greatest force of the thread upon the needle [N]; nan where no force is known.
-        pull_error: of that force against the ground truth, see `pull_error_percent`; nan without both [%].
-        minimum: minimum margin of each kind.
-        contact_frames: predicted frames in which the thread touches an obstacle.
-        step_time: of the model's step [s].
-        processing: of a frame in the tracker [s].
-        interval: between frames, median [s].
+        metrics: of all frames.
         live: of the recorded graph.
         silence: time without frames, or poses.
         span: that is evaluated [s].
-        estimate_error: of the estimate, as `error`.
-        compared: errors of `prediction` and `estimate` under the same names; see `compare_errors`.
-        estimation: what else there is of the estimate.
     """
 
-    frames: int
-    tracked: int
-    predicted: int
-    error: Mapping[str, Mapping[str, float] | None]
-    recorded_error: Mapping[str, Mapping[str, float] | None]
-    estimate_error: Mapping[str, Mapping[str, float] | None]
-    compared: Mapping[str, Mapping[str, float | None]]
-    estimation: EstimationFigures
-    target: str
-    measured_share: float
-    strain: float
-    residual: float
-    tension: float
-    pull: float
-    pull_error: float
-    minimum: Mapping[str, MinimumMargin]
-    contact_frames: int
-    step_time: Percentiles | None
-    processing: Percentiles | None
-    interval: float
+    metrics: RunMetrics
     live: LiveFigures
     silence: SensorSilence
     span: float
-
-    @property
-    def silent_share(self) -> float:
-        """Share of the time without frames, or poses."""
-        return self.silence.total / self.span if self.span > 0.0 else 0.0
 
     @classmethod
     def of(
@@ -106,32 +73,28 @@ class Figures:
         """
         times = metrics.observed.times
         begin, end = within or (float(times.min(initial=math.inf)), float(times.max(initial=-math.inf)))
-        steps = np.diff(times)
-        return cls(
-            frames=len(metrics.observed),
-            tracked=metrics.tracked,
-            predicted=len(metrics.series),
-            error=metrics.errors(),
-            recorded_error=metrics.errors("recorded_error"),
-            target=metrics.target,
-            measured_share=metrics.mean("seen_share"),
-            strain=metrics.maximum("strain"),
-            residual=metrics.maximum("residual"),
-            tension=metrics.maximum("tension"),
-            pull=metrics.maximum("pull"),
-            pull_error=metrics.pull_error_percent,
-            minimum=metrics.minimum_margins,
-            contact_frames=metrics.contact_frames,
-            step_time=metrics.percentiles("step_time"),
-            processing=Percentiles.of(metrics.observed.column("processing")),
-            interval=float(np.median(steps)) if len(steps) else math.nan,
-            live=live or LiveFigures(),
-            silence=SensorSilence.of(times, begin, end),
-            span=end - begin,
-            estimate_error=metrics.errors("estimate_error"),
-            compared=compare_errors(metrics.series),
-            estimation=metrics.estimation,
-        )
+        return cls(metrics, live or LiveFigures(), SensorSilence.of(times, begin, end), end - begin)
+
+    @property
+    def frames(self) -> int:
+        """Number of camera frames, or recorded poses."""
+        return len(self.metrics.observed)
+
+    @property
+    def tracked(self) -> int:
+        """Number of these with a needle."""
+        return self.metrics.tracked
+
+    @property
+    def predicted(self) -> int:
+        """Number of these with a predicted thread."""
+        return len(self.metrics.series)
+
+    @property
+    def interval(self) -> float:
+        """Median time between frames [s]; nan where there are none."""
+        steps = np.diff(self.metrics.observed.times)
+        return float(np.median(steps)) if len(steps) else math.nan
 
 
 @dataclass(frozen=True)
@@ -202,62 +165,65 @@ class Headline:
 
 def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
     """Return the figures of the page's head, in their order."""
-    estimation, interval = figures.estimation, figures.interval
-    kinds = {"estimate": figures.estimate_error} if estimation.estimated else {}
-    kinds["prediction"] = figures.error
+    metrics, interval = figures.metrics, figures.interval
+    estimation = metrics.estimation
+    kinds = {"estimate": metrics.errors("estimate_error")} if estimation.estimated else {}
+    kinds["prediction"] = metrics.errors()
     found = [
         _error(about, errors[target], f"{kind}, error against {against}", target)
         for target, against in AGAINST.items()
         for kind, errors in kinds.items()
         if target in errors
     ]
-    if estimation.estimated:
-        found += [_consistency(estimation), _hidden(estimation)]
+    if estimation.hidden is not None:
+        found += [_consistency(estimation.consistency), _hidden(estimation.hidden)]
     for parameter in estimation.learned:
         value, range_95 = str(parameter).split(", ", 1)
         name = parameter.name.replace("_", " ")
-        found.append(Headline(name, value, range_95, NONE, "learned by the estimate"))
-    found += [_frames(figures), _margin(about, figures), _strain(figures), _tension(figures)]
-    found.append(_duration("model step", figures.step_time, interval, "one step of the thread model"))
-    if figures.processing:
-        found.append(_duration("tracker", figures.processing, interval, "one camera frame"))
+        found.append(Headline(name, value, range_95, "none", "learned by the estimate"))
+    found += [_frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
+    if math.isfinite(tension := metrics.maximum("tension")):
+        pull = f"of a segment; the thread pulls the needle with at most {micronewtons(metrics.maximum('pull'))}"
+        found.append(Headline("peak tension", micronewtons(tension), pull, "none", "by the model's multipliers"))
+    found.append(_duration("model step", metrics.percentiles("step_time"), interval, "one step of the thread model"))
+    if processing := Percentiles.of(metrics.observed.column("processing")):
+        found.append(_duration("tracker", processing, interval, "one camera frame"))
     return [*found, _latency(figures)]
 
 
-def _grade(value: float, *grades: tuple[float, str, str]) -> tuple[str, str]:
-    """Return grade and words of the first upper limit that a value keeps."""
-    return next((grade, words) for limit, grade, words in grades if value <= limit)
+def _grade(value: float, good: float, middling: float, *words: str) -> tuple[str, str]:
+    """Return the grade of a value by two upper limits, and its words."""
+    rank = 0 if value <= good else 1 if value <= middling else 2
+    return ("good", "middling", "bad")[rank], words[rank]
 
 
 def _error(about: BagDetails, found: Mapping[str, float] | None, name: str, target: str) -> Headline:
     if found is None:
         missing = "not in this bag" if target == "truth" else "no frame shows half of the thread"
-        return Headline(name, "none", missing, NONE, "not scored")
-    grades = ((CLOSE, GOOD, "close"), (FAIR, MIDDLING, "off, but usable"), (math.inf, BAD, "far off"))
+        return Headline(name, "none", missing, "none", "not scored")
     millimetres = format_number(10.0 * found["mean"] * about.length)
     detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Maximum {format_number(found['maximum'])} %"
-    return Headline(name, f"{format_number(found['mean'])} %", detail, *_grade(found["mean"], *grades))
+    grade = _grade(found["mean"], 1.0, 5.0, "close", "off, but usable", "far off")
+    return Headline(name, f"{format_number(found['mean'])} %", detail, *grade)
 
 
-def _consistency(estimation: EstimationFigures) -> Headline:
-    name, found = "normalised innovation squared", estimation.consistency
+def _consistency(found: Consistency | None) -> Headline:
+    name = "normalised innovation squared"
     if found is None:
-        return Headline(name, "none", "no measurement went into the estimate", NONE, "a prediction only")
-    grades = ((-0.9, GOOD, "consistent"), (-0.5, MIDDLING, "often off"), (0.0, BAD, "not consistent"))
+        return Headline(name, "none", "no measurement went into the estimate", "none", "a prediction only")
     low, high = found.band
     windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
     detail = f"mean; in its 95 % band, {low:.2f} to {high:.2f}, in {found.within} of {windows} of {found.width:.1f} s"
-    return Headline(name, format_number(found.mean), detail, *_grade(-found.share, *grades))
+    grade = _grade(-found.share, -0.9, -0.5, "consistent", "often off", "not consistent")
+    return Headline(name, format_number(found.mean), detail, *grade)
 
 
-def _hidden(estimation: EstimationFigures) -> Headline:
-    found = estimation.hidden
-    assert found is not None
-    grades = ((0.0, GOOD, "never"), (1.0 - 1e-9, NONE, "at times"), (1.0, NONE, "always"))
+def _hidden(found: HiddenShares) -> Headline:
+    words = "never" if found.time == 0.0 else "always" if found.time > 1.0 - 1e-9 else "at times"
     detail = f"of the time, in part or all; {100.0 * found.length:.1f} % of the length in the mean"
     if found.all_time > 0.0:
         detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
-    return Headline("thread hidden", f"{100.0 * found.time:.1f} %", detail, *_grade(found.time, *grades))
+    return Headline("thread hidden", f"{100.0 * found.time:.1f} %", detail, "none" if found.time else "good", words)
 
 
 def _frames_of(count: float) -> str:
@@ -266,28 +232,28 @@ def _frames_of(count: float) -> str:
 
 def _frames(figures: Figures) -> Headline:
     share = figures.predicted / figures.frames if figures.frames else 0.0
-    grades = ((-0.95, GOOD, "nearly all"), (-0.5, MIDDLING, "with gaps"), (0.0, BAD, "few"))
     detail = f"{100.0 * share:.1f} %; needle found in {figures.tracked}"
     silence = figures.silence
     if silence.gaps:
         detail += f"; none at all for {format_number(silence.total)} s, the longest {format_number(silence.max_gap)} s"
         detail += f" at {silence.at:.1f} s"
-        share *= 1.0 - figures.silent_share
-    return Headline("frames predicted", f"{figures.predicted} of {figures.frames}", detail, *_grade(-share, *grades))
+        share *= 1.0 - (silence.total / figures.span if figures.span > 0.0 else 0.0)
+    grade = _grade(-share, -0.95, -0.5, "nearly all", "with gaps", "few")
+    return Headline("frames predicted", f"{figures.predicted} of {figures.frames}", detail, *grade)
 
 
-def _margin(about: BagDetails, figures: Figures) -> Headline:
+def _margin(about: BagDetails, metrics: RunMetrics) -> Headline:
     """Return the minimum margin: of something solid where all barriers hold, else the one that is broken most."""
-    minima = figures.minimum.values()
+    minima = metrics.minimum_margins.values()
     if not minima:
-        return Headline("minimum margin", "none", "no prediction converged", NONE, "not known")
+        return Headline("minimum margin", "none", "no prediction converged", "none", "not known")
     broken = [least.kind.replace("_", " ") for least in minima if not _holds(about, least)]
     worst = min(minima, key=lambda least: least.clearance - _min_clearance(about, least))
     if not broken:
         worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
-    touching = f"; touches in {_frames_of(figures.contact_frames)}" if figures.contact_frames else ""
+    touching = f"; touches in {_frames_of(metrics.contact_frames)}" if metrics.contact_frames else ""
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
-    grade, words = (BAD, f"broken: {', '.join(broken)}") if broken else (GOOD, "every barrier holds")
+    grade, words = ("bad", f"broken: {', '.join(broken)}") if broken else ("good", "every barrier holds")
     name = f"minimum margin, {worst.kind.replace('_', ' ')}"
     return Headline(name, micrometres(worst.clearance), detail, grade, words)
 
@@ -309,29 +275,22 @@ def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
     return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"
 
 
-def _strain(figures: Figures) -> Headline:
-    name, detail = "maximum stretch", "of a segment, either way"
-    if not math.isfinite(figures.strain):
-        return Headline(name, "none", detail, NONE, "not known")
-    grades = ((EXACT, GOOD, "inextensible"), (0.01, MIDDLING, "more than 0.1 %"), (math.inf, BAD, "more than 1 %"))
-    return Headline(name, f"{format_number(100.0 * figures.strain)} %", detail, *_grade(figures.strain, *grades))
-
-
-def _tension(figures: Figures) -> Headline:
-    if not math.isfinite(figures.tension):
-        return Headline("peak tension", "none", "of a segment, by the model", NONE, "no force is known")
-    detail = f"of a segment, by the model; the thread pulls the needle with at most {micronewtons(figures.pull)}"
-    return Headline("peak tension", micronewtons(figures.tension), detail, NONE, "by the model's multipliers")
+def _strain(strain: float) -> Headline:
+    grade = "none", "not known"
+    if math.isfinite(strain):
+        grade = _grade(strain, EXACT, 0.01, "inextensible", "more than 0.1 %", "more than 1 %")
+    value = f"{format_number(100.0 * strain)} %" if math.isfinite(strain) else "none"
+    return Headline("maximum stretch", value, "of a segment, either way", *grade)
 
 
 def _duration(name: str, found: Percentiles | None, interval: float, detail: str) -> Headline:
     if found is None:
-        return Headline(f"{name}, median", "none", detail, NONE, "not known")
-    grade = NONE, "frame rate not known"
+        return Headline(f"{name}, median", "none", detail, "none", "not known")
+    grade = "none", "frame rate not known"
     if interval > 0.0:
-        slow = math.inf, MIDDLING, "slower than the frames, on this machine"
-        fast = 0.5, GOOD, f"keeps up with {1.0 / interval:.3g} frames/s"
-        grade = _grade(found.p99 / interval, fast, (1.0, MIDDLING, "just keeps up"), slow)
+        fast = f"keeps up with {1.0 / interval:.3g} frames/s"
+        slow = "slower than the frames, on this machine"
+        grade = _grade(found.p99 / interval, 0.5, 1.0, fast, "just keeps up", slow)
     detail = f"{detail}; 99th percentile {milliseconds(found.p99)}"
     return Headline(f"{name}, median", milliseconds(found.median), detail, *grade)
 
@@ -340,10 +299,10 @@ def _latency(figures: Figures) -> Headline:
     name, live = "latency, frame to prediction", figures.live
     found = live.latency.get("frame to prediction")
     if found is None:
-        return Headline(name, "none", "measured only where the running graph was recorded", NONE, live.remark)
+        return Headline(name, "none", "measured only where the running graph was recorded", "none", live.remark)
     detail = f"median; 99th percentile {milliseconds(found.p99)}"
     soon = found.p99 <= 2.0 * figures.interval
-    grade, words = (GOOD, "within two frames") if soon else (MIDDLING, "longer than two frames")
+    grade, words = ("good", "within two frames") if soon else ("middling", "longer than two frames")
     return Headline(name, milliseconds(found.median), detail, grade, words)
 
 

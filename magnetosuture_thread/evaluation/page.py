@@ -1,4 +1,4 @@
-"""The report of one bag as a page of HTML that loads nothing, and the data of its plots."""
+"""The report of one bag as a page of HTML that loads nothing: its data, and the template and style of all reports."""
 
 from __future__ import annotations
 
@@ -9,41 +9,31 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime, timezone
 from functools import cache
-from typing import Any
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Template
-from plotly.offline import get_plotlyjs
+from jinja2 import Environment, StrictUndefined, Template
 
+from magnetosuture_thread.evaluation import figures as report
+from magnetosuture_thread.evaluation.figures import AGAINST, COLOURS, STAGES, BagDetails, Figures
 from magnetosuture_thread.evaluation.frames import MARGIN, Array, ErrorMap, WorstFrame, with_gaps
-from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.evaluation.plots import ReportPicture
-from magnetosuture_thread.evaluation.report import figures as report
-from magnetosuture_thread.evaluation.report.figures import AGAINST, STAGES, BagDetails, Figures
-from magnetosuture_thread.evaluation.report.template import page_style, read_source, read_template
+from magnetosuture_thread.evaluation.metrics import Consistency, Percentiles, RunMetrics
+from magnetosuture_thread.texts import printable
 from magnetosuture_thread.thread.margins import SOLID
 
-SINCE_EPOCH = 1_000_000_000  # s; a bag's time before it is no date
-MAX_POINTS = 5000  # of a line
-MAX_BANDS = 400  # of times in which the needle was not found
-MIN_RANGE = 1.0  # s
-MIN_STRAIN = 1e-7  # %, on a scale of powers of ten
-DIGITS = 5  # of a value in the page
-LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
+if TYPE_CHECKING:
+    from magnetosuture_thread.evaluation.plots import ReportPicture
 
-ERROR_LINES = (
+MAX_POINTS = 5000  # of a line
+KINDS = (
     ("estimate_", "estimate", "estimated"),
     ("", "prediction", "predicted"),
     ("recorded_", "recorded prediction", "kind5"),
-)
+)  # of threads: beginning of their columns, name, colour
+LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
 
-FORCE_LINES = (
-    ("tension", "peak tension", "predicted", ""),
-    ("pull", "pull upon the needle", "ink", ""),
-    ("true_pull", "the same by the ground truth", "good", "dot"),
-)
-
-Line = tuple[str, str, str, str]  # column, name, colour, dash
+Line = tuple[str, str, str, str, float]  # column, name, colour, dash, scale to the axis's unit
 
 
 def write_page(about: BagDetails, metrics: RunMetrics, figures: Figures, pictures: Sequence[ReportPicture]) -> str:
@@ -63,12 +53,17 @@ def write_page(about: BagDetails, metrics: RunMetrics, figures: Figures, picture
     return _template().render(
         about=about,
         figures=figures,
+        metrics=metrics,
+        estimation=metrics.estimation,
         headlines=report.headlines(about, figures),
         pictures=pictures,
         data={"simulated": bool(about.simulated), **page_data(metrics, [picture.worst for picture in pictures])},
         reasons=metrics.reasons.most_common(),
         against=AGAINST,
-        times=[("model step", figures.step_time), ("tracker, one frame", figures.processing)],
+        times=[
+            ("model step", metrics.percentiles("step_time")),
+            ("tracker, one frame", Percentiles.of(metrics.observed.column("processing"))),
+        ],
         stages=STAGES,
         recorded=_date(about.start),
         style=page_style(),
@@ -93,6 +88,8 @@ def _template() -> Template:
 @cache
 def _library() -> tuple[str, str]:
     """Return plotly.js, packed to two fifths of its size and in letters, and as it is."""
+    from plotly.offline import get_plotlyjs  # late, as other reports draw nothing with it
+
     library = get_plotlyjs()
     return base64.b64encode(zlib.compress(library.encode(), 9)).decode(), library
 
@@ -102,8 +99,8 @@ def _hash(script: str) -> str:
 
 
 def _date(start: int) -> str:
-    """Return when a bag was recorded; empty if its clock does not say."""
-    if start < SINCE_EPOCH * 10**9:
+    """Return when a bag was recorded; empty if its clock does not say: before 2001 it is no date."""
+    if start < 10**18:
         return ""
     return datetime.fromtimestamp(start // 10**9, timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
@@ -118,87 +115,70 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
         worst: the worst frames, numbered in their order.
         limit: points of a line.
     """
-    estimation, observed = metrics.estimation, metrics.observed.times
-    times, columns = thinned(metrics.series.times, _in_units(metrics), limit)
-    tracked_times, tracked = thinned(observed, {"processing": 1e3 * metrics.observed.column("processing")}, limit)
+    series, observed, estimation = metrics.series, metrics.observed, metrics.estimation
+    times, columns = thinned(series.times, {name: series.column(name) for name in series.names}, limit)
+    frames, tracked = thinned(observed.times, {"processing": observed.column("processing")}, limit)
     errors = [
-        (f"{kind}error_{target}", f"{name} against {words}", colour, dash)
-        for kind, name, colour in ERROR_LINES
+        (f"{kind}error_{target}", f"{name} against {words}", colour, dash, 1.0)
+        for kind, name, colour in KINDS
         for (target, words), dash in zip(AGAINST.items(), ("", "dot"), strict=True)
     ]
-    solid = [(f"{MARGIN}{name}", name, colour, "") for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
+    solid = [(f"{MARGIN}{name}", name, colour, "", 1e3) for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
     others = [name for name in columns if name.startswith(MARGIN) and name.removeprefix(MARGIN) not in SOLID]
     margins = [
-        (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "")
+        (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "", 1e6)
         for k, column in enumerate(others)
     ]
-    durations = _lines(columns, [("step_time", "model step", "kind0", "")], dots=True)
-    durations += _lines(tracked, [("processing", "tracker", "kind1", "")], at="frames", dots=True)
+    forces = [
+        ("tension", "peak tension", "predicted", "", 1e6),
+        ("pull", "pull upon the needle", "ink", "", 1e6),
+        ("true_pull", "the same by the ground truth", "good", "dot", 1e6),
+    ]
+    durations = _lines(columns, [("step_time", "model step", "kind0", "", 1e3)], dots=True)
+    durations += _lines(tracked, [("processing", "tracker", "kind1", "", 1e3)], at="frames", dots=True)
+    hidden = [("hidden", "hidden", "kind5", "", 100.0)] if estimation.estimated else []
+    windows, consistency, top = _consistency_lines(estimation.consistency, columns)
     moments = {"moments": f"error_{metrics.target}", "floor": 0.0}
-    hidden = _lines(columns if estimation.estimated else {}, [("hidden", "hidden", "kind5", "")])
-    windows, consistency, top = _consistency_lines(metrics, columns)
     plots: list[tuple[str, str, list[dict[str, Any]], dict[str, Any]]] = [
         ("error", "error [% of length]", _lines(columns, errors), moments),
         ("consistency", "squared innovation", consistency, {"top": top}),
-        ("hidden", "hidden [% of length]", hidden, {"top": 102.0}),
-        ("stretch", "stretch [%]", _lines(columns, [("strain", "maximum", "ink", "")]), {"log": True}),
-        ("tension", "force [µN]", _lines(columns, FORCE_LINES), {"floor": 0.0}),
+        ("hidden", "hidden [% of length]", _lines(columns, hidden), {"top": 102.0}),
+        ("stretch", "stretch [%]", _lines(columns, [("strain", "maximum", "ink", "", 100.0)]), {"log": True}),
+        ("tension", "force [µN]", _lines(columns, forces), {"floor": 0.0}),
         ("obstacle", "distance [mm]", _lines(columns, solid), {"zero": True}),
         ("lengths", "margin [µm]", _lines(columns, margins), {"zero": True}),
         ("pace", "time [ms]", durations, {"log": True}),
     ]
+    first, last = float(observed.times.min(initial=math.inf)), float(observed.times.max(initial=-math.inf))
     return {
-        "times": {
-            name: _values(at, 8)
-            for name, at in zip(("predicted", "frames", "windows"), (times, tracked_times, windows), strict=True)
-        },
-        "range": _range(observed),
-        "lost": [[round(a, 4), round(b, 4)] for a, b in _bands(metrics.lost)],
+        "times": {"predicted": _values(times, 8), "frames": _values(frames, 8), "windows": _values(windows, 8)},
+        "range": [first, max(last, first + 1.0)] if len(observed) else [0.0, 1.0],
+        "lost": [[round(a, 4), round(b, 4)] for a, b in metrics.lost],
         "moments": [
             {"number": number, "time": round(each.time, 4), "error": _rounded(each.error)}
             for number, each in enumerate(worst, 1)
         ],
         "disturbances": [[round(event.begin_s, 4), round(event.end_s, 4)] for event in estimation.disturbances],
         "plots": [{"id": name, "y": label, "series": lines, **kind} for name, label, lines, kind in plots if lines],
-        "map": _map(metrics.error_map),
-        "estimate_map": _map(metrics.estimate_map),
+        "map": _map(metrics.error_map()),
+        "estimate_map": _map(metrics.error_map("estimate")),
     }
 
 
-def _in_units(metrics: RunMetrics) -> dict[str, Array]:
-    """Return the columns of a run in the units of the plots: %, mm, µm, ms, µN."""
-    scales = {
-        "strain": 100.0,
-        "hidden": 100.0,
-        "step_time": 1e3,
-        **dict.fromkeys(("tension", "pull", "true_pull"), 1e6),
-    }
-    scales |= {name: 1e6 for name in metrics.series.names if name.startswith(MARGIN)}
-    scales |= {f"{MARGIN}{name}": 1e3 for name in SOLID}
-    columns = {name: scales.get(name, 1.0) * metrics.series.column(name) for name in metrics.series.names}
-    columns["strain"] = np.maximum(columns["strain"], MIN_STRAIN)
-    return columns
-
-
-def _consistency_lines(metrics: RunMetrics, columns: Mapping[str, Array]) -> tuple[Array, list[dict[str, Any]], float]:
+def _consistency_lines(
+    found: Consistency | None, columns: Mapping[str, Array]
+) -> tuple[Array, list[dict[str, Any]], float]:
     """Return times of the windows, the lines of normalised innovations squared, and the end of their axis."""
-    found = metrics.estimation.consistency
     if found is None:
         return np.empty(0), [], 0.0
-    shown = {
-        name: _paired(each, each) for name, each in (("low", found.low), ("high", found.high), ("mean", found.means))
-    }
-    names = [
-        ("low", "", "estimated", ""),
-        ("high", "95 % band of such a mean", "estimated", ""),
-        ("mean", f"mean over {found.width:.1f} s", "ink", ""),
-    ]
-    lines = _lines(columns, [("innovation_squared", "of each frame", "kind5", "")], dots=True)
-    lines += _lines(shown, names, at="windows")
-    for line in lines:
-        line["band"] = line["id"] if line["id"] in ("low", "high") else ""
-    frames = float(np.nanpercentile(columns["innovation_squared"], 98))
-    return _paired(found.begins, found.ends), lines, round(max(2.5, 1.1 * float(np.nanmax(found.means)), frames), 2)
+    bounds = {name: _paired(each, each) for name, each in (("low", found.low), ("high", found.high))}
+    lines = _lines(columns, [("innovation_squared", "of each frame", "kind5", "", 1.0)], dots=True)
+    band = [("low", "", "estimated", "", 1.0), ("high", "95 % band of such a mean", "estimated", "", 1.0)]
+    lines += [{**line, "band": line["id"]} for line in _lines(bounds, band, at="windows")]
+    mean = [("mean", f"mean over {found.width:.1f} s", "ink", "", 1.0)]
+    lines += _lines({"mean": _paired(found.means, found.means)}, mean, at="windows")
+    top = max(2.5, 1.1 * float(np.nanmax(found.means)), float(np.nanpercentile(columns["innovation_squared"], 98)))
+    return _paired(found.begins, found.ends), lines, round(top, 2)
 
 
 def _paired(first: Array, second: Array) -> Array:
@@ -207,33 +187,11 @@ def _paired(first: Array, second: Array) -> Array:
 
 
 def _map(errors: ErrorMap | None) -> dict[str, Any] | None:
-    grid = errors.grid() if errors is not None else None
-    if grid is None:
+    if errors is None or (grid := errors.grid()) is None:
         return None
-    return {
-        "times": _values(grid.times, 8),
-        "lengths": _values(1e3 * grid.lengths, 6),
-        "errors": [_values(row, 4) for row in grid.errors],
-    }
-
-
-def _range(times: Array) -> list[float]:
-    """Return what of the time is shown at first: all, and a second at the least."""
-    first, last = (float(times.min()), float(times.max())) if len(times) else (0.0, 1.0)
-    room = max(0.0, 0.5 * (MIN_RANGE - (last - first)))
-    return [first - room, last + room]
-
-
-def _bands(lost: Sequence[Sequence[float]]) -> list[list[float]]:
-    """Return when the needle was not found, bands that a plot cannot tell apart as one."""
-    bands: list[list[float]] = []
-    apart = (lost[-1][1] - lost[0][0]) / MAX_BANDS if len(lost) > MAX_BANDS else 0.0
-    for begin, end in lost:
-        if bands and begin - bands[-1][1] < apart:
-            bands[-1][1] = end
-        else:
-            bands.append([begin, end])
-    return bands
+    times, lengths, values = grid
+    rows = [_values(row, 4) for row in values]
+    return {"times": _values(times, 8), "lengths": _values(1e3 * lengths, 6), "errors": rows}
 
 
 def thinned(times: Array, columns: Mapping[str, Array], limit: int) -> tuple[Array, dict[str, Array]]:
@@ -268,8 +226,8 @@ def _lines(
 ) -> list[dict[str, Any]]:
     """Return the lines that hold any value."""
     return [
-        dict(id=name, name=label, role=role, dash=dash, at=at, dots=dots, values=_values(columns[name], DIGITS))
-        for name, label, role, dash in wanted
+        dict(id=name, name=label, role=role, dash=dash, at=at, dots=dots, values=_values(scale * columns[name], 5))
+        for name, label, role, dash, scale in wanted
         if name in columns and np.isfinite(columns[name]).any()
     ]
 
@@ -278,5 +236,40 @@ def _values(column: Array, digits: int) -> list[float | None]:
     return [_rounded(value, digits) for value in column.tolist()]
 
 
-def _rounded(value: float, digits: int = DIGITS) -> float | None:
+def _rounded(value: float, digits: int = 5) -> float | None:
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+def read_template(package: str, name: str, functions: Mapping[str, Callable[..., Any]]) -> Template:
+    """Return a template that ships with a subpackage, in which texts are escaped and nothing may be undefined.
+
+    Args:
+        package: name of the subpackage.
+        name: of the file.
+        functions: that the template uses as filters or calls, by name.
+    """
+    environment = Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined, finalize=_shown
+    )
+    environment.filters.update(functions)
+    environment.globals.update(functions)
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
+    return environment.from_string(read_source(package, name))
+
+
+def read_source(package: str, name: str) -> str:
+    """Return a file that ships with a subpackage."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def _shown(value: Any) -> Any:
+    """Return what the page gets for a value: of a text from outside, what can be shown."""
+    return printable(value) if type(value) is str else value  # not Markup, which is ours
+
+
+@cache
+def page_style() -> str:
+    """Return the style sheet of all reports: the colours as variables, `--measured` and the others, and the rest."""
+    light, dark = (" ".join(f"--{name}: {pair[ground]};" for name, pair in COLOURS.items()) for ground in (0, 1))
+    colours = f":root {{ {light} }}\n@media screen and (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"
+    return colours + read_source(__package__, "page.css")

@@ -1,1 +1,0 @@
-"""The report of one evaluated bag: figures, plots, pictures, and the page that holds them."""
