@@ -321,7 +321,7 @@ def _through(offsets: Points, tolerance: float) -> Points | None:
         return None
     sectors, radii = _sectors(offsets), np.hypot(*offsets.T)
     basis = _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    picked = np.random.default_rng(0).integers(len(offsets), size=(200, 5))
+    picked = np.random.default_rng(0).integers(len(offsets), size=(400, 5))
     chosen = np.sort(sectors[picked], axis=1)
     picked = picked[(np.diff(chosen, axis=1) > 2).all(axis=1)]
     picked = picked[np.abs(np.linalg.det(basis[picked])) > 1e-3]
