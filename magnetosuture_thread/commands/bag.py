@@ -67,9 +67,9 @@ def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
 def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
     """Write every intact message of a bag into a new one.
 
-    Messages, their times and numbers, definitions, attachments, metadata records and notes stay as they are; chunks,
-    indices and metadata.yaml are made anew. The command reports how many messages there are and what is lost or
-    changed, where and when.
+    Messages, their times and numbers, definitions and notes stay as they are; chunks, indices and metadata.yaml are
+    made anew. Attachments and metadata records of other recorders are counted and not kept. The command reports how
+    many messages there are and what is lost or changed, where and when.
 
     A damaged bag without checksums (sqlite3) is refused: nothing tells its altered messages from the others.
     """
@@ -82,8 +82,7 @@ def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
     doubts = [str(bag.damage or ""), f"unverified: {bag.unverified}" if bag.unverified else bag.unchecked, *bag.remarks]
     lines = [line for line in doubts if line]
     if report.is_same and not lines:
-        kept = "messages, definitions, attachments, metadata records and notes"
-        lines.append(f"is not damaged: the new bag holds the same {kept}")
+        lines.append("is not damaged: the new bag holds the same messages, definitions and notes")
     lines += [f"{reason}: {pluralize(lost, 'message')} lost" for reason, lost in report.refused.items()]
     lines += [f"not kept: {lost} of this: {reason}" for reason, lost in report.dropped.items()]
     if report.unpacked:
