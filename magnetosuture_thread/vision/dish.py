@@ -423,7 +423,7 @@ def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> t
         normal = system[kept].T @ system[kept] + 1e-9 * np.eye(3)
         shift = np.linalg.solve(normal, system[kept].T @ distance[kept])
         residual = np.abs(distance - system @ shift)
-        kept = residual < max(0.5, 2.0 * middle(residual))
+        kept = residual < max(0.5, 2.0 * float(np.median(residual)))
     return float(np.hypot(shift[0], shift[1])), int(kept.sum())
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.vision.images import Gray, measured_channel, sampled, shrunk
 
@@ -184,7 +185,7 @@ def _edges_of(image: np.ndarray) -> _Edges:
     right, down = np.rint(normals).astype(int).T
     thin = (value >= strength[rows + down, columns + right]) & (value > strength[rows - down, columns - right])
     chosen = np.flatnonzero(thin)
-    chosen = chosen[np.argsort(-value[chosen], kind="stable")[:3000]]  # The weak ones are texture.
+    chosen = np.sort(chosen[np.argsort(value[chosen], kind="stable")[-3000:]])  # The weak ones are texture.
     return _Edges(
         np.column_stack([columns, rows])[chosen].astype(float), normals[chosen].astype(float), image.shape[:2]
     )
@@ -319,21 +320,12 @@ def _through(offsets: Points, tolerance: float) -> Points | None:
     """
     if len(offsets) < 20:
         return None
-    sectors, radii = _sectors(offsets), np.hypot(*offsets.T)
-    basis = _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0]))
-    picked = np.random.default_rng(0).integers(len(offsets), size=(200, 5))
-    chosen = np.sort(sectors[picked], axis=1)
-    picked = picked[(np.diff(chosen, axis=1) > 2).all(axis=1)]
-    picked = picked[np.abs(np.linalg.det(basis[picked])) > 1e-3]
-    shapes = np.linalg.solve(basis[picked], radii[picked][..., None])[..., 0]
-    near = np.hypot(shapes[:, 1], shapes[:, 2]) <= 0.2 * shapes[:, 0]
-    shapes = shapes[near & (np.hypot(shapes[:, 3], shapes[:, 4]) <= 0.12 * shapes[:, 0])]
-    if not len(shapes):
+    shape = np.zeros(5)
+    angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+    if not fit_harmonics(angles, np.hypot(*offsets.T), tolerance, 200, BINS, shape):
         return None
-    agree = np.abs(radii - shapes @ basis.T) < tolerance
-    directions = (agree.astype(np.float32) @ np.eye(BINS, dtype=np.float32)[sectors] > 0.0).sum(axis=1)
     turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
-    best = _harmonics(turns) @ shapes[directions.argmax()]
+    best = _harmonics(turns) @ shape
     return np.asarray(best[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]))
 
 
@@ -368,3 +360,66 @@ def _fitted(points: Points) -> Ellipse | None:
         return None
     direction = math.radians(angle) + (0.0 if axes[0] <= axes[1] else 0.5 * math.pi)
     return Ellipse((float(u + mean[0]), float(v + mean[1])), major, minor, direction)
+
+
+@compiled
+def fit_harmonics(angles, radii, tolerance, tries, bins, best):
+    """Find by random samples the ellipse near a centre that edges in the most directions agree on.
+
+        r(t) = c_0 + c_1 cos t + c_2 sin t + c_3 cos 2t + c_4 sin 2t
+
+    Args:
+        angles: of the edges from the centre, shape (m,) [rad].
+        radii: of them [px].
+        tolerance: between an edge and the ellipse [px].
+        tries: how many samples of five edges are drawn.
+        bins: directions that are counted.
+        best: filled with c, shape (5,).
+
+    Returns:
+        In how many directions an edge agrees.
+    """
+    count = len(angles)
+    basis = np.empty((count, 5))
+    sector = np.empty(count, np.int64)
+    for index in range(count):
+        t = angles[index]
+        basis[index, 0] = 1.0
+        basis[index, 1], basis[index, 2] = math.cos(t), math.sin(t)
+        basis[index, 3], basis[index, 4] = math.cos(2.0 * t), math.sin(2.0 * t)
+        sector[index] = int((t / (2.0 * math.pi) + 1.0) * bins) % bins
+    state, most = np.uint64(88172645463325252), 0
+    picked = np.empty(5, np.int64)
+    for _ in range(tries):
+        apart = True
+        for k in range(5):
+            state ^= (state << np.uint64(13)) & np.uint64(0xFFFFFFFFFFFFFFFF)
+            state ^= state >> np.uint64(7)
+            state ^= (state << np.uint64(17)) & np.uint64(0xFFFFFFFFFFFFFFFF)
+            picked[k] = np.int64((state >> np.uint64(11)) % np.uint64(count))
+            for other in range(k):
+                apart = apart and abs(sector[picked[k]] - sector[picked[other]]) > 2
+        if not apart:
+            continue
+        system, right = np.empty((5, 5)), np.empty(5)
+        for k in range(5):
+            right[k] = radii[picked[k]]
+            for j in range(5):
+                system[k, j] = basis[picked[k], j]
+        if abs(np.linalg.det(system)) < 1e-3:
+            continue
+        shape = np.linalg.solve(system, right)
+        if math.hypot(shape[1], shape[2]) > 0.2 * shape[0] or math.hypot(shape[3], shape[4]) > 0.12 * shape[0]:
+            continue
+        marks = np.zeros(bins, np.uint8)
+        for index in range(count):
+            fitted = 0.0
+            for j in range(5):
+                fitted += basis[index, j] * shape[j]
+            if abs(radii[index] - fitted) < tolerance:
+                marks[sector[index]] = 1
+        agreeing = int(marks.sum())
+        if agreeing > most:
+            most = agreeing
+            best[:] = shape
+    return most

@@ -19,6 +19,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_a
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.dish import DishWatch, FoundDish, Tilt
+from magnetosuture_thread.vision.ellipse import find_ellipse
 from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, check_image, prepare, sampled, shrunk
 from magnetosuture_thread.vision.lens import Lens
 from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
@@ -672,6 +673,7 @@ def warm_up() -> bool:
     image = cv2.GaussianBlur(image, (0, 0), 0.9)
     # What a plain frame does not reach: a needle in one dark thing with its thread, crossings, and other pieces.
     sampled(np.zeros((4, 4), np.float32), np.zeros((1, 2)))
+    find_ellipse(image)
     core = np.zeros((60, 60), np.uint8)
     core[10, 5:55] = core[10:50, 54] = core[49, 5:55] = 1  # long and winding
     axis_guesses(cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0, 30.0, 5.0)
