@@ -40,7 +40,7 @@ class SceneFollower:
     def __init__(self, node: PackageNode, changed: Callable[[Scene], None], scene: Scene | None = None) -> None:
         self.scene, self.problem = scene, ""
         self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
-        self._node, self._changed = node, changed
+        self._node, self._health, self._changed = node, node.health, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True)
 
     @property
@@ -71,10 +71,10 @@ class SceneFollower:
                 self._changed(scene)
         except MagnetosutureError as error:
             self.problem = f"scene refused: {shortened(str(error))}"
-            self._node.health.refuse(error, **{"scene problem": self.problem})
+            self._health.refuse(error, **{"scene problem": self.problem})
         else:
             self.scene, self.problem = scene, ""
-            self._node.health.note(**{"scene problem": "none"})
+            self._health.note(**{"scene problem": "none"})
 
 
 def received_scene(data: bytes) -> Scene:
