@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any
@@ -42,6 +42,8 @@ from magnetosuture_thread.thread.step import WarmStart
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
+Controller = Callable[[float, Vector, Vector], Vector]
+"""Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
 WALL_NAME = "wall"
 MAX_HORIZON = 60.0  # s
 MAX_STEPS = 20_000
@@ -353,13 +355,14 @@ class ThreadForecaster:
         return ForecastStart(pose, chain_inside(path, self.thread.segments, self.thread.segment_length, radius))
 
     def forecast(
-        self, start: ForecastStart, commands: Vector, horizon: float = 3.0, *, slowed: bool = True
+        self, start: ForecastStart, commands: Vector | Controller, horizon: float = 3.0, *, slowed: bool = True
     ) -> Forecast:
         """Return what happens from a start under a command.
 
         Args:
             start: of needle and thread.
-            commands: velocity of the tip [m/s]: one that is held, shape (2,), or one for each step, shape (k, 2).
+            commands: velocity of the tip [m/s]: one that is held, shape (2,), one for each step, shape (k, 2), or a
+                function of time, tail and heading that is asked before every step, as a path follower.
             horizon: a whole number of steps to the nearest [s].
             slowed: whether the friction law slows the commands; see `friction_feedback` of the coil bridge.
 
@@ -369,13 +372,18 @@ class ThreadForecaster:
         """
         steps = self._steps(horizon)
         self._check_start(start)
-        sequence = self._sequence(commands, steps)
+        sequence = np.zeros((steps, 2)) if callable(commands) else self._sequence(commands, steps)
         nodes, state = self.thread.segments + 1, self._begin(start)
         model, buffers = self._model_of(start, slowed), self._buffers(start)
         record = RolloutRecord.of(steps, nodes, len(self.scene.shapes))
         if start.needle_force is not None:
             record.pull[0] = start.needle_force
-        code, done = roll_out(model, buffers, state, sequence, self.step, record)
+        code, done, asked = ENDED, 0, 1 if callable(commands) else steps
+        while code == ENDED and done < steps:
+            if callable(commands):
+                velocity = commands(done * self.step, state.pose[:2].copy(), state.pose[2:].copy())
+                sequence[done] = finite_array("controller's command", velocity, (2,), bounded("m/s"))
+            code, done = roll_out(model, buffers, state, sequence, self.step, done, done + asked, record)
         problem, instants = "", done + 1
         if code == NO_ROOM:
             problem = f"more than {len(buffers.contacts.node)} contacts at once at {done * self.step:.3f} s"

@@ -331,9 +331,11 @@ def roll_out(
     state: RolloutState,
     commands: Points,
     interval: float,
+    first: int,
+    last_step: int,
     record: RolloutRecord,
 ) -> tuple[int, int]:
-    """Integrate needle, filter and thread over the steps of the commands.
+    """Integrate needle, filter and thread over the steps `first` to `last_step`, the latter not included.
 
     Args:
         model: what stays the same.
@@ -341,6 +343,8 @@ def roll_out(
         state: at the begin of the first step; written.
         commands: velocity of the tip in each step, shape (k, 2) [m/s].
         interval: duration of a step [s].
+        first: step; before step 0 the instant of the start is recorded.
+        last_step: step.
         record: written.
 
     Returns:
@@ -350,12 +354,11 @@ def roll_out(
     pose, last, averaging = state.pose, state.last, model.friction.averaging
     limited = last[0] == last[0]  # not a number: the velocity before is not known
     share = 1.0 - math.exp(-interval / averaging) if averaging > 0.0 else 1.0
-    steps = len(commands)
-    for k in range(steps + 1):
-        if not record_thread(model, buffers, state, k, record):
+    for k in range(first, last_step + 1):
+        if (k > first or k == 0) and not record_thread(model, buffers, state, k, record):
             return NO_ROOM, max(k - 1, 0)
         command, slowdown = (0.0, 0.0), 1.0
-        if k < steps:
+        if k < last_step:
             command = (commands[k, 0], commands[k, 1])
             slowdown = record.slowdown[k] = friction_slowdown(model, state, record.rubbed[k])
         elapsed = interval if limited else np.inf
@@ -363,7 +366,7 @@ def roll_out(
             model.needle, pose, command, slowdown, (last[0], last[1]), elapsed, record.touched[k]
         )
         record.margin[k, NEEDLE_MARGIN], record.shape[k, NEEDLE_MARGIN] = margin, shape
-        if k == steps:
+        if k == last_step:
             break
         record.filtered[k, 0], record.filtered[k, 1] = x, y
         for a in range(4):
@@ -377,4 +380,4 @@ def roll_out(
             for a in range(2):
                 moved = (state.positions[i, a] - record.vertices[k, i, a]) / interval
                 state.averaged[i, a] += share * (moved - state.averaged[i, a])
-    return ENDED, steps
+    return ENDED, last_step

@@ -185,10 +185,22 @@ def same(one: Forecast, other: Forecast) -> bool:
     )
 
 
-def test_sequence_equals_held_command(forecaster: ThreadForecaster):
+def test_sequence_and_controller_equal_held_command(forecaster: ThreadForecaster):
     start, steps = forecaster.straight(START), round(HORIZON / STEP)
     held = forecaster.forecast(start, UP, HORIZON)
     assert same(forecaster.forecast(start, np.tile(UP, (steps, 1)), HORIZON), held)
+    asked: list[float] = []
+
+    def controller(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        expected = np.append(held.tails[len(asked)], held.headings[len(asked)])
+        np.testing.assert_array_equal(np.append(tail, heading), expected)
+        asked.append(time)
+        return UP
+
+    assert same(forecaster.forecast(start, controller, HORIZON), held)
+    np.testing.assert_allclose(asked, held.times[:-1])
+    with pytest.raises(InvalidInputError, match="controller"):
+        forecaster.forecast(start, lambda time, tail, heading: np.full(2, np.nan), HORIZON)
 
 
 def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
