@@ -189,11 +189,15 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-@cache  # to read type hints takes longer than to check a value
 def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
     """Return the fields of a configuration class."""
+    return _fields_of(cast(Any, cls))
+
+
+@cache  # to read type hints takes longer than to check a value
+def _fields_of(cls: Any) -> tuple[ConfigurationField, ...]:
     hints, found = get_type_hints(cls), []
-    for entry in fields(cast(Any, cls)):
+    for entry in fields(cls):
         hint = hints[entry.name]
         kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
         assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"

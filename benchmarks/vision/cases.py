@@ -476,7 +476,7 @@ def _beside(random: Random) -> Case | None:
     place, direction = _place_of_crossing(random, case)
     side = random.choice((-1.0, 1.0)) * random.uniform(*BESIDE)
     other, _ = _through(random, place + side * unit_vector(direction + 0.5 * math.pi), direction)
-    clear = KDTree(case.thread[::4]).query(other)[0].min() > 0.9 * BESIDE[0]
+    clear = float(np.min(KDTree(case.thread[::4]).query(other)[0])) > 0.9 * BESIDE[0]
     return _with(case, other, {"distance": abs(side)}) if clear else None
 
 

@@ -222,7 +222,7 @@ def compare_pieces(
         "complete": observation.complete,
         "pieces": visible * _share(seen, np.vstack(lines), bound),
     }
-    sums: Counter[str] = Counter()
+    sums: Any = Counter()  # of numbers that are not whole
     for piece, line in zip(observation.pieces, lines, strict=True):
         off, nearest = (np.asarray(values) for values in tree.query(piece.points))
         ends = ((piece.first_end, piece.points[0]), (piece.last_end, piece.points[-1]))
@@ -239,7 +239,7 @@ def compare_pieces(
     last = float(np.hypot(*(observation.pieces[0].points[-1] - truth[-1])))
     shown = at[-1] * _share(truth, lines[0], max(bound, WRONG_END))
     found["incomplete"] = bool(observation.complete and (last > WRONG_END or shown < at[-1] - WRONG_END))
-    return found | sums
+    return {**found, **sums}
 
 
 def _is_misplaced(piece: ThreadPiece, truth: np.ndarray) -> bool:

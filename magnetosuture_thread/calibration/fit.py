@@ -147,12 +147,18 @@ class Objective:
         x, cost = first, 0.0
         if self.parameters:  # else only the attachment is asked for
             units = self._units
+
+            def residuals_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+                return np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]])
+
+            def jacobian_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+                parts = [part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)]
+                return np.asarray(units * np.concatenate(parts))
+
             found = least_squares(
-                lambda y: np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]]),
+                residuals_at,
                 np.zeros(len(first)),
-                jac=lambda y: (
-                    units * np.concatenate([part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)])
-                ),
+                jac=jacobian_at,
                 bounds=((self._low - first) / units - 1e-9, (self._high - first) / units + 1e-9),
                 ftol=1e-4,
                 xtol=1e-3,

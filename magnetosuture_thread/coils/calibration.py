@@ -91,7 +91,8 @@ def read_calibration(path: Path) -> CoilCalibration:
         if coils[-1].name in [coil.name for coil in coils[:-1]]:
             expected = "a name of its own for each"
             raise ConfigurationError("coils", f"two of the name {coils[-1].name}", expected, source)
-    return CoilCalibration(*(content.get(key, "") for key in TEXT_KEYS), tuple(coils))
+    name, date, notes = (content.get(key, "") for key in TEXT_KEYS)
+    return CoilCalibration(name, date, notes, tuple(coils))
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:

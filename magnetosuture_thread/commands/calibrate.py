@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.parameters import choose_parameters
@@ -92,7 +92,7 @@ def run_calibrate(options: argparse.Namespace, terminal: Terminal) -> int:
     """
     chosen = FitOptions(**{field.name: getattr(options, field.name) for field in fields(FitOptions)})
     with terminal.progress("calibrate") as advance:
-        fit = fit_bags(options.bags, chosen, bag_selection(options), terminal.log, advance)
+        fit = fit_bags(options.bags, chosen, cast(BagSelection, bag_selection(options)), terminal.log, advance)
     fit.write(options.output, options.picture)
     values = fit.result.to_json()
     write_json(options.json, values)

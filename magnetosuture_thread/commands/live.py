@@ -296,10 +296,11 @@ def _play_on(live: LiveReplay, source: GraphInput, graph: OwnGraph) -> str:
     try:
         with graph.interruption:
             live.play_on(source.records)
-    except KeyboardInterrupt:
-        return ""
     except GraphError as error:
         return str(error)
+    except KeyboardInterrupt:
+        pass
+    return ""
 
 
 def _check_poses(given: BagInput, log: Log) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, ca
         cap: [D^2]
     """
     off = points_at_nodes(nodes, start + arcs) - points
-    return np.minimum(off[:, 0] ** 2 + off[:, 1] ** 2, cap).mean()
+    return float(np.minimum(off[:, 0] ** 2 + off[:, 1] ** 2, cap).mean())
 
 
 @compiled

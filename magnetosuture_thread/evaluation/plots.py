@@ -215,8 +215,10 @@ def draw_threads(
         if len(points) > 1:
             style["linewidth"] *= magnified
             axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
+    u, v = view.to_pixels(nodes).T
     axes.scatter(
-        *view.to_pixels(nodes).T,
+        u,
+        v,
         s=9.0 * magnified**2,
         c=np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM),
         cmap=MARGIN_COLOURS,

@@ -129,8 +129,9 @@ class ConsoleGraph:
             ConfigurationError: the settings' scene cannot be read; nothing is changed.
         """
         scene = _file_scene(settings)
-        for queue in (*self._latest.values(), self._camera, self._reports):
-            queue.close()
+        for latest in (*self._latest.values(), self._camera):
+            latest.close()
+        self._reports.close()
         self._open(settings, scene)
 
     def publish_velocity(self, velocity: tuple[float, float]) -> None:

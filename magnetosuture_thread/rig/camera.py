@@ -491,7 +491,7 @@ def line_covered(box: Box, line: Points, width_px: float) -> Light:
         if part is not None:
             inside, drawn = _within(part, box), _line_drawn(part, piece, wide)
             np.maximum(result[inside], drawn, out=result[inside])
-    return result * np.float32(min(1.0, width_px * OVERSAMPLING / wide))
+    return np.asarray(result * np.float32(min(1.0, width_px * OVERSAMPLING / wide)))
 
 
 def _line_drawn(box: Box, line: Points, wide: int) -> Light:

@@ -361,14 +361,15 @@ def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None
 def _fit_rim(gray: Gray, guess: Guess) -> tuple[tuple[float, float, float, int], Points, Points] | None:
     """Return the circle along a rim's inner edge, that edge and the darkest ring; None if too few rays agree."""
     edges = darkest = np.empty((0, 2))
-    fitted: tuple[float, float, float, int] | None = (*guess, 0)
+    fitted = (*guess, 0)
     # In shares of the radius: by a first guess, and once it is known.
     for reach, step in ((0.12, 1.0), (REACH, 0.5)):
         u, v, radius, _ = fitted
         edges, darkest = rim_points(gray, (u, v), radius, reach * radius, step, RAYS)
-        fitted = fit_circle(edges, AGREEMENT_PX)
-        if fitted is None:
+        found = fit_circle(edges, AGREEMENT_PX)
+        if found is None:
             return None
+        fitted = found
     return fitted, edges, darkest
 
 

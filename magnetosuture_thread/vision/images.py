@@ -194,7 +194,7 @@ def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarra
 def _size_of(buffer: np.ndarray) -> tuple[int, int]:
     """Return width and height by a picture's header, 0 and 0 where the bytes are none."""
     try:
-        with Image.open(io.BytesIO(buffer), formats=("JPEG", "PNG", "BMP", "TIFF", "WEBP")) as picture:
+        with Image.open(io.BytesIO(buffer.tobytes()), formats=("JPEG", "PNG", "BMP", "TIFF", "WEBP")) as picture:
             return picture.size
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:  # far more pixels than we take
         raise InvalidInputError("image.data", str(error), f"at most {MAX_PIXELS} pixels") from None
@@ -273,7 +273,9 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
     return values
 
 
-def straightened(image: NDArray[Any], axis: tuple[float, float, float, float], along: Points, aside: Points) -> Points:
+def straightened(
+    image: NDArray[Any], axis: tuple[float, float, float, float], along: NDArray[Any], aside: NDArray[Any]
+) -> Points:
     """Return an image along and aside of an arc, shape (m, n); see `straighten`."""
     strip = np.empty((len(along), len(aside)))
     straighten(image, axis, along, aside, strip)

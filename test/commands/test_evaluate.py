@@ -99,14 +99,14 @@ def test_against_and_formulation_are_as_asked_for(tmp_path: Path, short_bag: Pat
 
 
 def test_what_is_wrong_for_all_bags_is_said_at_once(tmp_path: Path, short_bag: Path):
-    for paths, output, options, error, words in (
-        ([short_bag], tmp_path / "out", {"setup_name": "none"}, ConfigurationError, "setup: got 'none'"),
-        ([short_bag], tmp_path, {}, BagError, "exists already"),
-        ([tmp_path], tmp_path / "out", {}, BagError, "holds no bags"),
-        ([tmp_path / "none"], tmp_path / "out", {}, BagError, "does not exist"),
+    for paths, output, setup, error, words in (
+        ([short_bag], tmp_path / "out", "none", ConfigurationError, "setup: got 'none'"),
+        ([short_bag], tmp_path, "", BagError, "exists already"),
+        ([tmp_path], tmp_path / "out", "", BagError, "holds no bags"),
+        ([tmp_path / "none"], tmp_path / "out", "", BagError, "does not exist"),
     ):
         with pytest.raises(error, match=words):
-            evaluate_bags(paths, output, **options)
+            evaluate_bags(paths, output, setup_name=setup)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,6 +6,7 @@ import io
 import math
 from dataclasses import replace
 from types import SimpleNamespace as Message
+from typing import Any
 
 import numpy as np
 import pytest
@@ -177,7 +178,11 @@ def test_the_table_says_what_is_simulated_and_fits_a_terminal():
         assert words in text
     assert "truth" not in text
     assert "without an answer" not in text
-    given = {"refused": {"a pose that is none": 2}, "damage": "the end is missing", "remark": "it is another thread"}
+    given: dict[str, Any] = {
+        "refused": {"a pose that is none": 2},
+        "damage": "the end is missing",
+        "remark": "it is another thread",
+    }
     text = shown(replace(summary, source="poses", speed=52.4, latency={}, **given))
     for words in ("recorded poses", "usable", "a pose that is none", "52.4", "the end is missing", "another thread"):
         assert words in text

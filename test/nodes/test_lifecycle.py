@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -237,9 +238,12 @@ def test_the_path_follower_stops_the_needle_and_goes_on_where_it_was(graph: Grap
         stamp = Time(sec=BEGIN + int(second), nanosec=round((second % 1.0) * 1e9))
         graph.publish(topics.NEEDLE_POSE, wire.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
 
+    def answered(index: int) -> bool:
+        return len(commands) > index
+
     for index in range(20):
         show(index / 60)
-        graph.wait(lambda index=index: len(commands) > index, "the answer")
+        graph.wait(partial(answered, index), "the answer")
     reached = setpoints[-1].pose.position.x
     assert commands[-1].twist.linear.x > 0.0
     assert graph.change("path_follower", DEACTIVATE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -94,7 +95,7 @@ def test_tail_and_tip_are_never_swapped(angle: float, distance: float, around: f
 @pytest.mark.parametrize(
     "size", [{"needle_length": length} for length in (0.003, 0.0058, 0.0082, 0.012)] + [{"needle_width": 0.0009}]
 )
-def test_a_needle_of_another_size_is_not_taken(size: dict[str, float]):
+def test_a_needle_of_another_size_is_not_taken(size: dict[str, Any]):
     assert find(render(Pose(np.array([-0.005, 0.0]), 0.3), **size))[0] == []
 
 

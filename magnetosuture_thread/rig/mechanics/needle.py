@@ -82,7 +82,7 @@ class NeedleBody:
     @cached_property
     def tip(self) -> NDArray[np.float64]:
         """The tip in the needle's frame, shape (2,) [m]."""
-        return self.outline(2)[1]
+        return np.asarray(self.outline(2)[1])
 
     def outline(self, count: int) -> NDArray[np.float64]:
         """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""

@@ -162,7 +162,7 @@ def _integrals(picture: Picture, points: Points, half: float) -> Values:
         points: of a polyline, shape (m, 2) [px].
         half: distance up to which is integrated [px].
     """
-    at = across(points, STEP_PX * np.arange(int(2.0 * half / STEP_PX + 1e-9) + 1) - half)
+    at = across(points, np.asarray(STEP_PX * np.arange(int(2.0 * half / STEP_PX + 1e-9) + 1) - half, np.float64))
     profiles = np.stack([sampled(layer.pixels, at) for layer in (picture.darkest, picture.brightest)])
     ground = np.maximum(profiles[..., [0, 1, -2, -1]].mean(axis=-1, keepdims=True), 1.0)
     return np.asarray(STEP_PX * (1.0 - profiles / ground).sum(axis=-1))

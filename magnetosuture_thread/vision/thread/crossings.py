@@ -272,7 +272,7 @@ def _edge_around(points: Points) -> Points:
     return np.asarray(max(outlines, key=len)[:, 0] + origin)
 
 
-def _peaks(values: NDArray[np.float32], bound: float) -> list[int]:
+def _peaks(values: NDArray[np.floating], bound: float) -> list[int]:
     """Return the peaks above a bound along a closed line, of those without a dip between them the highest."""
     found: list[int] = []
     first, top, low = int(np.argmin(values)), -1, math.inf

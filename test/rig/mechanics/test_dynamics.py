@@ -27,7 +27,7 @@ SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def coils(turn: float = 0.0) -> CoilField:
-    return CoilField(turn + 0.5 * math.pi * np.arange(4), 0.05, 0.025, 0.03, 480.0)
+    return CoilField([turn + 0.5 * math.pi * k for k in range(4)], 0.05, 0.025, 0.03, 480.0)
 
 
 class PlainField:
