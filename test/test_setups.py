@@ -45,7 +45,7 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     assert coils.needle_turning_drag == pytest.approx(body.drag[2], rel=0.02)
     thread_drag = rig.thread_drag_along * rig.thread_length
     assert coils.needle_drag == pytest.approx(body.drag[0] + thread_drag, rel=0.05)
-    coil = rig.field().per_current(np.zeros((1, 3)))[0, 0]
+    coil = rig.field().per_current(np.zeros(2))[:, 0]
     assert np.linalg.norm(coil) == pytest.approx(coils.field_per_current, rel=0.01)
 
 

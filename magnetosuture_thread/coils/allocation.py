@@ -310,8 +310,9 @@ class CoilGainEstimator:
         n . sum_i g_i b_i I_i = (c omega + T) / m + noise,    of deviation DIRECTION_DEVIATION |B|
 
     A Kalman filter takes this at each measured pose. Its state is the gains g, 1 with GAIN_DEVIATION at first, and
-    T / m, which is 0 with the deviation of the largest pull of a thread at the tail, and is forgotten in
-    TORQUE_TIME. A factor on all gains does not show in the direction: their mean stays 1.
+    T / m, which is forgotten in TORQUE_TIME. The deviation of T is what a straight thread of drag k gives that is
+    pulled aside at the needle's speed v, k v l / 2 with the chord l. A factor on all gains does not show in the
+    direction: their mean stays 1.
 
     Source: the extended Kalman filter. Deviation: the gains are scaled to their mean after each measurement, their
     covariance is not. Pure: times come in, in seconds.
@@ -319,17 +320,17 @@ class CoilGainEstimator:
     Args:
         coils: their calibrated field.
         needle: its mechanics.
-        max_torque: of the thread on the needle [N m].
+        thread_drag: k, of a straight thread behind the needle [N s/m].
     """
 
-    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, max_torque: float) -> None:
+    def __init__(self, coils: LoopCoils, needle: NeedleMechanics, thread_drag: float) -> None:
         self._coils, self._needle = coils, needle
         count = len(coils.names)
         self._state = np.append(np.ones(count), 0.0)  # gains, and the field that balances the thread's torque [T]
-        self._torque_variance = (max_torque / needle.moment) ** 2
-        self._covariance = np.diag([GAIN_DEVIATION**2] * count + [self._torque_variance])
+        self._field_per_speed = 0.5 * needle.chord * thread_drag / needle.moment  # that balances the torque [T s/m]
+        self._covariance = np.diag([GAIN_DEVIATION**2] * count + [0.0])
         self._applied: deque[tuple[float, Vector]] = deque()
-        self._last: tuple[float, Vector] | None = None  # stamp and chord's direction of the last pose
+        self._last: tuple[float, Vector, Vector] | None = None  # stamp, middle and chord's direction of the last pose
 
     @property
     def gains(self) -> Vector:
@@ -355,18 +356,20 @@ class CoilGainEstimator:
             stamp: when it was measured [s].
         """
         e = self._needle.chord_direction(heading)
-        last, self._last = self._last, (stamp, e)
+        middle = tail + 0.5 * self._needle.chord * e
+        last, self._last = self._last, (stamp, middle, e)
         if last is None or stamp <= last[0]:
             return
         interval = stamp - last[0]
-        self._predict(interval)
+        self._predict(interval, math.hypot(*(middle - last[1])) / interval)
         currents = self._mean_currents(last[0], stamp)
         if currents is None:
             return
         chord = self._needle.chord * e
         fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * currents
         row = np.append(fields[1] * e[0] - fields[0] * e[1], -1.0)
-        turned = math.atan2(last[1][0] * e[1] - last[1][1] * e[0], float(last[1] @ e))
+        before = last[2]
+        turned = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
         turning = self._needle.turning_drag / self._needle.moment / interval  # field for one radian in the interval
         deviation = math.hypot(
             DIRECTION_DEVIATION * float(np.linalg.norm(fields @ self.gains)), HEADING_ERROR * turning
@@ -395,13 +398,13 @@ class CoilGainEstimator:
             total, since = total + max(0.0, until - since) * currents, max(since, until)
         return total / (end - start)
 
-    def _predict(self, interval: float) -> None:
-        """Let the gains drift and the thread's torque be forgotten over an interval [s]."""
+    def _predict(self, interval: float, speed: float) -> None:
+        """Let the gains drift and the thread's torque be forgotten over an interval [s], at a speed [m/s]."""
         kept = math.exp(-interval / TORQUE_TIME)
         self._state[-1] *= kept
         self._covariance[-1] *= kept
         self._covariance[:, -1] *= kept
-        self._covariance[-1, -1] += (1.0 - kept**2) * self._torque_variance
+        self._covariance[-1, -1] += (1.0 - kept**2) * (self._field_per_speed * speed) ** 2
         self._covariance[:-1, :-1] += DRIFT_DEVIATION**2 * min(1.0, interval) * np.eye(len(self.gains))
 
 

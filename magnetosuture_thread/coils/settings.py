@@ -227,10 +227,8 @@ class CoilBridgeSettings(Configuration):
         return LoopCoils(self.coils_properties())
 
     def gain_estimator(self) -> CoilGainEstimator:
-        """Return what estimates the coils' gains; a thread pulls with at most its drag at `max_speed`, at the tail."""
-        needle = self.needle()
-        max_torque = 0.5 * needle.chord * self.thread_drag * self.max_speed
-        return CoilGainEstimator(self.coil_field(), needle, max_torque)
+        """Return what estimates the coils' gains."""
+        return CoilGainEstimator(self.coil_field(), self.needle(), self.thread_drag)
 
     @property
     def hold_time(self) -> float:

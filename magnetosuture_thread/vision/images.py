@@ -134,11 +134,11 @@ class Wall:
         There the floor of a channel is mixed with the rim. What is farther out has the brightness of the place on
         the way to the centre that is so far inside.
         """
-        v, u = np.mgrid[box]
-        offsets = np.stack([u, v], axis=-1) - self.centre
-        share = np.minimum(1.0, max(0.0, self.radius - FLOOR_DEPTH_PX) / np.maximum(self.distances(box), 1.0))
-        at = (share[..., None] * offsets + self.centre - 0.5 * (factor - 1)) / factor
-        return np.asarray(sampled(channel.floor, at) + 0.5).astype(np.uint8)
+        rows, columns = box
+        floor = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
+        inside = max(0.0, self.radius - FLOOR_DEPTH_PX)
+        _fill_floor(channel.floor, float(factor), self.centre, inside, (columns.start, rows.start), floor)
+        return floor
 
 
 def without_wall(channel: Layer, pixels: Gray, factor: int, wall: Wall, around: Points, reach: float) -> Gray:
@@ -300,6 +300,18 @@ def within(image, u, v):
     u = min(max(u, 0.0), image.shape[1] - 1.001)
     v = min(max(v, 0.0), image.shape[0] - 1.001)
     return sample(image, u, v)
+
+
+@compiled
+def _fill_floor(image, factor, centre, inside, corner, floor):
+    """Fill in the floor of a box whose first pixel is the corner; see `Wall.floor`."""
+    for row in range(floor.shape[0]):
+        for column in range(floor.shape[1]):
+            u, v = corner[0] + column - centre[0], corner[1] + row - centre[1]
+            share = min(1.0, inside / max(math.hypot(u, v), 1.0))
+            x = (share * u + centre[0] - 0.5 * (factor - 1.0)) / factor
+            y = (share * v + centre[1] - 0.5 * (factor - 1.0)) / factor
+            floor[row, column] = np.uint8(within(image, x, y) + 0.5)
 
 
 @compiled
