@@ -580,3 +580,67 @@ def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(mon
     monkeypatch.undo()
     assert all(still(output) for output in plant.run(0.08))
     assert not still(plant.run(0.1)[-1])
+
+
+def test_two_that_command_at_once_stop_it_until_one_is_silent():
+    plant = Plant().ready()
+    plant.run(0.5)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        plant.command((-0.01, 0.0), number=7777)
+    plant.velocity = None
+    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/servo_cv at once",)
+
+
+def test_an_operator_may_take_over_from_two_that_dispute_the_needle():
+    plant = Plant().ready()
+    plant.run(0.2)
+    with pytest.raises(InvalidInputError, match="2 publishers at once"):
+        plant.command((-0.01, 0.0), number=7777)
+    plant.velocity = None
+    assert plant.run(PERIOD)[0].reasons == ("several publishers of needle/servo_cv at once",)
+    plant.command((0.0, 0.004), number=1, source="operator")
+    assert plant.run(PERIOD)[0].source == "operator"
+
+
+def test_an_invalid_prediction_leaves_the_last_valid_one_until_that_is_old():
+    plant = Plant(thread=False).ready()
+    plant.run(0.02)
+    plant.bridge.on_margins(plant.time, True, 0.5, plant.bridge.scene_version, plant.time)
+    for _ in range(8):
+        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
+        assert plant.run(0.05)[-1].slowdown == 0.5
+    for _ in range(4):
+        plant.bridge.on_margins(plant.time, False, 1.0, plant.bridge.scene_version, plant.time)
+        plant.run(0.05)
+    assert plant.outputs[-1][1].reasons == ("no thread prediction for 0.5 s",)
+    for slowdown in (float("nan"), -0.1, 1.5):
+        with pytest.raises(InvalidInputError, match="slowdown"):
+            plant.bridge.on_margins(plant.time, True, slowdown, "", plant.time)
+
+
+def test_a_new_scene_that_takes_long_is_no_fault():
+    plant = Plant(driver=HARDWARE).ready()
+    plant.run(0.5)
+    plant.time += 0.4
+    plant.bridge.set_scene(Scene(Dish(0.036)))
+    assert not still(plant.run(0.2)[-1])
+
+
+def test_after_a_stop_the_needle_starts_from_rest():
+    """Neither speed nor currents nor the motion that a pose is carried on by outlive a stop."""
+    settings = CoilBridgeSettings(max_acceleration=0.1, max_current_slew=100.0)
+    plant = Plant(settings, velocity=(0.015, 0.0)).ready()
+    plant.run(1.0)
+    plant.bridge.latch.disarm()
+    plant.run(PERIOD)
+    plant.tail = None
+    at_rest = plant.bridge.extrapolator.pose(plant.time, plant.time)
+    later = plant.bridge.extrapolator.pose(plant.time + 0.05, plant.time + 0.05)
+    assert at_rest is not None
+    assert later is not None
+    assert later.tail.tolist() == at_rest.tail.tolist()
+    plant.bridge.arm(READY)
+    plant.command((0.015, 0.0))
+    first = plant.run(PERIOD)[0]
+    assert 0.0 < np.linalg.norm(first.filtered) <= 0.1 * 2 * PERIOD + 1e-12
+    assert np.abs(first.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9

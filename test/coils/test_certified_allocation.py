@@ -81,3 +81,52 @@ def test_where_currents_are_not_certified_with_what_is_measured_they_are_without
         for more in (disturbance, MotionDisturbance())
     ]
     assert max(shares) >= MIN_SHARE
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int):
+    """The needle is beside a block, with another on the other side, and pulled."""
+    random = np.random.default_rng(seed)
+    left, right = random.uniform(2.4e-4, 6e-4, 2)
+    safety = SETTINGS.safety_filter(blocks(left, -right))
+    coils = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
+    pose = Pose(-1.25e-3 * E, E)
+    disturbance = MotionDisturbance(*random.uniform(-1e-3, 1e-3, 2))
+    wanted, shares = random.uniform(-2e-3, 2e-3, 2), []
+    for limit in (0.0, 2e-3):
+        found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, disturbance, limit)
+        motion, drift = found.velocity + disturbance.velocity(E), found.drift + disturbance.drift
+        shares.append(safety.safe_share(motion, pose.tail, pose.heading, drift)[0])
+    assert shares[1] >= min(shares[0], MIN_SHARE) - 1e-9
+
+
+@pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])
+def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to_the_wall(place: float, gap: float):
+    """Their drift cannot be avoided close to a coil's axis: the needle turns away from the wall by as much."""
+    settings = CoilBridgeSettings()
+    safety, needle = settings.safety_filter(Scene(Dish(0.035))), settings.needle()
+    out, e = np.array([math.cos(place), math.sin(place)]), np.array([-math.sin(place), math.cos(place)])
+    reach = math.sqrt((0.0175 - settings.keep_out - gap) ** 2 - 0.25 * needle.chord**2)
+    pose = Pose(reach * out - 0.5 * needle.chord * e, e)
+    wanted = safety.filter(0.005 * e + 0.003 * out, pose.tail, pose.heading).filtered
+    coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
+    found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, None)
+    assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
+    assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999
+
+
+@pytest.mark.parametrize("speed", [1e-3, -1e-3])
+def test_a_needle_on_a_coil_s_axis_that_is_pulled_to_a_block_may_be_driven_along_it_but_not_turned_to_it(speed: float):
+    """No currents hold it there: the pull alone takes it closer than it may be, whatever is commanded."""
+    east, north, pull = np.array([1.0, 0.0]), np.array([0.0, 1.0]), MotionDisturbance(0.0, 1e-3)
+    safety, coils = SETTINGS.safety_filter(blocks(2.6e-4, along=east)), CertifiedAllocation(SETTINGS.allocation(), 0.02)
+    pose = Pose(-1.25e-3 * east, east)
+
+    def allocated(velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+        found, _ = coils.allocate(velocity, pose, safety, coils.zero(), math.inf, pull)
+        assert found.drift + pull.drift > 5e-4
+        return found.velocity
+
+    assert allocated(speed * east) @ east == pytest.approx(speed, rel=0.05)
+    resting = allocated(1e-9 * east)
+    assert abs((allocated(1e-3 * north) - resting) @ north) < 1e-4

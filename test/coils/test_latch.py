@@ -85,3 +85,20 @@ def test_whatever_is_pressed_in_whatever_order_nothing_passes_without_an_arm_aft
             assert not (latched and latch.stop_reason == "")
             assert latch.ready_to_arm == (active and not latched and not allowed)
         assert (latch.stop_reason == "") == (allowed and active and not latched), sequence
+
+
+def test_deactivation_disarms():
+    latch = armed()
+    latch.deactivate()
+    assert latch.stop_reason == "inactive"
+    latch.activate()
+    assert latch.stop_reason == "disarmed"
+
+
+def test_first_fault_is_latched():
+    latch = armed()
+    latch.trip("driver: silent")
+    latch.trip("something that followed")
+    assert (latch.stop_reason, latch.state, latch.armed) == ("driver: silent", ArmingState.FAULT, False)
+    with pytest.raises(InvalidInputError, match="driver: silent"):
+        latch.arm("")

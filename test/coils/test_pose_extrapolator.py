@@ -167,3 +167,30 @@ def test_two_that_say_where_the_needle_is_are_one_too_many():
         extrapolator.update(np.array([0.01, 0.0]), EAST, 1.0, 7777, 1.0, 50.01)
     assert extrapolator.stale_reason(1.0, 50.02) == "several publishers of needle/measured_cp at once"
     assert extrapolator.pose(1.0, 50.02) is None
+
+
+@pytest.mark.parametrize(
+    ("variances", "jump", "believed"),
+    [
+        ([0.0, 1e-6, 0.0], 0.0025, True),
+        ([1.0, 0.0, 0.0], 0.0028, True),
+        ([1.0, 0.0, 0.0], 0.003, False),
+        ([np.inf, 0.0, 0.0], 0.0025, False),
+    ],
+)
+def test_no_uncertainty_excuses_more_than_2_mm_and_an_infinite_one_says_nothing(
+    variances: list[float], jump: float, believed: bool
+):
+    with nullcontext() if believed else pytest.raises(InvalidInputError, match="jumped"):
+        doubter().update(np.array([0.0, jump]), EAST, 1.02, 2, 1.02, 50.02, np.diag(variances))
+
+
+def test_a_needle_that_turned_too_fast_about_its_tail_is_not_believed():
+    turned = np.array([np.cos(0.3), np.sin(0.3)])
+    with pytest.raises(InvalidInputError, match="its tip jumped"):
+        doubter().update(np.zeros(2), turned, 1.02, 2, 1.02, 50.02)
+
+
+def test_poses_that_do_not_agree_are_never_believed():
+    """Of two needles seen in turn."""
+    assert not any(show(doubter(), [[0.004, 0.0], [-0.004, 0.0]] * 20))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
 
@@ -16,6 +17,7 @@ from test.nodes.bridge import (
     arm,
     armed,
     change,
+    command,
     drive,
     driven,
     press,
@@ -151,3 +153,18 @@ def test_an_error_in_a_transition_leaves_the_coils_at_zero_and_the_driver_closed
     assert not applied(node)[-1].any()
     assert "nobody foresaw this" in str(node.problem)
     assert stage(graph) in ("unconfigured", "finalized")
+
+
+def test_a_bad_message_does_not_hide_an_emergency_stop(graph):
+    graph.add(CoilBridgeNode)
+    diagnostics, states = graph.listen(topics.DIAGNOSTICS), graph.listen(topics.BRIDGE_STATE)
+    assert press(graph, EMERGENCY_STOP).success
+    graph.wait(lambda: any(d.status[0].level == DiagnosticStatus.ERROR for d in diagnostics), "the fault")
+    bad = command(graph)
+    bad.header.frame_id = "map"
+    graph.publish(topics.NEEDLE_COMMAND, bad)
+    graph.wait(lambda: bool(states) and states[-1].refused == 1, "the refusal")
+    heard = len(diagnostics)
+    graph.wait(lambda: len(diagnostics) > heard, "another report")
+    assert diagnostics[-1].status[0].level == DiagnosticStatus.ERROR
+    assert diagnostics[-1].status[0].message == "fault: emergency stop"

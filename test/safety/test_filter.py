@@ -12,7 +12,7 @@ import shapely
 from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.safety import NeedleSafetyFilter
+from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
 from magnetosuture_thread.safety.barriers import BAND
 from magnetosuture_thread.safety.filter import MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
@@ -167,3 +167,60 @@ def test_shapes_are_named_right_whatever_kinds_come_before_them():
     ):
         assert safety.safe_share(velocity, at, EAST)[1] == name
         assert safety.filter(velocity, at, EAST).active == (name,)
+
+
+HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
+
+
+HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
+
+
+HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
+
+
+HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
+
+
+def test_a_curved_needle_is_kept_clear_of_the_wall_with_its_belly():
+    """Driven forwards and to the right its belly comes 0.4 mm before the wall, though its ends do not."""
+    half = 0.5 * 250.0 * LENGTH
+    chord, belly = 2.0 / 250.0 * math.sin(half), (1.0 - math.cos(half)) / 250.0
+    safety, needle = needle_filter(needle_curvature=250.0), NeedleKinematics(LENGTH, 250.0)
+    tail, heading = np.array([-0.5 * chord, belly + KEEP + 2e-4 - 0.0175]), np.array([math.cos(half), -math.sin(half)])
+    velocity = np.array([0.0, -0.01])
+    assert safety.clearance(tail, heading) == pytest.approx(KEEP + 2e-4, abs=1e-6)
+    found = safety.filter(velocity, tail, heading)
+    assert found.active == ("wall",)
+    for commanded in (velocity, np.array([0.006, -0.01])):
+        share, name = safety.safe_share(commanded, tail, heading)
+        along, across = needle.body_velocity(heading, commanded)
+        for part, clear in ((1.0, True), (1.05, False)):
+            poses = [
+                needle.moved(tail, heading, part * share * along, part * share * across, time)
+                for time in np.linspace(0.0, HOLD, 41)
+            ]
+            assert (min(safety.clearance(*pose) for pose in poses) > KEEP - 1e-8) == clear
+        assert name == "wall"
+
+
+def test_clearance_is_that_of_the_closest_point_from_wall_and_shapes():
+    tail, heading = np.array([0.001, 0.002]), np.array([0.6, 0.8])
+    tip = tail + LENGTH * heading
+    assert needle_filter().clearance(tail, heading) == pytest.approx(0.0175 - math.hypot(*tip))
+    beside = tail + 0.5 * LENGTH * heading + 0.003 * np.array([-0.8, 0.6])
+    post = SceneShape("post", "instrument", Disc((float(beside[0]), float(beside[1])), 0.001))
+    assert needle_filter(post).clearance(tail, heading) == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("curvature", [5.0, -200.0])
+def test_between_two_points_of_a_curved_needle_nothing_gets_closer_than_keep_out(curvature: float):
+    """What is as close to two points as may be is as close to the arc between them on either side."""
+    data = needle_filter(length=0.008, keep_out=1e-3, needle_curvature=curvature).compiled_data()
+    radius, turn = 1.0 / abs(curvature), abs(curvature) * 0.008 / (len(data.body.points) - 1)
+    middle, half = radius * math.cos(0.5 * turn), radius * math.sin(0.5 * turn)  # of the points' chord
+    for side in (1.0, -1.0):
+        corner = middle + side * math.sqrt(data.keep**2 - half**2)
+        assert abs(corner - radius) >= 1e-3
+    assert data.keep < 1.04e-3
+    bulge = radius - middle  # towards the wall
+    assert 1e-3 <= data.keep_wall - bulge < 1.001e-3

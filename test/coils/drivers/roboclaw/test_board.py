@@ -204,3 +204,10 @@ def test_a_second_attempt_takes_what_is_newest(peer, port):
         bytes(4),
     ]
     assert made.warnings == ()
+
+
+def test_an_exchange_ends_however_slowly_bytes_come(peer, port):
+    peer.trickle(0.02)
+    with pytest.raises(DeviceError, match="no valid answer to ReadVersion"):
+        board(port).identify()
+    assert len(port.answer) < 48  # which the library would wait for

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.calibration import CoilCalibration
-from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+from magnetosuture_thread.coils.drivers.roboclaw import DeviceError, LineThread, Mailbox, RoboClawDriver
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
@@ -382,3 +382,79 @@ def test_boards_that_are_exchanged_when_they_are_plugged_again_are_never_ready(b
         assert not driver.state().ready
     assert [board.heard for board in bench.boards] == heard
     assert not any(board.timeline for board in bench.boards)
+
+
+@pytest.mark.parametrize("stable", [True, False])
+def test_boards_that_answer_to_any_address_need_paths_that_stay(bench, stable: bool):
+    """As all do over USB, where the board's address is not looked at."""
+
+    def usb(board: RoboClawBoard) -> Callable[[bytes, float], bytes]:
+        def receive(data: bytes, now: float) -> bytes:
+            board.address = data[0]
+            return RoboClawBoard.receive(board, data, now)
+
+        return receive
+
+    for board in bench.boards:
+        vars(board)["receive"] = usb(board)
+    bench.stage.open()
+    ports = [str(line.path if stable else line.path.resolve()) for line in bench.stage.lines]
+    driver = bench.open(ready=stable, roboclaw_ports=ports, **PATIENT)
+    if not stable:
+        bench.wait(lambda: "address 128): answers to address 129 too" in driver.state().problem, "the refusal")
+        tried = failures(driver)
+        bench.wait(lambda: min(tried.count(0), tried.count(1)) >= 3, "three attempts at each")
+        assert not driver.state().ready
+
+
+def test_a_supply_that_breaks_down_is_a_loss(bench):
+    driver = bench.open()
+    bench.boards[0].supply = 3.0
+    bench.wait(lambda: "a supply of 3 V" in driver.state().problem, "the problem")
+
+
+class Stub:
+    """A board that does not hear the first requests for zero, and a port."""
+
+    def __init__(self, deaf: float = 0) -> None:
+        self.requests = 0
+        self.closed = False
+        self._deaf = deaf
+
+    def write_zero(self) -> None:
+        """Take a request for zero."""
+        self.requests += 1
+        if self.requests <= self._deaf:
+            raise DeviceError("nothing came")
+
+    def reset_output_buffer(self) -> None:
+        """Do nothing."""
+        raise OSError("gone")
+
+    def close(self) -> None:
+        """Keep that it was closed."""
+        self.closed = True
+
+
+def left(*boards: Stub) -> LineThread:
+    """Return a line that has left its boards."""
+    line = LineThread(0, "/dev/none", {}, CoilBridgeSettings(), Mailbox(4, ["connecting"], 0.1))
+    port = Stub()
+    vars(line)["_boards"] = dict(enumerate(boards))
+    assert not line._no_retry()
+    vars(LineThread)["_leave"](line, port)
+    assert port.closed
+    return line
+
+
+def test_a_board_that_did_not_hear_is_asked_for_zero_again():
+    boards = Stub(), Stub(deaf=2), Stub()
+    line = left(*boards)
+    assert [board.requests for board in boards] == [1, 3, 1]
+    assert line._no_retry()  # each request only once, as there are few milliseconds
+
+
+def test_a_board_that_never_hears_keeps_nobody():
+    boards = Stub(deaf=float("inf")), Stub()
+    left(*boards)
+    assert boards[1].requests == 1
