@@ -36,7 +36,7 @@ from magnetosuture_thread.campaign.run import run_procedure, vary
 from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.commands.command import make_log
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast import NeedleDrag, make_forecaster
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.rig.rig import Rig, RigFrame
@@ -106,6 +106,14 @@ class LoopRecord:
         self._filtered = output.filtered
 
 
+def forecaster_of(setup: Setup) -> ThreadForecaster:
+    """Return the forecaster of a setup; with the needle's drag where the bridge does not compensate the motion."""
+    coils, drag = setup.coils, None
+    if not coils.motion_compensation:
+        drag = NeedleDrag(coils.needle_drag, coils.needle_drag_across, coils.needle_turning_drag)
+    return make_forecaster(setup.model, setup.scene, coils.safety_filter(setup.scene), drag=drag)
+
+
 def run_loop(name: str, seed: int) -> tuple[Setup, LoopRecord]:
     """Run a procedure, or the path follower of a setup, with what a seed varies; return the setup and what was done."""
     record = LoopRecord()
@@ -142,7 +150,7 @@ def measure_accuracy(name: str, moments: int, horizon: float, seed: int) -> dict
         seed: of what is varied, and of the moments.
     """
     setup, record = run_loop(name, seed)
-    made = make_forecaster(setup.model, setup.scene, setup.coils.safety_filter(setup.scene))
+    made = forecaster_of(setup)
     steps, slowed = round(horizon / made.step), setup.coils.friction_feedback == "all"
     times, commands = np.array(record.times), np.array(record.commands)
     first = times[np.argmax(commands.any(axis=1))]  # nothing moves before

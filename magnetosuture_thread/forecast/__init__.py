@@ -5,6 +5,7 @@ from magnetosuture_thread.forecast.forecaster import (
     ForecastContact,
     ForecastMargin,
     ForecastStart,
+    NeedleDrag,
     ThreadForecaster,
     make_forecaster,
 )
@@ -14,6 +15,7 @@ __all__ = [
     "ForecastContact",
     "ForecastMargin",
     "ForecastStart",
+    "NeedleDrag",
     "ThreadForecaster",
     "make_forecaster",
 ]

@@ -19,6 +19,7 @@ from magnetosuture_thread.forecast.rollout import (
     NEEDLE_MARGIN,
     NO_CONTACT,
     OBSTACLE_MARGIN,
+    DragData,
     FrictionData,
     RolloutBuffers,
     RolloutModel,
@@ -44,6 +45,7 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 Vector = NDArray[np.float64]
 Controller = Callable[[float, Vector, Vector], Vector]
 """Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
+
 WALL_NAME = "wall"
 MAX_HORIZON = 60.0  # s
 MAX_STEPS = 20_000
@@ -61,7 +63,8 @@ class ForecastStart:
         interval: duration of that step; 0 if there was none [s].
         tip_velocity: filtered velocity of the tip before the start, shape (2,) [m/s], from which the acceleration is
             limited; None if it is not known, and then the first change is not limited.
-        needle_force: of the thread upon the needle, shape (2,) [N]; None if it is not known.
+        needle_force: of the thread upon the needle, shape (2,) [N], from which a needle with drag goes on; None if it
+            is not known.
         warm_start: of the formulation, which brings friction that holds already; None for none.
         thread: with the stiffness, rest curvature and drag to forecast with; None for the forecaster's own.
     """
@@ -262,6 +265,55 @@ class Forecast:
         return tuple(name for name, active in zip(self.shapes, touched.tolist(), strict=True) if active)
 
 
+@checked_arguments("needle drag")
+@dataclass(frozen=True)
+class NeedleDrag:
+    """The needle's drag, by which the thread's pull moves it.
+
+    Coils allocated for a velocity v of the tip give the needle a force along its chord and a torque. With the force F
+    of the thread at its tail, the unit vector e from tail to tip, n to its left, and the chord l, the needle moves with
+
+        u = (along v . e + F . e) / (along - thread),    w = F . n / across
+        omega = (v . n) / (l / 2) - (l / 2) (F . n) / turning
+
+    where `along` has, as that of the coil bridge, the drag `thread` of a straight thread behind the needle: with that
+    thread u = v . e. Source: none; force and torque balance without inertia. Deviation: the moment of a clamped thread
+    is left out; and the pull moves the needle no faster than the filtered velocity times the share of the commanded one
+    that this is, as a needle that the barriers hold back leans on what they keep it from.
+
+    Attributes:
+        along: drag along the needle, that of a straight thread included [N s/m].
+        across: drag across it [N s/m].
+        turning: torque at 1 rad/s [N m s].
+        thread: part of `along` that the thread adds; None for all of its drag along itself [N s/m].
+
+    Raises:
+        ConfigurationError: a number is not positive, or the thread's part is not less than the whole.
+    """
+
+    along: Annotated[float, bounded("N s/m", 1e-15)]
+    across: Annotated[float, bounded("N s/m", 1e-15)]
+    turning: Annotated[float, bounded("N m s", 1e-20)]
+    thread: float | None = None
+
+    def data(self, thread: Thread, learned: Thread | None = None) -> DragData:
+        """Return it for compiled code.
+
+        Args:
+            thread: with which `along` was measured.
+            learned: that is driven, as the estimator has learned it; None for the same.
+
+        Raises:
+            ConfigurationError: the thread's part is not less than the whole.
+        """
+        part = thread.medium.drag_along * thread.length if self.thread is None else self.thread
+        if not 0.0 <= part < self.along:
+            raise ConfigurationError("needle drag along", self.along, f"more than the thread's part, {part:g} N s/m")
+        driven = learned or thread
+        whole = driven.medium.drag_across * driven.length
+        return DragData(self.along, self.along - part, self.across, self.turning, whole)
+
+
 class ThreadForecaster:
     """Forecasts thread and needle under commanded velocities.
 
@@ -270,12 +322,11 @@ class ThreadForecaster:
         forecast.first_contact, forecast.minima["obstacle"].value, forecast.rest_time
 
     A step is what the loop does in one of its periods: the commanded velocity is slowed by the thread's friction and
-    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity exactly, as a bridge
-    with `motion_compensation` moves it, and the thread follows the needle by one step of the formulation `rod`, divided
-    as `ThreadPredictor` divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and
-    `ThreadPredictor` by hand, but for rounding; it is compiled from end to end. Where the structured solver does not
-    get on with a step, the forecast ends there and says so, as no general solver is tried. Several threads may forecast
-    at once.
+    filtered by the needle's safety filter at its pose, the needle follows the filtered velocity, exactly unless its
+    drag is given, and the thread follows the needle by one step of the formulation `rod`, divided as `ThreadPredictor`
+    divides it. So a forecast equals stepping `NeedleSafetyFilter`, `NeedleKinematics` and `ThreadPredictor` by hand,
+    but for rounding; it is compiled from end to end. Where the structured solver does not get on with a step, the
+    forecast ends there and says so, as no general solver is tried. Several threads may forecast at once.
 
     Args:
         thread: the thread.
@@ -284,6 +335,8 @@ class ThreadForecaster:
         law: the friction law that slows the needle; None for none.
         friction_averaging: time over which the nodes' speeds are averaged for it [s].
         attachment_offset: where the thread is fixed, along the heading and to its left of the needle's tail [m].
+        drag: of the needle, by which the thread's pull moves it; None for one that follows the filtered velocity
+            exactly.
         step: duration of a step [s].
         fixed_nodes: nodes that stay where they are.
         options: by name, see `PredictorOptions`; `margin_range` is 2 mm by default.
@@ -307,6 +360,7 @@ class ThreadForecaster:
         law: FrictionLaw | None = None,
         friction_averaging: Annotated[float, bounded("s", 0.0, 10.0)] = 0.0,
         attachment_offset: Annotated[Sequence[float], bounded("m", -0.1, 0.1, multiple=2)] = (),
+        drag: NeedleDrag | None = None,
         step: Annotated[float, bounded("s", 1e-4, 1.0)] = 1.0 / 66.0,
         fixed_nodes: Sequence[int] = (),
         **options: object,
@@ -325,7 +379,7 @@ class ThreadForecaster:
                 raise ConfigurationError("margin_range", chosen.margin_range, expected)
             friction = FrictionData(law.threshold, law.beta, law.stuck_speed, float(friction_averaging))
         self.thread, self.scene, self.safety, self.step = thread, scene, safety, step
-        self._formulation = formulation
+        self._formulation, self._drag = formulation, drag
         reach = chosen.margin_range + 0.5 * thread.diameter  # margins are of the thread's surface
         self._model = RolloutModel(
             step=formulation.step_model(),
@@ -338,6 +392,7 @@ class ThreadForecaster:
             max_substeps=int(chosen.max_substeps),
             contact_tolerance=float(chosen.contact_tolerance),
             friction=friction,
+            drag=DragData() if drag is None else drag.data(thread),
         )
         self._names = (*scene.names, WALL_NAME)
 
@@ -416,13 +471,15 @@ class ThreadForecaster:
             model = model._replace(friction=model.friction._replace(beta=1.0))
         if thread is None or thread is self.thread:
             return model
-        return model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
+        model = model._replace(step=model.step._replace(rod=self._formulation.rod_of(thread)))
+        return model if self._drag is None else model._replace(drag=self._drag.data(self.thread, thread))
 
     def _begin(self, start: ForecastStart) -> RolloutState:
         """Return the state at the start."""
         vertices = np.array(start.vertices, np.float64, order="C")
         velocities = np.zeros_like(vertices) if start.velocities is None else np.array(start.velocities, np.float64)
         heading = np.asarray(start.pose.heading, np.float64)
+        pulled = self._drag is not None and start.needle_force is not None
         x, y = (math.nan, math.nan) if start.tip_velocity is None else np.asarray(start.tip_velocity).tolist()
         return RolloutState(
             vertices,
@@ -430,6 +487,7 @@ class ThreadForecaster:
             np.zeros_like(vertices),
             np.concatenate([np.asarray(start.pose.tail, np.float64), heading / np.linalg.norm(heading)]),
             np.array([x, y, start.interval]),
+            np.full(3, math.nan if pulled else 0.0),  # what is no number is worked out from the force
         )
 
     def _buffers(self, start: ForecastStart) -> RolloutBuffers:

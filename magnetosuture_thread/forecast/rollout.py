@@ -59,6 +59,24 @@ class FrictionData(NamedTuple):
     averaging: float = 0.0
 
 
+class DragData(NamedTuple):
+    """The drag of the needle, see `NeedleDrag`; zeros where it follows the filtered velocity exactly.
+
+    Attributes:
+        along: with the thread's [N s/m].
+        bare: without it [N s/m].
+        across: [N s/m].
+        turning: [N m s].
+        whole: of the whole thread broadside [N s/m].
+    """
+
+    along: float = 0.0
+    bare: float = 0.0
+    across: float = 0.0
+    turning: float = 0.0
+    whole: float = 0.0
+
+
 class RolloutModel(NamedTuple):
     """What stays the same from step to step.
 
@@ -73,6 +91,7 @@ class RolloutModel(NamedTuple):
         max_substeps: into which an interval is divided at the most.
         contact_tolerance: the thread touches a shape or the wall to which it is this close [m].
         friction: the law that slows the needle.
+        drag: of the needle.
     """
 
     step: StepModel
@@ -85,6 +104,7 @@ class RolloutModel(NamedTuple):
     max_substeps: int
     contact_tolerance: float
     friction: FrictionData
+    drag: DragData
 
 
 class RolloutState(NamedTuple):
@@ -97,6 +117,7 @@ class RolloutState(NamedTuple):
         pose: the needle's tail [m] and heading, shape (4,).
         last: velocity of the tip over the last step [m/s], and duration of the thread's last step, 0 for none [s],
             shape (3,).
+        added: motion that the thread's pull adds to the needle's; see `moved_needle`, shape (3,).
     """
 
     positions: Points
@@ -104,6 +125,7 @@ class RolloutState(NamedTuple):
     averaged: Points
     pose: Vector
     last: Vector
+    added: Vector
 
 
 class RolloutBuffers(NamedTuple):
@@ -290,6 +312,36 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
 
 
 @compiled_inner
+def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded: float, pull: Vector) -> None:
+    """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
+
+        c <- c + (c*(F) - c) / (1 + r)
+
+    with the ratio r of the drag that the whole thread would have broadside to the needle's: so the pull of the last
+    step, which falls with the needle's velocity, does not make the two swing. The result is bounded by the share of the
+    commanded speed [m/s] that the velocity is.
+    """
+    drag, added, body, pose = model.drag, state.added, model.needle.body, state.pose
+    lever = 0.5 * body.chord
+    ex, ey = body.chord_x * pose[2] - body.chord_y * pose[3], body.chord_x * pose[3] + body.chord_y * pose[2]
+    speed = math.hypot(velocity[0], velocity[1])
+    speed *= min(1.0, speed / commanded) if commanded > 0.0 else 0.0
+    along, across = pull[0] * ex + pull[1] * ey, pull[1] * ex - pull[0] * ey
+    forwards = velocity[0] * ex + velocity[1] * ey
+    full = (
+        (drag.along * forwards + along) / drag.bare - forwards,
+        across / drag.across,
+        -lever * across / drag.turning,
+    )
+    ratio = (drag.whole / drag.bare, drag.whole / drag.across, lever * lever * drag.whole / drag.turning)
+    begins = np.isnan(added[0])
+    for k in range(3):
+        added[k] = full[k] if begins else added[k] + (full[k] - added[k]) / (1.0 + ratio[k])
+        limit = speed if k < 2 else (speed / lever if lever > 0.0 else 0.0)
+        added[k] = max(-limit, min(limit, added[k]))
+
+
+@compiled_inner
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -371,7 +423,10 @@ def roll_out(
         record.filtered[k, 0], record.filtered[k, 1] = x, y
         for a in range(4):
             buffers.pose[a] = pose[a]
-        moved_needle(model.needle, pose, (x, y), interval)
+        if model.drag.along > 0.0 and (k > 0 or np.isnan(state.added[0])):  # at the start where the pull is known
+            commanded = min(math.hypot(command[0], command[1]), model.needle.max_speed)
+            add_pull(model, state, (x, y), commanded, record.pull[k])
+        moved_needle(model.needle, pose, (x, y), state.added, interval)
         last[0], last[1], limited = x, y, True
         code, record.converged[k + 1] = follow_needle(model, buffers, state, interval)
         if code != ENDED:

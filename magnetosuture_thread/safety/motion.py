@@ -227,19 +227,23 @@ def filter_velocity(
 
 
 @compiled
-def moved_needle(data: FilterData, pose: NDArray[np.float64], velocity: Pair, duration: float) -> None:
+def moved_needle(
+    data: FilterData, pose: NDArray[np.float64], velocity: Pair, added: NDArray[np.float64], duration: float
+) -> None:
     """Move the needle by a tip velocity that is held, as the needle has it, for a time.
 
     Args:
         data: of the filter.
         pose: tail [m] and heading, written, shape (4,).
         velocity: of the tip [m/s].
+        added: to the motion that the velocity gives: velocity of the chord's middle along it and to its left [m/s], and
+            rate of turning [rad/s], shape (3,); a needle that is a point does not turn.
         duration: [s].
     """
     chord = (data.body.chord, data.body.chord_x, data.body.chord_y)
     ex, ey = chord[1] * pose[2] - chord[2] * pose[3], chord[1] * pose[3] + chord[2] * pose[2]
     along, across = ex * velocity[0] + ey * velocity[1], ex * velocity[1] - ey * velocity[0]
     if chord[0] == 0.0:
-        move_pose(chord, pose, along, across, 0.0, duration)
+        move_pose(chord, pose, along + added[0], across + added[1], 0.0, duration)
     else:
-        move_pose(chord, pose, along, 0.0, across / (0.5 * chord[0]), duration)
+        move_pose(chord, pose, along + added[0], added[1], across / (0.5 * chord[0]) + added[2], duration)

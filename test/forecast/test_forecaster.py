@@ -23,6 +23,7 @@ from magnetosuture_thread import (
     ThreadForecaster,
     ThreadPredictor,
 )
+from magnetosuture_thread.forecast import NeedleDrag
 from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.thread.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
@@ -165,7 +166,10 @@ def test_the_thread_of_a_start_is_forecast_in_place_of_the_own(forecaster: Threa
     own = forecaster.thread
     medium = replace(own.medium, drag_across=0.7 * own.medium.drag_across)
     stiffer = replace(own, bending_stiffness=20.0 * own.bending_stiffness, medium=medium)
-    one, other = (ThreadForecaster(each, forecaster.scene, forecaster.safety, law=LAW) for each in (own, stiffer))
+    drag = NeedleDrag(0.0255, 0.033, 1.6e-7)
+    one, other = (
+        ThreadForecaster(each, forecaster.scene, forecaster.safety, law=LAW, drag=drag) for each in (own, stiffer)
+    )
     start = one.straight(START)
     learned = one.forecast(replace(start, thread=stiffer), UP, HORIZON)
     assert same(learned, other.forecast(start, UP, HORIZON))
@@ -216,6 +220,27 @@ def test_needle_that_is_driven_against_a_shape_comes_to_rest_there():
     assert 0.0 < forecast.minima["needle"].value < 1e-5
     assert forecaster.forecast(start, -0.002 * EAST, 1.0).rest_time is None
     assert forecaster.forecast(start, np.zeros(2), 1.0).rest_time is None, "nobody commands it to move"
+
+
+def test_needle_with_drag_moves_by_the_balance_of_command_and_pull():
+    """Behind a straight thread as commanded, and with one that lies across it more slowly: that has to be turned."""
+    where, drag = Scene.create(), NeedleDrag(along=0.0255, across=0.033, turning=1.6e-7)
+    filters = NeedleSafetyFilter(where, needle_length=0.007)
+    exact, pulled = (ThreadForecaster(thread(), where, filters, drag=each) for each in (None, drag))
+    start = exact.straight(NeedlePose(0.0, np.zeros(2), EAST))
+    ahead, steps = 0.003 * EAST, 60
+    free, drawn = (each.forecast(start, ahead, steps * STEP) for each in (exact, pulled))
+    assert drawn.tails[-1, 0] == pytest.approx(free.tails[-1, 0], rel=0.05)
+    turning = np.array([0.0, 0.003])
+    free, drawn = (each.forecast(start, turning, steps * STEP) for each in (exact, pulled))
+    turns = [math.atan2(each.headings[-1, 1], each.headings[-1, 0]) for each in (free, drawn)]
+    assert 0.1 * turns[0] < turns[1] < 0.95 * turns[0]
+    balance = drawn.needle_force[-1] @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
+    across = turning @ np.array([-drawn.headings[-1, 1], drawn.headings[-1, 0]])
+    rate = (math.atan2(*drawn.headings[-1][::-1]) - math.atan2(*drawn.headings[-2][::-1])) / STEP
+    assert rate == pytest.approx(across / 0.0035 - 0.0035 * balance / 1.6e-7, rel=0.1)
+    still = pulled.forecast(replace(start, vertices=start.vertices), np.zeros(2), 0.2)
+    np.testing.assert_array_equal(still.tails[-1], still.tails[0])  # nothing moves a needle that nobody commands
 
 
 def test_first_contact_names_shape_and_time():
@@ -285,5 +310,9 @@ def test_filter_of_another_scene_and_other_settings_are_refused():
         ThreadForecaster(thread(), where, NeedleSafetyFilter(Scene.create()))
     with pytest.raises(ConfigurationError, match="step"):
         ThreadForecaster(thread(), where, step=math.nan)
+    with pytest.raises(ConfigurationError, match="turning"):
+        NeedleDrag(along=0.02, across=0.03, turning=math.nan)
+    with pytest.raises(ConfigurationError, match="along"):
+        ThreadForecaster(thread(), where, drag=NeedleDrag(along=0.001, across=0.03, turning=1e-7))
     with pytest.raises(ConfigurationError, match="margin_range"):
         ThreadForecaster(thread(), where, law=LAW, margin_range=1e-4)
