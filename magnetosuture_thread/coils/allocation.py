@@ -362,9 +362,11 @@ class CoilGainEstimator:
             return
         interval = stamp - last[0]
         self._predict(interval, math.hypot(*(middle - last[1])) / interval)
-        currents = self._mean_currents(last[0], stamp)
-        if currents is None:
+        while len(self._applied) > 1 and self._applied[1][0] <= stamp:
+            self._applied.popleft()
+        if not self._applied or self._applied[0][0] > stamp or not self._applied[0][1].any():
             return
+        currents = self._applied[0][1]
         chord = self._needle.chord * e
         fields = 0.5 * (self._coils.per_current(tail) + self._coils.per_current(tail + chord)) * currents
         row = np.append(fields[1] * e[0] - fields[0] * e[1], -1.0)
@@ -383,20 +385,6 @@ class CoilGainEstimator:
         gains = self.gains
         self._state[:-1] = np.clip(gains / gains.mean(), 1.0 - MAX_CHANGE, 1.0 + MAX_CHANGE)
         self._covariance -= np.outer(spread, spread) / variance
-
-    def _mean_currents(self, start: float, end: float) -> Vector | None:
-        """Return the mean currents between two times [A]; None where some are zero or not known."""
-        while len(self._applied) > 1 and self._applied[1][0] <= start:
-            self._applied.popleft()
-        if not self._applied or self._applied[0][0] > start:
-            return None
-        total, since = np.zeros(len(self.gains)), start
-        for k, (_, currents) in enumerate(self._applied):
-            until = min(end, self._applied[k + 1][0]) if k + 1 < len(self._applied) else end
-            if until > since and not currents.any():
-                return None
-            total, since = total + max(0.0, until - since) * currents, max(since, until)
-        return total / (end - start)
 
     def _predict(self, interval: float, speed: float) -> None:
         """Let the gains drift and the thread's torque be forgotten over an interval [s], at a speed [m/s]."""

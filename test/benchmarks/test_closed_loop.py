@@ -26,7 +26,8 @@ def test_a_short_loop():
     assert 1e-5 < frames["peak_n"] < 2e-4
     assert periods["rms_percent"] < 5.0  # of a peak that this loop has not reached yet
     assert frames["rms_percent"] < 0.5 * tracked["rms_percent"]
-    assert tracked["averaged_rms_percent"] < 0.5 * tracked["rms_percent"]
+    assert tracked["rms_percent"] < 5.6  # of tracked poses, whose noise is most of it
+    assert tracked["averaged_rms_percent"] < 2.8
     assert 0.0 < tracked["estimate"]["mean_percent"] < 0.1
     assert tracked["estimate"]["mean_percent"] <= tracked["estimate"]["max_percent"] < 0.5
     assert 0.0 < tracked["prediction"]["mean_percent"] < 0.3
