@@ -1,8 +1,8 @@
 """Reads the files of a bag in sqlite3, the older format of rosbag2, which has no checksums.
 
-A database may be anything: views that compute their rows, trees that lead back to themselves, rows of gigabytes. It is
-read within a number of steps that depends on the size of the file. A damaged one is refused: nothing tells its altered
-messages from the others.
+A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes. Only
+plain tables are read, within a number of steps that depends on the size of the file. A damaged one is refused: nothing
+tells its altered messages from the others.
 """
 
 from __future__ import annotations
@@ -35,11 +35,17 @@ _MAX_TIME = (1 << 63) - 1
 _LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
 _MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
+_COLUMNS = {
+    "topics": ("id", "name", "type", "serialization_format"),
+    "messages": ("id", "topic_id", "timestamp", "data"),
+}
 # sqlite3 does not enforce column types, so that a row may hold anything.
-_COUNT = """
-    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM(
-        typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'
-    ) FROM messages GROUP BY topic_id
+_IS_VALID = (
+    "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
+)
+_COUNT = f"""
+    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM({_IS_VALID})
+    FROM messages GROUP BY topic_id
 """
 
 
@@ -76,6 +82,7 @@ class SqliteFile:
             with closing(self._connect()) as database:
                 if (found := str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])) != "ok":
                     raise self._damaged(found)
+                self._check_tables(database)
                 self.connections = _connections(database)
                 self._count_messages(database)
         except (sqlite3.OperationalError, sqlite3.DataError) as error:  # no such table, or too much work: no damage
@@ -86,6 +93,17 @@ class SqliteFile:
             raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
         progress(size)
         self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
+
+    def _check_tables(self, database: sqlite3.Connection) -> None:
+        """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
+        for table, columns in _COLUMNS.items():
+            kinds = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)).fetchall()
+            if [kind for kind, _ in kinds] != ["table"] or "virtual" in str(kinds[0][1]).lower().split("(")[0]:
+                raise BagError(self.path, f"has no table {table}, which the database of a bag has")
+            found = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
+            missing = next((name for name in columns if found.get(name) != 0), None)
+            if missing is not None:
+                raise BagError(self.path, f"has no column {missing} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> None:
         lost = longest = 0
@@ -119,7 +137,7 @@ class SqliteFile:
                 marks = ",".join("?" * len(wanted))
                 query = (
                     f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
-                    " AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
+                    f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
                 )
                 rows = database.execute(query, (*wanted, max(start, -_MAX_TIME), min(end, _MAX_TIME)))
                 yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)

@@ -530,10 +530,14 @@ class BagWriter:
         information = self._information()
         self._writer.finish({"rosbag2": {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}})
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-        with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
+        try:
+            with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError:  # a part of it would be refused, where readers do without it
+            (self.folder / METADATA_FILE).unlink(missing_ok=True)
+            raise
 
     def _information(self) -> dict[str, Any]:
         """Return the content of metadata.yaml."""

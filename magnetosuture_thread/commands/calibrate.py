@@ -93,9 +93,9 @@ def run_calibrate(options: argparse.Namespace, terminal: Terminal) -> int:
     chosen = FitOptions(**{field.name: getattr(options, field.name) for field in fields(FitOptions)})
     with terminal.progress("calibrate") as advance:
         fit = fit_bags(options.bags, chosen, cast(BagSelection, bag_selection(options)), terminal.log, advance)
-    fit.write(options.output, options.picture)
     values = fit.result.to_json()
     write_json(options.json, values)
+    fit.write(options.output, options.picture)
     terminal.print(parameter_table(values))
     terminal.print(bag_table(values))
     for line in calibration_lines(values):

@@ -165,7 +165,7 @@ def add_span(parser: argparse._ActionsContainer, bag: str = "the bag") -> None:
     """Add --start and --duration: which part of a bag is read."""
     option = parser.add_argument
     option("--start", type=number_argument(0.0, 1e9), default=0.0, metavar="S", help=f"seconds into {bag} to begin at")
-    option("--duration", type=number_argument(0.0, 1e9), metavar="S", help="seconds (default: to the end)")
+    option("--duration", type=number_argument(1e-3, 1e9), metavar="S", help="seconds (default: to the end)")
 
 
 def bag_selection(options: argparse.Namespace) -> dict[str, Any]:

@@ -265,10 +265,10 @@ def numbered(names: Sequence[str], form: str) -> list[str]:
         names: that may come again.
         form: of a name with its number, 2 and up, for example `{}_{}`.
     """
-    taken = dict[str, None]()
+    taken, given = dict[str, None](), set(names)
     for name in names:
         own, number = name, 1
-        while own in taken:
+        while own in taken or (number > 1 and own in given):
             number += 1
             own = form.format(name, number)
         taken[own] = None

@@ -261,9 +261,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         now = (latch.state, latch.stop_reason, closed, reasons, driver.ready, driver.problem, driver.warnings, scene)
         if now == self._last_state and not force:
             return
-        self._last_state = now
         stamp = self.get_clock().now().to_msg()
         self._states.publish(packed_bridge_state(stamp, system, driver, self._refused))
+        self._last_state = now
         if output is not None and not output.publish:
             self._filter.publish(packed_filter_state(stamp, output))
         jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)

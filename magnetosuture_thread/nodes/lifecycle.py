@@ -157,9 +157,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""
         try:
-            current = {each.name: self.get_parameter(each.name) for each in configuration_fields(self._class)}
-            given = {name: plain_value(value) for name, value in current.items()}
-            settings = declare(self, self._class, given, read_only=False, fixed=self._fixed)
+            settings = declare(self, self._class, self._declared(), read_only=False, fixed=self._fixed)
             self.allocate(settings)
             if not self._starts:  # as `run` does when the node has started
                 gc.collect()
@@ -230,9 +228,16 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             MagnetosutureError: they are refused; nothing has changed.
         """
         if values:
+            if self.settings is None:  # then `_check_change` leaves it to `on_configure`
+                from_mapping(self._class, {**self._declared(), **values})
             result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
             if not result.successful:
                 raise MagnetosutureError(result.reason)
+
+    def _declared(self) -> dict[str, Any]:
+        """Return the values of the parameters."""
+        names = [each.name for each in configuration_fields(self._class)]
+        return {name: plain_value(self.get_parameter(name)) for name in names}
 
     def _failed(self, error: Exception) -> TransitionCallbackReturn:
         self.problem = error

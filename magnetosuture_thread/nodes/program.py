@@ -61,5 +61,7 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 2 or sys.argv[1] not in (*MAKERS, "console"):
+        sys.exit(f"error: expected one of {', '.join((*MAKERS, 'console'))}")
     sys.argv = sys.argv[1:]
     sys.exit(main())

@@ -144,3 +144,12 @@ def test_a_refused_scene_is_reported_and_leaves_all_as_it_was(graph, bench: Benc
     graph.wait(lambda: bench.said(words), "a refusal")
     bench.show(2)
     assert bench.margins[-1].scene_version == read_scene("dish_150mm").version
+
+
+def test_a_material_that_cannot_be_leaves_an_unconfigured_node_as_it_was(graph):
+    node = graph.add(ThreadModelNode, autostart="unconfigured")
+    node.on_material(ThreadMaterial(name="steel", viscosity=0.7))
+    assert node.get_parameter("material").value == "polyamide_7_0"
+    assert node.get_parameter("viscosity").value == 1.0
+    node.on_material(ThreadMaterial(name="silk_6_0"))
+    assert node.get_parameter("material").value == "silk_6_0"

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread.errors import DriverError
+
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.settings import CoilBridgeSettings
 
@@ -176,7 +178,10 @@ def make_driver(
     if settings.driver == "simulated":
         return SimulatedDriver(coils, send, listeners)
     if settings.driver == "roboclaw":
-        from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+        try:
+            from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
+        except ModuleNotFoundError as error:
+            raise DriverError("roboclaw", f"{error}; install it by: pip install basicmicro pyserial") from None
 
         return RoboClawDriver(settings, coils)
     return RecordingDriver(coils)
