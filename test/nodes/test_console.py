@@ -212,8 +212,13 @@ def test_procedures_are_planned_begun_paused_and_given_up_by_the_page(graph, con
         return not asyncio.run(console.execute_procedure("plan", near, True))
 
     graph.wait(planned, "the plan", timeout=60.0)
-    graph.wait(lambda: (console.state()["procedure"] or {}).get("state") == "ready", "its state")
-    graph.wait(lambda: len(console.state()["plan"]) > 10, "its plan")
+
+    def is_shown() -> bool:
+        graph.publish(topics.NEEDLE_POSE, pose)  # without poses a plan is given up
+        state = console.state()
+        return (state["procedure"] or {}).get("state") == "ready" and len(state["plan"]) > 10
+
+    graph.wait(is_shown, "state and plan")
     assert console.state()["procedure"]["goals"] == ["go_to"]
     assert asyncio.run(console.execute_procedure("resume", "", False)) == ""
 
