@@ -71,6 +71,8 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
 def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters that are meant for a node, by name, without those of rclpy; what comes later counts.
 
+    `use_sim_time` is put in force here, as rcl does not know sections by a node's kind.
+
     Args:
         node: in any namespace and under any name.
         kind: the node's own name, under which parameter files know it whatever it is renamed to.
@@ -95,6 +97,8 @@ def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[
             if owner in ("", kind, node.get_name()):
                 given[name] = parse_parameter_value(right)
     given.update({each.name: plain_value(each) for each in options.get("parameter_overrides") or []})
+    if isinstance(clock := given.get("use_sim_time"), bool):
+        node.set_parameters([Parameter("use_sim_time", value=clock)])
     return {name: value for name, value in given.items() if name.split(".")[0] not in ROS_PARAMETERS}
 
 

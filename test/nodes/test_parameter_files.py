@@ -139,7 +139,9 @@ def test_sections_of_others_do_not_matter(followed):
 def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(graph, programs, tmp_path: Path):
     """Found from outside: it was active with no obstacles, another dish and another needle, without a warning."""
     extra = tmp_path / "launch.yaml"  # what launch writes of parameters that it is given itself
-    extra.write_text("/**: {ros__parameters: {use_sim_time: false, max_speed: 0.011}}")
+    extra.write_text(
+        "/**: {ros__parameters: {max_speed: 0.011}}\n/**/coil_bridge: {ros__parameters: {use_sim_time: true}}"
+    )
     files = ("--params-file", str(find_setup_file("hernia_ring")), "--params-file", str(extra))
     names = ("-r", "__node:=left_bridge", "-r", "__ns:=/lab1")
     programs.start("coil_bridge", *names, *files, environment=graph_environment(graph.domain))
@@ -149,6 +151,7 @@ def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(graph, programs,
         "keep_out": 0.00025,
         "needle_moment": 2.405e-4,
         "max_speed": 0.011,
+        "use_sim_time": True,
         "driver": "recording",
     }
     client = AsyncParameterClient(graph.probe, "/lab1/left_bridge")
