@@ -74,7 +74,11 @@ class TopicReport:
             recording.convert(record, self.channel).decode()
             self.known, self.problem = True, ""
         except (UnfitError, BagError) as error:
-            why = error.problem if isinstance(error, BagError) else error
+            self.refuse(error.problem if isinstance(error, BagError) else error)
+
+    def refuse(self, why: object) -> None:
+        """Keep why the first message of a topic of ours cannot be used, until one can."""
+        if self.channel is not None and not self.known:
             self.problem = self.problem or f"none of the messages on {self.topic} can be used: {why}"
 
     def to_json(self) -> dict[str, Any]:
@@ -120,6 +124,8 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
         topics[record.topic].add(record, time, is_cdr=is_cdr)
         if is_cdr:
             topics[record.topic].try_to_use(record, recording)
+        else:
+            topics[record.topic].refuse(f"they are written as {connection.serialization!r}, expected {CDR!r}")
         progress(time / max(bag.duration, 1e-9))
     return {
         "bag": str(bag.path),

@@ -223,6 +223,7 @@ class FrameSource:
 
     def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
         lens: Lens | None = None
+        recording.refused.clear()  # counted by `rate` too
         wanted = [channel for channel in (CAMERA_INFO, self._channel) if recording.counts.get(channel.recorded)]
         for record in recording.records(wanted):
             if record.topic == CAMERA_INFO.recorded:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 
 from magnetosuture_thread import cli
@@ -123,3 +124,19 @@ def test_the_frame_can_be_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for words, is_told in (([], True), (["--frame", "world"], False)):
         assert cli.main(["bag", "check", str(tmp_path / "bag"), *words]) == 0
         assert ("is not connected to dish" in capsys.readouterr().out) == is_told
+
+
+def test_a_topic_of_ours_in_another_serialization_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        schema = writer.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"string text")
+        channel = writer.register_channel("/needle/measured_cp", "cbor", schema)
+        writer.add_message(channel, 10, b"\xa0", 10)
+        writer.finish()
+    found = tmp_path / "found.json"
+    cli.main(["bag", "check", str(path), "--json", str(found)])
+    (topic,) = json.loads(found.read_text())["topics"]
+    assert not topic["known"]
+    assert "they are written as 'cbor', expected 'cdr'" in topic["problem"]
