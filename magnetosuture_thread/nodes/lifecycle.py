@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -22,23 +22,23 @@ from rclpy.timer import Timer
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, MAX_REQUEST_ENTRIES, PackageNode, reason_of
-from magnetosuture_thread.nodes.parameters import (
-    as_declared,
-    declare,
-    given_parameters,
-    plain_value,
-)
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, MAX_REQUEST_ENTRIES, GuardedNode, reason_of
+from magnetosuture_thread.nodes.parameters import as_declared, declare, given_parameters, plain_value
+from magnetosuture_thread.texts import shortened
 
 C = TypeVar("C", bound=Configuration)
-E = TypeVar("E", bound="Publisher | Subscription | Service | Timer")
+E = TypeVar("E")  # a publisher, subscription, service or timer, or another part of a node with a method `destroy`
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 INACTIVE = "inactive: messages are not used until the node is activated"
 
 
-class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
+class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
     """A lifecycle node with the states of ROS 2: unconfigured, inactive, active, finalized.
+
+    It uses messages, answers requests and commands only while it is active: see `while_active` and `require_active`.
+    What others wait for, as its publishers, enters the graph when it is configured, with everything loaded, and leaves
+    when it is cleaned up: see `held`.
 
     Args:
         name: of the node.
@@ -47,6 +47,8 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         options: for rclpy's node.
 
     Attributes:
+        stands_by: whether its state on /diagnostics is that of its lifecycle while it is not active.
+        is_active: whether it is active.
         settings: as the node was configured with them; None while unconfigured.
         problem: why the last transition failed.
 
@@ -54,15 +56,19 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         ConfigurationError: a parameter is invalid, or a parameter file cannot be used.
     """
 
+    stands_by: ClassVar[bool] = True
+
     def __init__(self, name: str, settings: type[C], *, fixed: Mapping[str, str] | None = None, **options: Any) -> None:
         self.settings: C | None = None
+        self.is_active = False
+        self.problem: Exception | None = None
+        self._held: list[Any] = []
+        self._agreed: tuple[C, Callable[[], None]] | None = None
+        self._starts = False
         super().__init__(name, **options)
         self._class = settings
         every = dict.fromkeys((each.name for each in configuration_fields(settings)), "")
         self._fixed = every if fixed is None else fixed
-        self._agreed: tuple[C, Callable[[], None]] | None = None
-        self.problem: Exception | None = None
-        self._starts = False
         try:
             declare(self, settings, given_parameters(self, name, options), read_only=False, fixed=self._fixed)
         except ConfigurationError:
@@ -76,17 +82,14 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def allocate(self, settings: C) -> None:
         """Allocate what the settings require; raise `MagnetosutureError` if that is impossible."""
 
-    @abstractmethod
     def activate(self) -> None:
         """Become active; raise `MagnetosutureError` where that cannot be."""
 
-    @abstractmethod
     def deactivate(self) -> None:
         """Become inactive; must not fail."""
 
-    @abstractmethod
     def release(self) -> None:
-        """Give all back that was taken in `allocate`, also if that did not get to its end; must not fail."""
+        """Give back what `allocate` took and is not held, also if that did not get to its end; must not fail."""
 
     def prepare(self, settings: C) -> Callable[[], None]:
         """Return what puts other settings in force, which must not fail; raise `MagnetosutureError` if they cannot be.
@@ -125,6 +128,41 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         """Return whether the node may become active by itself at its start."""
         return True
 
+    def held(self, entity: E) -> E:
+        """Return an entity of this node, after noting that it leaves the graph when the node is cleaned up."""
+        self._held.append(entity)
+        return entity
+
+    def give_back(self, entity: Any) -> None:
+        """Take an entity that is held out of the graph."""
+        self._held.remove(entity)
+        kinds = (
+            (Publisher, self.destroy_publisher),
+            (Subscription, self.destroy_subscription),
+            (Service, self.destroy_service),
+            (Timer, self.destroy_timer),
+        )
+        destroy = next((destroy for kind, destroy in kinds if isinstance(entity, kind)), type(entity).destroy)
+        destroy(entity)
+
+    def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback of a subscription or timer that is called only while the node is active."""
+
+        def call(*arguments: Any) -> None:
+            if self.is_active:
+                callback(*arguments)
+
+        return call
+
+    def require_active(self) -> None:
+        """Refuse a request that only an active node can answer.
+
+        Raises:
+            GraphError: the node is not active.
+        """
+        if not self.is_active:
+            raise GraphError(f"{self.get_name()} is {self.stage}; activate it first")
+
     def require(self, go: Callable[[], TransitionCallbackReturn]) -> None:
         """Make a transition.
 
@@ -141,39 +179,46 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         Raises:
             MagnetosutureError: a transition failed; the node is destroyed.
         """
-        if self.get_parameter_or("autostart").value == "unconfigured":
-            return
+        until = self.get_parameter("autostart").value
         self._starts = True
         try:
-            self.require(self.trigger_configure)
-            if self.get_parameter("autostart").value != "inactive" and self.may_start():
-                self.require(self.trigger_activate)
+            if until != "unconfigured":
+                self.require(self.trigger_configure)
+                if until != "inactive" and self.may_start():
+                    self.require(self.trigger_activate)
         except BaseException:  # an interruption too: the driver may be open
             self.destroy_node()
             raise
         finally:
             self._starts = False
+        if not self.is_active:
+            self._stand_by("unconfigured" if self.settings is None else INACTIVE)
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Check the parameters and allocate what they require."""
         try:
-            settings = declare(self, self._class, self._declared(), read_only=False, fixed=self._fixed)
+            settings = from_mapping(self._class, self._declared())
             self.allocate(settings)
             if not self._starts:  # as `run` does when the node has started
                 gc.collect()
                 gc.freeze()
         except Exception as error:  # rclpy would swallow it, and what was taken would stay
-            self.release()
+            self._release_all()
+            self._stand_by(f"unconfigured: {error}")
             return self._failed(error)
         self.settings = settings
+        self._stand_by(INACTIVE)
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Become active."""
+        self._stand_by("")
         try:
             self.activate()
         except Exception as error:
+            self._stand_by(INACTIVE)
             return self._failed(error)
+        self.is_active = True
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -184,12 +229,16 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             self.on_cleanup(state)
             self._failed(error)
             return TransitionCallbackReturn.ERROR
+        self.is_active = False
+        self._stand_by(INACTIVE)
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give all back; the parameters can be set again."""
-        self.release()
+        self.is_active = False
+        self._release_all()
         self.settings = None
+        self._stand_by("finalized" if self.is_shutting_down else "unconfigured")
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -212,14 +261,9 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
     def destroy_node(self) -> None:
         """Give all back, and leave the graph at once."""
         try:
-            self.release()
+            self._release_all()
         finally:
             self._leave()
-
-    def _leave(self) -> None:
-        super().destroy_node()
-        # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
-        self._state_machine.destroy_when_not_in_use()
 
     def change(self, values: Mapping[str, Any]) -> None:
         """Set parameters together, as the service does.
@@ -233,6 +277,21 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
             result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
             if not result.successful:
                 raise MagnetosutureError(result.reason)
+
+    def _release_all(self) -> None:
+        self.release()
+        for entity in tuple(self._held):
+            self.give_back(entity)
+
+    def _leave(self) -> None:
+        super().destroy_node()
+        # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
+        self._state_machine.destroy_when_not_in_use()
+
+    def _stand_by(self, text: str) -> None:
+        """Report the state of the lifecycle on /diagnostics; at the start, once the node has got as far as it goes."""
+        if self.stands_by and self.context.ok() and (not self._starts or not text):
+            self.health.stand_by(text)
 
     def _declared(self) -> dict[str, Any]:
         """Return the values of the parameters."""
@@ -255,22 +314,19 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
         asked = {name: value for name, value in asked.items() if value != in_force[name]}
         try:
             for name, value in asked.items():
-                self._check_free(name, value)
+                where, long = f"{self._class.GROUP}.{name}", isinstance(value, list) and len(value)
+                if name in self._fixed:
+                    shown = value[:10] if long else value  # a million entries take long to write
+                    raise ConfigurationError(where, shown, "its value in force, until the node is cleaned up")
+                if long > MAX_REQUEST_ENTRIES:
+                    expected = f"at most {MAX_REQUEST_ENTRIES} while the node runs"
+                    raise ConfigurationError(where, f"{long} entries", expected)
             if asked:
                 settings = from_mapping(self._class, {**in_force, **asked})
                 self._agreed = settings, self.prepare(settings)
         except MagnetosutureError as error:
             return SetParametersResult(successful=False, reason=_reason(error, asked))
         return SetParametersResult(successful=True)
-
-    def _check_free(self, name: str, value: Any) -> None:
-        where = f"{self._class.GROUP}.{name}"
-        if name in self._fixed:
-            shown = value[:10] if isinstance(value, list) else value  # a million entries take long to write
-            raise ConfigurationError(where, shown, "its value in force, until the node is cleaned up")
-        if isinstance(value, list) and len(value) > MAX_REQUEST_ENTRIES:
-            expected = f"at most {MAX_REQUEST_ENTRIES} while the node runs"
-            raise ConfigurationError(where, f"{len(value)} entries", expected)
 
     def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
         if self._agreed is not None:
@@ -279,99 +335,7 @@ class ManagedNode(PackageNode, LifecycleNode, Generic[C]):
 
 
 def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
-    """Return why a change was refused, in one line: of a long list its beginning and what was expected."""
-    text = " ".join(str(error).split())
-    if len(text) > MAX_REASON_CHARS:
-        text = f"{text[: MAX_REASON_CHARS // 2]} … {text[-MAX_REASON_CHARS // 2 :]}"
+    """Return why a change was refused, in one line."""
     named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
     together = "" if named in ("", *asked) else "; what belongs together is set at once, by set_parameters_atomically"
-    return text + together
-
-
-class StandbyNode(ManagedNode[C]):
-    """A managed node that uses messages, answers requests and commands only while it is active.
-
-    While it is not, its state on /diagnostics is that of its lifecycle. What others wait for, as its publishers, enters
-    the graph when it is configured, with everything loaded, and leaves when it is cleaned up: see `held`.
-
-    Attributes:
-        is_active: whether it is.
-    """
-
-    def __init__(self, name: str, settings: type[C], **options: Any) -> None:
-        self.is_active = False
-        self._held: list[Publisher | Subscription | Service | Timer] = []
-        super().__init__(name, settings, **options)
-
-    def held(self, entity: E) -> E:
-        """Return an entity of this node, after noting that it leaves the graph when the node is cleaned up."""
-        self._held.append(entity)
-        return entity
-
-    def release(self) -> None:
-        """Take what is held out of the graph; nodes with more to give back do that before."""
-        for entity in self._held:
-            if isinstance(entity, Publisher):
-                self.destroy_publisher(entity)
-            elif isinstance(entity, Subscription):
-                self.destroy_subscription(entity)
-            elif isinstance(entity, Service):
-                self.destroy_service(entity)
-            else:
-                self.destroy_timer(entity)
-        self._held.clear()
-
-    def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback of a subscription or timer that is called only while the node is active."""
-
-        def call(*arguments: Any) -> None:
-            if self.is_active:
-                callback(*arguments)
-
-        return call
-
-    def require_active(self) -> None:
-        """Refuse a request that only an active node can answer.
-
-        Raises:
-            GraphError: the node is not active.
-        """
-        if not self.is_active:
-            raise GraphError(f"{self.get_name()} is {self.stage}; activate it first")
-
-    def start(self) -> None:
-        """Go as far as the parameter `autostart` says; see `ManagedNode`."""
-        super().start()
-        if not self.is_active:
-            self.health.stand_by(INACTIVE if self.stage == "inactive" else "unconfigured")
-
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Check the parameters and allocate what they require."""
-        result = super().on_configure(state)
-        if not self._starts:
-            self.health.stand_by(INACTIVE if result is SUCCESS else f"unconfigured: {self.problem}")
-        return result
-
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Become active."""
-        self.health.stand_by("")
-        result = super().on_activate(state)
-        self.is_active = result is SUCCESS
-        if not self.is_active:
-            self.health.stand_by(INACTIVE)
-        return result
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Become inactive; where even that fails, give all back."""
-        result = super().on_deactivate(state)
-        self.is_active = False
-        self.health.stand_by(INACTIVE if result is SUCCESS else "unconfigured")
-        return result
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Give all back; the parameters can be set again."""
-        self.is_active = False
-        result = super().on_cleanup(state)
-        if self.context.ok():
-            self.health.stand_by("finalized" if self.is_shutting_down else "unconfigured")
-        return result
+    return shortened(" ".join(str(error).split()), MAX_REASON_CHARS) + together

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any, ClassVar
-from weakref import WeakMethod
+from weakref import ref
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
@@ -61,7 +61,7 @@ class Health:
         self._values: dict[str, object] = {}
         self._sent = -1.0
         node.create_timer(PERIOD, self.publish, clock=self._clock)
-        self._late = node.create_timer(self.quiet, self._publish_late, clock=self._clock)
+        self._late = node.create_timer(self.quiet, self.publish, clock=self._clock)
         self._late.cancel()
 
     def ok(self, text: str, **values: object) -> None:
@@ -91,9 +91,9 @@ class Health:
         self._refused += 1
         self._last_refusal = shortened(str(problem), MAX_REASON_CHARS)
         if self._level == DiagnosticStatus.ERROR:
-            self._values.update(values)
+            self.note(**values)
         else:
-            self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
+            self.warn(f"refused: {self._last_refusal}", **values)
 
     @contextmanager
     def load(self, what: str) -> Iterator[None]:
@@ -121,6 +121,7 @@ class Health:
 
     def publish(self) -> None:
         """Publish the state now."""
+        self._late.cancel()
         values = {**self._values, "refused": self._refused, "last refusal": self._last_refusal or "none"}
         status = DiagnosticStatus(
             level=DiagnosticStatus.WARN if self._standby else self._level,
@@ -148,10 +149,6 @@ class Health:
         elif self._late.is_canceled():
             self._late.reset()
 
-    def _publish_late(self) -> None:
-        self._late.cancel()
-        self.publish()
-
 
 def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
     """Return message and values of a status, of anybody, with texts of bounded length."""
@@ -160,7 +157,7 @@ def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
 
 
 class GuardedNode(Node):
-    """A node of rclpy that answers a failed request by an error, and ignores an impossible time.
+    """A node that reports on /diagnostics, answers a failed request by an error, and ignores an impossible time.
 
     What a service callback raises, those of rclpy for parameters, lifecycle and types included, would come out of
     `spin` and end the node; so would a time on /clock that rclpy cannot represent.
@@ -170,8 +167,13 @@ class GuardedNode(Node):
         super().__init__(name, **options)
         for service in self.services:  # rclpy makes some by another way
             self._guard(service)
-        # Where a constructor fails, nothing may keep the node: it would stay in the graph.
-        self.add_on_set_parameters_callback(_weakly(self._check_parameters))
+        node = ref(self)  # where a constructor fails, nothing may keep the node: it would stay in the graph
+        self.add_on_set_parameters_callback(lambda parameters: _check_parameters(node(), parameters))
+
+    @cached_property
+    def health(self) -> Health:
+        """Status of the node, published from its first use on."""
+        return Health(self)
 
     @property
     def clock_is_fixed(self) -> bool:
@@ -188,7 +190,7 @@ class GuardedNode(Node):
 
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
-        self.get_logger().warning(f"refused: {problem}", throttle_duration_sec=PERIOD)
+        self.health.refuse(problem)
 
     def finish(self) -> None:
         """Publish what others must know before the node ends in order; the graph is still there."""
@@ -202,14 +204,15 @@ class GuardedNode(Node):
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
         if msg_type is ClockMessage and not options.get("raw"):
-            options["raw"], received, refuse = True, callback, _weakly(self.refuse)
+            found: Callable[[], Any] = ref(self)
+            options["raw"], received = True, callback
 
             def callback(data: bytes) -> None:
                 try:
                     message = topics.CLOCK.decode(data)
                     reading.clock_nanoseconds(message)
                 except InvalidInputError as error:
-                    refuse(error)
+                    found().refuse(error)
                 else:
                     received(message)
 
@@ -220,41 +223,16 @@ class GuardedNode(Node):
             service.callback = _GuardedCallback(service, self.get_logger())
         return service
 
-    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if not parameter.name:  # which rclpy would declare
-                return SetParametersResult(successful=False, reason="a parameter without a name")
-            if parameter.name == "use_sim_time" and self.clock_is_fixed:
-                now = self.get_parameter("use_sim_time").value
-                if parameter.value is not now:
-                    error = ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now")
-                    return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
 
-
-class PackageNode(GuardedNode):
-    """A guarded node that reports on /diagnostics."""
-
-    @cached_property
-    def health(self) -> Health:
-        """Status of the node, published from its first use on."""
-        return Health(self)
-
-    def refuse(self, problem: Exception) -> None:
-        """Report a message that was refused."""
-        self.health.refuse(problem)
-
-
-def _weakly(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function that calls a method but does not keep its object."""
-    found = WeakMethod(method)
-
-    def call(argument: Any) -> Any:
-        bound = found()
-        assert bound is not None  # who calls is part of the object
-        return bound(argument)
-
-    return call
+def _check_parameters(node: Any, parameters: list[Parameter]) -> SetParametersResult:
+    """Refuse a parameter without a name, which rclpy would declare, and another clock for a node that keeps its own."""
+    reason, now = "", node.get_parameter("use_sim_time").value
+    for parameter in parameters:
+        if not parameter.name:
+            reason = "a parameter without a name"
+        elif parameter.name == "use_sim_time" and node.clock_is_fixed and parameter.value is not now:
+            reason = str(ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now"))
+    return SetParametersResult(successful=not reason, reason=reason)
 
 
 class _GuardedCallback:

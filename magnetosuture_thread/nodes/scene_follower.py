@@ -7,17 +7,8 @@ from collections.abc import Callable
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import PackageNode
+from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.texts import shortened
-
-
-def initial_scene(name: str) -> Scene | None:
-    """Return the scene of a node's parameter `scene`; None where it is empty.
-
-    Raises:
-        ConfigurationError: there is no such file, or it holds anything invalid.
-    """
-    return read_scene(name) if name else None
 
 
 class SceneFollower:
@@ -37,10 +28,10 @@ class SceneFollower:
         problem: why the scene that came last is not in force; empty where it is, or none came.
     """
 
-    def __init__(self, node: PackageNode, changed: Callable[[Scene], None], scene: Scene | None = None) -> None:
+    def __init__(self, node: GuardedNode, changed: Callable[[Scene], None], scene: Scene | None = None) -> None:
         self.scene, self.problem = scene, ""
         self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
-        self._node, self._health, self._changed = node, node.health, changed
+        self._node, self._changed = node, changed
         topics.SCENE.subscribe(node, self.on_scene, raw=True)
 
     @property
@@ -55,7 +46,7 @@ class SceneFollower:
             ConfigurationError: there is no such file, or it holds anything invalid.
         """
         if self._heard is None:
-            self.scene = initial_scene(name)
+            self.scene = read_scene(name) if name else None
         else:
             self.scene, self.problem = self._heard, ""
             if name:
@@ -63,24 +54,15 @@ class SceneFollower:
         return self.scene
 
     def on_scene(self, data: bytes) -> None:
-        """Handle a published scene."""
+        """Handle the bytes of a published scene."""
         self._heard = None
         try:
-            self._heard = scene = received_scene(data)
+            self._heard = scene = parse_scene_message(topics.SCENE.decode(data))
             if scene.version != self.version:
                 self._changed(scene)
         except MagnetosutureError as error:
             self.problem = f"scene refused: {shortened(str(error))}"
-            self._health.refuse(error, **{"scene problem": self.problem})
+            self._node.health.refuse(error, **{"scene problem": self.problem})
         else:
             self.scene, self.problem = scene, ""
-            self._health.note(**{"scene problem": "none"})
-
-
-def received_scene(data: bytes) -> Scene:
-    """Return the scene of a message's bytes.
-
-    Raises:
-        InvalidInputError: they are too many, cut off, or say no scene as it was sent.
-    """
-    return parse_scene_message(topics.SCENE.decode(data))
+            self._node.health.note(**{"scene problem": "none"})

@@ -20,7 +20,6 @@ from magnetosuture_thread.nodes import player, timeline, topics
 from magnetosuture_thread.nodes.player import LiveReplay, Losses
 from magnetosuture_thread.nodes.timeline import Timeline
 from test.nodes import wire
-from test.nodes.margins import no_margins
 
 
 def test_time_stands_still_before_it_begins_and_while_it_is_paused(monkeypatch: pytest.MonkeyPatch):
@@ -98,7 +97,7 @@ def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pyte
     def answer(message: Any) -> None:
         asked.append(message)
         if len(asked) % 2:
-            margins.publish(no_margins(message.header.stamp, "for a test"))
+            margins.publish(wire.no_margins(message.header.stamp, "for a test"))
 
     graph.probe.create_subscription(topics.NEEDLE_POSE.message, topics.NEEDLE_POSE.name, answer, 100)
     graph.probe.create_subscription(topics.CLOCK.message, topics.CLOCK.name, lambda message: None, 100)

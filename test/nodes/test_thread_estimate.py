@@ -136,8 +136,6 @@ def test_a_late_observation_corrects_the_estimate_of_its_frame_and_the_last(benc
 def spoiled(name: str) -> tuple[float, ThreadObservation]:
     """Return when an observation that cannot be used is stamped, in frames after the third, and it."""
     good = piece_of(NODES[3], 3)
-    if name == "future":
-        return 1800.0, whole(NODES[3], 3)
     if name == "not finite":
         points = good.points.copy()
         points[3, 0] = math.nan
@@ -151,7 +149,6 @@ def spoiled(name: str) -> tuple[float, ThreadObservation]:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("future", "after the last pose"),
         ("not finite", "thread/observation"),
         ("another thread", "it is of another one"),
     ],
