@@ -11,9 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
-from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.disturbance import Disturbance
-from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.cdr import Stamp, pack
@@ -23,6 +20,7 @@ from magnetosuture_thread.thread.margins import UNKNOWN, Margins, friction_colou
 from magnetosuture_thread.thread.prediction import Prediction
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
 
 ADD, LINE_STRIP = 0, 4  # as in Marker.msg; the other types below
@@ -169,6 +167,9 @@ def _disturbance_markers(number: int, found: Disturbance, width: float) -> list[
 
 def deviation_band(estimate: ThreadEstimate) -> Points:
     """Return the triangles of the band within 2.33 standard deviations of the estimated thread, shape (6 n, 2) [m]."""
+    # Only here: a scene server packs markers too, and needs no estimator.
+    from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
+
     nodes = estimate.positions
     along = np.gradient(nodes, axis=0)
     across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]

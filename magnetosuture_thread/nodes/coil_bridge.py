@@ -27,10 +27,8 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import packing, reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import raise_priority
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 

@@ -28,9 +28,7 @@ from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, reason_of
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text

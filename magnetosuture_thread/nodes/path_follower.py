@@ -12,9 +12,8 @@ from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.planning.follower import PathFollowerSettings, prepare_paths
 
 

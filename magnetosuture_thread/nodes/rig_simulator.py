@@ -19,9 +19,8 @@ from std_srvs.srv import SetBool
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
 from magnetosuture_thread.messages.packing import camera_outputs, ground_truth_outputs, packed_image
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.nodes.parameters import declare, given_parameters
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault

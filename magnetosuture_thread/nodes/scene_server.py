@@ -13,7 +13,7 @@ from magnetosuture_thread.interface import SCENE_SERVER, Service
 from magnetosuture_thread.messages.markers import packed_scene_markers
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
+from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.scene.files import SceneEditor, SceneServerSettings
 
 

@@ -34,9 +34,7 @@ from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_forecast_markers, packed_thread_markers
 from magnetosuture_thread.messages.packing import estimate_outputs, packed_forecast, prediction_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.node import Health
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 from magnetosuture_thread.thread.prediction import STARTED
 from magnetosuture_thread.thread.program import SOLVED

@@ -15,8 +15,7 @@ from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

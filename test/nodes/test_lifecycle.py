@@ -22,8 +22,8 @@ from std_srvs.srv import Trigger
 
 from magnetosuture_thread.interface import SCENE_SERVER, STANDBY_NODES, Service
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import INACTIVE
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
+from magnetosuture_thread.nodes.node import INACTIVE
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadForecasts, ThreadModelNode

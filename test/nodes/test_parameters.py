@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
+from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.nodes.parameters import plain_value
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode

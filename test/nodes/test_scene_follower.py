@@ -10,8 +10,7 @@ from rclpy.serialization import serialize_message
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import GuardedNode
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.scene import Scene, read_scene
 from test.nodes import wire
 from test.scene.scenes import every_shape
