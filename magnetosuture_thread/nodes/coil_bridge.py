@@ -16,7 +16,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
@@ -67,9 +66,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
-        self.create_service(SetBool, Service.ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
-        self.create_service(Trigger, Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
-        self.create_service(Trigger, Service.RESET, lambda _, answer: _done(answer, self.reset()))
+        self.serve(Service.ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
+        self.serve(Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
+        self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()))
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")

@@ -99,10 +99,9 @@ class ConsoleGraph:
     def __init__(self, node: Node, settings: ConsoleSettings) -> None:
         self.node = node
         self.blocked = ""
-        triggers = (Service.EMERGENCY_STOP, Service.RESET, *PROCEDURE_ACTIONS.values())
-        switches = (Service.ARM, Service.PAUSE_REPLAY, Service.PAUSE_RIG)
-        plan = {Service.PLAN_PROCEDURE: PlanProcedure}
-        self.services = Services(node, {**dict.fromkeys(triggers, Trigger), **dict.fromkeys(switches, SetBool), **plan})
+        offered_by = ("coil_bridge", interface.PLANNER, "replay", RIG)
+        called = [each for each in Service if each.node in offered_by]
+        self.services = Services(node, {each: topics.ros_class(each.type_name) for each in called})
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)

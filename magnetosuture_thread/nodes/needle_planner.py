@@ -15,11 +15,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, EstimatedThread, PredictedThread, SafetyMargins, TrackerState
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
-from magnetosuture_msgs.srv import PlanProcedure
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 
 from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.estimator.disturbance import disturbance_text
@@ -81,7 +79,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
         self._read_sparingly(topics.PREDICTED_THREAD, self.on_prediction)
         self._read_sparingly(topics.ESTIMATED_THREAD, self.on_estimate)
         self._read_sparingly(topics.MARGINS, self.on_margins)
-        self.held(self.create_service(PlanProcedure, Service.PLAN_PROCEDURE, self.on_plan))
+        self.held(self.serve(Service.PLAN_PROCEDURE, self.on_plan))
         self._offer(Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person"))
         self._offer(Service.RESUME_PROCEDURE, self.resume_procedure)
         self._offer(Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person"))
@@ -225,8 +223,8 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
 
         self.held(topic.subscribe(self, self.while_active(take), raw=True))
 
-    def _offer(self, name: str, execute: Callable[[], bool]) -> None:
-        self.held(self.create_service(Trigger, name, partial(self._serve, execute)))
+    def _offer(self, service: Service, execute: Callable[[], bool]) -> None:
+        self.held(self.serve(service, partial(self._serve, execute)))
 
     def _serve(self, execute: Callable[[], bool], request: Any, answer: Any) -> Any:
         self.require_active()

@@ -29,7 +29,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
 from magnetosuture_thread.compiled import compilations
 from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.errors import GraphError
@@ -213,6 +213,10 @@ class GuardedNode(Node):
 
     def finish(self) -> None:
         """Publish what others must know before the node ends in order; the graph is still there."""
+
+    def serve(self, service: interface.Service, callback: Callable[[Any, Any], Any]) -> Service:
+        """Offer a service."""
+        return self.create_service(topics.ros_class(service.type_name), service, callback)
 
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service whose callback may raise."""

@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 import rclpy.time
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool
 
 from magnetosuture_thread import InvalidInputError, interface
 from magnetosuture_thread.errors import GraphError
@@ -143,7 +142,7 @@ class LiveReplay:
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
         self._stack = ExitStack()
         self._node = self._stack.enter_context(joined(name="replay", domain=domain))
-        self._node.create_service(SetBool, interface.Service.PAUSE_REPLAY, self._on_pause)
+        self._node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
         # A quality of service that waits for slow readers: only the replay has time to.
         reliable: dict[str, Any] = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}

@@ -14,7 +14,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
-from std_srvs.srv import SetBool
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
 from magnetosuture_thread.messages.packing import camera_outputs, ground_truth_outputs, packed_image
@@ -57,7 +56,7 @@ class RigSimulatorNode(GuardedNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.time = Timeline(EPOCH if self._simulated else self.get_clock().now().nanoseconds, rate)
         self.time.begin()
-        self.create_service(SetBool, interface.Service.PAUSE_RIG, self.time.on_pause)
+        self.serve(interface.Service.PAUSE_RIG, self.time.on_pause)
         self._phase: float | None = None
         self._last_index, self._clock_stamp = -1, 0
         self._frames = self._skipped = 0

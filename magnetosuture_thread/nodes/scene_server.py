@@ -6,8 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
-
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.interface import SCENE_SERVER, Service
 from magnetosuture_thread.messages.markers import packed_scene_markers
@@ -33,14 +31,13 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
         self._editor = editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
         self._scenes = self.held(topics.SCENE.publisher(self))
         self._markers = self.held(topics.SCENE_MARKERS.publisher(self))
-        changes: tuple[tuple[Any, str, Callable[[Any], object]], ...] = (
-            (LoadScene, Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
-            (EditShape, Service.ADD_SHAPE, lambda asked: editor.add(asked.name, asked.shape)),
-            (EditShape, Service.REPLACE_SHAPE, lambda asked: editor.replace(asked.name, asked.shape)),
-            (RemoveShape, Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
-        )
-        for kind, name, change in changes:
-            self.held(self.create_service(kind, name, partial(self._change, change)))
+        for service, change in (
+            (Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
+            (Service.ADD_SHAPE, lambda asked: editor.add(asked.name, asked.shape)),
+            (Service.REPLACE_SHAPE, lambda asked: editor.replace(asked.name, asked.shape)),
+            (Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
+        ):
+            self.held(self.serve(service, partial(self._change, change)))
 
     def activate(self) -> None:
         """Publish the scene; inactive, others go on by what they have."""

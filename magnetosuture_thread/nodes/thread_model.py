@@ -14,7 +14,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import ThreadMaterial
-from magnetosuture_msgs.srv import ForecastPath
 
 from magnetosuture_thread import (
     Forecast,
@@ -299,7 +298,7 @@ class ThreadForecasts:
         self._published = node.held(topics.FORECAST.publisher(node))
         self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
-        node.held(node.create_service(ForecastPath, interface.Service.FORECAST_PATH, self.on_path))
+        node.held(node.serve(interface.Service.FORECAST_PATH, self.on_path))
         # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
         self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
         self._error: Exception | None = None

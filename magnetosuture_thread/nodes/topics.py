@@ -78,8 +78,7 @@ class Topic:
     @property
     def message(self) -> Any:
         """Return the message class."""
-        package, _, name = self.channel.type_name.split("/")
-        return getattr(import_module(f"{package}.msg"), name)
+        return ros_class(self.channel.type_name)
 
     def publisher(self, node: Node) -> Publisher:
         """Return a publisher whose reliability and depth can be overridden by parameters, as usual in ROS."""
@@ -145,6 +144,12 @@ class Topic:
             node.refuse(error)
         else:
             callback(message)
+
+
+def ros_class(type_name: str) -> Any:
+    """Return the class of a type, for example of `std_srvs/srv/SetBool`."""
+    package, kind, name = type_name.split("/")
+    return getattr(import_module(f"{package}.{kind}"), name)
 
 
 @cache

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -44,8 +45,9 @@ class Program:
         return [line for line in self.output.splitlines() if line.startswith("error: ")]
 
     def send_signal(self, which: signal.Signals) -> None:
-        """Send a signal."""
-        os.kill(self.pid, which)
+        """Send a signal, if it has not ended."""
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, which)
 
     def poll(self) -> int | None:
         """Return the exit code, None while it runs."""
@@ -76,7 +78,7 @@ class Program:
     def kill(self) -> None:
         """Kill it, as a crash would, if it has not ended."""
         if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+            self.send_signal(signal.SIGKILL)
             self.wait()
 
 
