@@ -39,15 +39,7 @@ PROCEDURES = ("dead_end", "figure_eight", "hernia", "slalom", "wrap_and_tighten"
 TOLERANCE = 1e-7  # m, rad or of the value itself
 # Of the machine, and not compared.
 TIMES = (
-    "step_time",
-    "step_median",
-    "step_p99",
-    "solve_time",
-    "wall",
-    "speed",
-    "seconds",
-    "latency",
-    "duration",
+    *("step_time", "step_median", "step_p99", "solve_time", "wall", "speed", "seconds", "latency", "duration"),
     "tracker",
 )
 

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from rich.table import Table
 
+from benchmarks.report import figures_table
 from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
@@ -185,17 +186,13 @@ def _sum(done: list[RandomMotion]) -> dict[str, Any]:
         "not_converged": sum(each.unconverged for each in done),
         "motions_crossed": sum(each.crossed > 0 for each in done),
         "free_us": 1e6 * float(np.median(free)),
-        "touching_us": 1e6 * float(np.median(touching)) if touching else None,
+        "touching_us": 1e6 * float(np.median(touching or [0.0])),
     }
 
 
 def self_contact_table(figures: dict[str, Any]) -> Table:
     """Return the figures as a table."""
-    table = Table(title="a thread that touches itself, random motions of the needle")
     names = ("motions", "motions_crossed", "steps", "touched", "refused", "not_converged", "free_us", "touching_us")
-    for name in ("thread", *(name.replace("_", " ") for name in names)):
-        table.add_column(name, justify="right")
-    for name, row in figures.items():
-        values = (row[key] for key in names)
-        table.add_row(name, *("-" if value is None else f"{value:.0f}" for value in values))
-    return table
+    columns = {"thread": "{thread}"} | {name.replace("_", " "): f"{{{name}:.0f}}" for name in names}
+    rows = [{"thread": name, **row} for name, row in figures.items()]
+    return figures_table("a thread that touches itself, random motions of the needle", rows, columns)

@@ -15,6 +15,7 @@ from magnetosuture_thread.calibration.parameters import (
     DAMPING,
     STIFFNESS_OVER_DRAG,
     STIFFNESS_WEIGHT,
+    WIDEST,
     Parameter,
     stiffness_over_drag,
     with_stiffness_over_drag,
@@ -30,10 +31,16 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Array = NDArray[np.float64]
 
+STARTS_SHARE = 0.2  # of the time of a search
 STARTS = tuple(10.0 ** (power / 1.5) for power in range(-3, 4))  # of the material's stiffness
 MAX_STARTS = 2  # of them, of each attachment, are fitted: the best local minima
 POOR, MUCH = 3.0, 1.0  # times the better error, and % of length more, where an attachment is given up after the starts
 WORSE_TIMES, WORSE_BY = 2.0, 0.05  # the same once the stiffness of each has been fitted
+PAPER_STARTS = {DAMPING: (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99), STIFFNESS_WEIGHT: (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)}
+FLOOR = 2e-3  # of the length
+MIN_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
+CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
+MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
 
 
 @dataclass(frozen=True)
@@ -126,9 +133,9 @@ class Objective:
         steps = lengths * np.where(x + lengths <= self._high, 1.0, -1.0)
         middle, *moved = self.residuals(x, *(x + np.diag(steps)))
         return [
-            np.stack([(end[run] - begin) / step for end, step in zip(moved, steps, strict=True)], axis=-1)
-            if moved
-            else np.empty((*begin.shape, 0))
+            np.array([(end[run] - begin) / step for end, step in zip(moved, steps, strict=True)])
+            .reshape(-1, *begin.shape)
+            .transpose(1, 2, 0)
             for run, begin in enumerate(middle)
         ]
 
@@ -197,36 +204,30 @@ def initial_guesses(
     bases, count = [replace(start, attachment=kind) for kind in kinds], len(replays.runs)
     if start.formulation == "paper":  # whose error has several minima in kappa and W_stiff
         tried = [start]
-        for parameter, values in (
-            (DAMPING, (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)),
-            (STIFFNESS_WEIGHT, (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)),
-        ):
+        for parameter, values in PAPER_STARTS.items():
             if parameter in parameters:
                 tried = [parameter.write(settings, value) for settings in tried for value in values]
-        replays.begin_stage("starts", count * len(tried))
-        replays.of(tried)
-        found = [min(tried, key=replays.error)]
-    elif STIFFNESS_OVER_DRAG in parameters:
-        tried = []
-        for base in bases:
-            low, high = STIFFNESS_OVER_DRAG.bounds(base)
-            stiffnesses = np.clip(np.array(STARTS) * stiffness_over_drag(base), low, high).tolist()
-            tried += [with_stiffness_over_drag(base, stiffness) for stiffness in stiffnesses]
-        replays.begin_stage("starts", count * len(bases) * (len(STARTS) + MAX_STARTS * 8))
+        with replays.stage(f"tried {len(tried)} starts", STARTS_SHARE, count * len(tried)):
+            replays.of(tried)
+        return [min(tried, key=replays.error)]
+    if STIFFNESS_OVER_DRAG not in parameters:
+        return bases
+    tried = []
+    for base in bases:
+        low, high = STIFFNESS_OVER_DRAG.bounds(base)
+        stiffnesses = np.clip(np.array(STARTS) * stiffness_over_drag(base), low, high).tolist()
+        tried += [with_stiffness_over_drag(base, stiffness) for stiffness in stiffnesses]
+    expected = count * len(bases) * (len(STARTS) + MAX_STARTS * 8)
+    with replays.stage(f"tried {len(tried)} starts", STARTS_SHARE, expected):
         replays.of(tried)  # at once, so that all cores have work
-        errors = np.array([replays.error(settings) for settings in tried]).reshape(len(bases), -1)
-        found = []
+        errors, found = np.reshape([replays.error(settings) for settings in tried], (len(bases), -1)), []
         for index in _not_much_worse(errors.min(axis=1).tolist(), POOR, MUCH):
             objectives = [
                 Objective(replays, tried[index * len(STARTS) + place], [STIFFNESS_OVER_DRAG], whole=True)
                 for place in local_minima(errors[index].tolist())[:MAX_STARTS]
             ]
             found.append(min((objective.fit() for objective in objectives), key=lambda fit: fit.cost).settings)
-        found = [found[i] for i in _not_much_worse([replays.error(s) for s in found], WORSE_TIMES, WORSE_BY)]
-    else:
-        return bases
-    replays.end_stage(f"tried {len(tried)} starts")
-    return found
+        return [found[i] for i in _not_much_worse([replays.error(s) for s in found], WORSE_TIMES, WORSE_BY)]
 
 
 def _not_much_worse(errors: Sequence[float], times: float, by: float) -> list[int]:
@@ -246,10 +247,18 @@ def local_minima(values: Sequence[float]) -> list[int]:
     return sorted(lows, key=lambda i: values[i]) or [0]
 
 
-FLOOR = 2e-3  # of the length
-MIN_BEND = 0.07  # of the length; silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
-CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
-MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
+class Identifiability(NamedTuple):
+    """Identifiability of one parameter, with its confidence interval.
+
+    Attributes:
+        reason: why it cannot be identified; empty if it can.
+        half: half of its 95 % interval, in the scale of the fit.
+        effect: of a change that counts, as a share of the length.
+    """
+
+    reason: str
+    half: float
+    effect: float
 
 
 class Uncertainty(NamedTuple):
@@ -313,20 +322,6 @@ def _own_effect(flat: Array, weights: Array, index: int) -> float:
     return float(np.abs(own).mean())
 
 
-class Identifiability(NamedTuple):
-    """Identifiability of one parameter, with its confidence interval.
-
-    Attributes:
-        reason: why it cannot be identified; empty if it can.
-        half: half of its 95 % interval, in the scale of the fit.
-        effect: of a change that counts, as a share of the length.
-    """
-
-    reason: str
-    half: float
-    effect: float
-
-
 def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:
     """Return the identifiability of each parameter of a solution.
 
@@ -347,9 +342,9 @@ def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -
         half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
         pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
         if pairs.max() <= 0.95:
-            for place, index in enumerate(left):
-                reason = _too_short(solution, index, runs) or _reason(solution, index, effect[place], half[place])
-                found[index] = Identifiability(reason, half[place], effect[place])
+            for index, own_half, own_effect in zip(left, half, effect, strict=True):
+                reason = _reason(solution, index, own_effect, own_half, runs)
+                found[index] = Identifiability(reason, own_half, own_effect)
             break
         one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
         name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
@@ -358,28 +353,20 @@ def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -
     return [found[index] for index in range(len(parameters))]
 
 
-def _reason(solution: FitSolution, index: int, effect: float, half: float) -> str:
-    parameter, settings = solution.parameters[index], solution.settings
+def _reason(solution: FitSolution, index: int, effect: float, half: float, runs: Sequence[RecordedRun]) -> str:
+    """Return why a parameter cannot be identified; empty if it can."""
+    parameter, settings, x = solution.parameters[index], solution.settings, float(solution.x[index])
+    length, speed, is_plain = settings.thread_length, min(run.speed for run in runs), parameter.kind == "plain"
+    if parameter is STIFFNESS_OVER_DRAG and speed > 0.0:
+        bend = float(np.cbrt(parameter.from_fit(x) / speed))
+        if bend < MIN_BEND * length:
+            part = f"{1e3 * bend:.1f} mm, {bend / length:.1%} of the thread"
+            return f"bending acts within {part} only; elsewhere it goes where it is pulled, however stiff"
     if effect < FLOOR:
-        change = (
-            f"{parameter.counts(settings):.3g} {parameter.unit}" if parameter.kind == "plain" else "a factor of two"
-        )
+        change = f"{parameter.counts(settings):.3g} {parameter.unit}" if is_plain else "a factor of two"
         moved = f"{change} moves the prediction by {100.0 * effect:.2g} % of the length only"
         return f"{moved}, less than the {100.0 * FLOOR:g} % that camera, tracker and model are wrong by"
-    if half > parameter.widest(settings):
-        low, high = parameter.interval(float(solution.x[index]), half)
+    if half > (parameter.counts(settings) if is_plain else WIDEST):
+        low, high = parameter.interval(x, half)
         return f"its 95 % interval is {low:.3g} to {high:.3g} {parameter.unit}".rstrip() + ", too wide to be of use"
     return ""
-
-
-def _too_short(solution: FitSolution, index: int, runs: Sequence[RecordedRun]) -> str:
-    """Return in words that the stiffness acts on too small a part of the thread; empty if it does not."""
-    parameter, length = solution.parameters[index], solution.settings.thread_length
-    speed = min(run.speed for run in runs)
-    if parameter is not STIFFNESS_OVER_DRAG or speed <= 0.0:
-        return ""
-    bend = float(np.cbrt(parameter.from_fit(float(solution.x[index])) / speed))
-    if bend >= MIN_BEND * length:
-        return ""
-    part = f"{1e3 * bend:.1f} mm, {bend / length:.1%} of the thread"
-    return f"bending acts within {part} only; elsewhere it goes where it is pulled, however stiff"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -42,7 +42,7 @@ class Parameter:
         unit: of its value.
         kind: `log`: x = ln value, for what is positive; `plain`: x = value; `lost`: x = ln (1 - value).
         bounds: least and greatest value.
-        counts: a change of x that counts: a factor of two, or what is said of it.
+        counts_of: the change of x that counts; a factor of two if None.
         getter: its value in settings, if it is not the setting itself.
         setter: settings with another value, likewise.
     """
@@ -52,9 +52,13 @@ class Parameter:
     unit: str
     kind: str
     bounds: Callable[[Settings], tuple[float, float]]
-    counts: Callable[[Settings], float] = field(default=lambda settings: math.log(2.0))
+    counts_of: Callable[[Settings], float] | None = None
     getter: Callable[[Settings], float] | None = None
     setter: Callable[[Settings, float], Settings] | None = None
+
+    def counts(self, settings: Settings) -> float:
+        """Return the change of x that counts."""
+        return math.log(2.0) if self.counts_of is None else self.counts_of(settings)
 
     def read(self, settings: Settings) -> float:
         """Return its value in settings."""
@@ -62,11 +66,10 @@ class Parameter:
 
     def write(self, settings: Settings, value: float) -> Settings:
         """Return settings with another value."""
-        return _replaced(settings, self.setting, value) if self.setter is None else self.setter(settings, value)
-
-    def widest(self, settings: Settings) -> float:
-        """Return half of a 95 % interval of x beyond which the parameter counts as unknown."""
-        return self.counts(settings) if self.kind == "plain" else WIDEST
+        if self.setter is not None:
+            return self.setter(settings, value)
+        changes: dict[str, Any] = {self.setting: value}
+        return replace(settings, **changes)
 
     def to_fit(self, value: float) -> float:
         """Return x of a value."""
@@ -82,25 +85,14 @@ class Parameter:
 
     def fit_bounds(self, settings: Settings) -> tuple[float, float]:
         """Return least and greatest x."""
-        low, high = sorted(self.to_fit(value) for value in self.bounds(settings))
+        low, high = sorted(map(self.to_fit, self.bounds(settings)))
         return low, high
-
-    def reset(self, settings: Settings, start: Settings) -> Settings:
-        """Return settings with this parameter taken from other settings."""
-        if self.setting == OFFSET:
-            return self.write(settings, self.read(start))
-        return _replaced(settings, self.setting, getattr(start, self.setting))
 
     def interval(self, x: float, half: float) -> tuple[float, float]:
         """Return the ends of x - half ... x + half as values, the lower one first."""
-        ends = (x - half, x + half) if self.kind == "plain" else (max(x - half, -LOGARITHM), min(x + half, LOGARITHM))
-        low, high = sorted(self.from_fit(end) for end in ends)
+        limit = math.inf if self.kind == "plain" else LOGARITHM
+        low, high = sorted(map(self.from_fit, (max(x - half, -limit), min(x + half, limit))))
         return low, high
-
-
-def _replaced(settings: Settings, field: str, value: Any) -> Settings:
-    changes: dict[str, Any] = {field: value}
-    return replace(settings, **changes)
 
 
 def stiffness_over_drag(settings: Settings) -> float:
@@ -140,9 +132,7 @@ def _offset(index: int, name: str) -> Parameter:
         most = min(0.01, MAX_OFFSET * settings.thread_length)
         return -most, most
 
-    def counts(settings: Settings) -> float:
-        return OFFSET_COUNTS * settings.thread_length
-
+    counts = lambda settings: OFFSET_COUNTS * settings.thread_length  # noqa: E731
     return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, counts, read, write)
 
 
@@ -179,12 +169,6 @@ OF_FORMULATION: dict[str, tuple[Parameter, ...]] = {
 }
 
 
-def known_settings(formulation: str) -> tuple[str, ...]:
-    """Return the names of the settings that can be fitted in a formulation."""
-    names = dict.fromkeys(parameter.setting for parameter in OF_FORMULATION[formulation])
-    return (*names, ATTACHMENT) if formulation == "rod" else tuple(names)
-
-
 def choose_parameters(formulation: str, names: Sequence[str] = ()) -> tuple[tuple[Parameter, ...], bool]:
     """Return the parameters to fit, and whether the attachment is one of them.
 
@@ -195,7 +179,9 @@ def choose_parameters(formulation: str, names: Sequence[str] = ()) -> tuple[tupl
     Raises:
         ConfigurationError: a name is none of those.
     """
-    known = known_settings(formulation)
+    known = dict.fromkeys(parameter.setting for parameter in OF_FORMULATION[formulation])
+    if formulation == "rod":
+        known[ATTACHMENT] = None
     for name in names:
         if name not in known:
             close = get_close_matches(name, known, n=1)

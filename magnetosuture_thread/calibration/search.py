@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import stdtrit
@@ -21,7 +21,6 @@ from magnetosuture_thread.calibration.fit import (
 from magnetosuture_thread.calibration.parameters import (
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
-    Parameter,
     choose_parameters,
 )
 from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, Replays, RunTasks, mean_across
@@ -84,12 +83,37 @@ def calibrate(
     parameters, both = choose_parameters(settings.formulation, names)
     if settings.medium != "liquid":
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
-    replays = Replays(runs, run_tasks, best, progress, log)
     for scene in dict.fromkeys(run.scene for run in runs):
         ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
-    result = _Search(replays, settings, parameters, both).go()
+    replays, count = Replays(runs, run_tasks, best, progress, log), len(runs)
+    replays.error(settings)
+    candidates = initial_guesses(replays, settings, parameters, both)
+    with replays.stage("fitted all that is unknown", 0.4, count * len(candidates) * 6 * (len(parameters) + 1)):
+        solutions = [_robust_fit(Objective(replays, candidate, parameters)) for candidate in candidates]
+        solution, attachment = _choose_attachment(replays, solutions, settings) if both else (solutions[0], None)
+    found = assess_identifiability(solution, runs)
+    with replays.stage("fitted what can be identified", 0.15, count * 4 * len(parameters)):
+        fitted, statuses = _fit_identified(replays, solution, found, settings)
+    held_out: list[Points | None] = [None] * count
+    if count > 1:
+        free = [parameter for parameter, status in zip(parameters, statuses, strict=True) if status != FIXED]
+        with replays.stage("predicted each bag by the others", 0.25, count * (count - 1) * 3 * (len(free) + 1)):
+            for index in range(count):
+                others = Objective(replays, fitted, free, [other for other in range(count) if other != index])
+                held_out[index] = replays.of([others.fit(scale=solution.scale).settings], [index])[0][0]
+    before, after = replays.of([settings, fitted])
+    fits = [BagFit(*parts) for parts in zip(runs, before, after, held_out, strict=True)]
+    estimates = []
+    for index, (parameter, each, status) in enumerate(zip(parameters, found, statuses, strict=True)):
+        value, low, high = parameter.read(fitted), math.nan, math.nan
+        if np.isfinite(each.half):
+            middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
+            low, high = parameter.interval(middle, each.half)
+        values, effect = (value, parameter.read(settings), low, high), 100.0 * each.effect
+        named = parameter.name, parameter.setting, parameter.unit
+        estimates.append(Estimate(*named, *values, status, each.reason, effect, parameter.kind == "log"))
     progress(1.0)
-    return result
+    return CalibrationResult.of(fitted, fits, estimates, attachment, replays.best.replays), fits
 
 
 def unfinished_result(
@@ -104,9 +128,9 @@ def unfinished_result(
     """
     found = best.settings or settings
     parameters = [p for p in OF_FORMULATION[settings.formulation] if p.read(found) != p.read(settings)]
-    estimates = tuple(
+    estimates = [
         Estimate(p.name, p.setting, p.unit, p.read(found), p.read(settings), status=UNFINISHED) for p in parameters
-    )
+    ]
     attachment = None
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
@@ -114,121 +138,68 @@ def unfinished_result(
     return CalibrationResult.of(found, fits, estimates, attachment, best.replays, finished=False), fits
 
 
-@dataclass
-class _Search:
-    replays: Replays
-    start: ThreadModelSettings
-    parameters: tuple[Parameter, ...]
-    both: bool
+def _robust_fit(objective: Objective) -> FitSolution:
+    """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
+    scale = robust_scale(objective.residuals(objective.start())[0])
+    solution = objective.fit(scale=scale)
+    narrower = robust_scale(solution.residuals)
+    return objective.fit(solution.x, narrower) if narrower < 0.5 * scale else solution
 
-    def go(self) -> tuple[CalibrationResult, list[BagFit]]:
-        runs, count = self.replays.runs, len(self.replays.runs)
-        self.replays.error(self.start)
-        candidates = initial_guesses(self.replays, self.start, self.parameters, self.both)
-        self.replays.begin_stage("fit", count * len(candidates) * 6 * (len(self.parameters) + 1))
-        solutions = [self._fitted(Objective(self.replays, settings, self.parameters)) for settings in candidates]
-        solution, attachment = self._attached(solutions)
-        self.replays.end_stage("fitted all that is unknown")
-        found = assess_identifiability(solution, runs)
-        self.replays.begin_stage("identified", count * 4 * len(self.parameters))
-        settings, statuses = self._identified(solution, found)
-        self.replays.end_stage("fitted what can be identified")
-        fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-        held_out: list[Points | None] = [None] * count
-        if count > 1:
-            self.replays.begin_stage("held out", count * (count - 1) * 3 * (len(fitted) + 1))
-            held_out = [self._held_out(settings, fitted, solution.scale, index) for index in range(count)]
-            self.replays.end_stage("predicted each bag by the others")
-        before, after = self.replays.of([self.start, settings])
-        fits = [BagFit(*parts) for parts in zip(runs, before, after, held_out, strict=True)]
-        estimates = tuple(
-            self._estimate(solution, index, each, status, settings)
-            for index, (each, status) in enumerate(zip(found, statuses, strict=True))
-        )
-        return CalibrationResult.of(settings, fits, estimates, attachment, self.replays.best.replays), fits
 
-    def _fitted(self, objective: Objective) -> FitSolution:
-        """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
-        scale = robust_scale(objective.residuals(objective.start())[0])
-        solution = objective.fit(scale=scale)
-        narrower = robust_scale(solution.residuals)
-        return objective.fit(solution.x, narrower) if narrower < 0.5 * scale else solution
+def _choose_attachment(
+    replays: Replays, solutions: Sequence[FitSolution], start: ThreadModelSettings
+) -> tuple[FitSolution, AttachmentDecision]:
+    """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
 
-    def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
-        """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
-        if not self.both:
-            return solutions[0], None
-        errors = {s.settings.attachment: self.replays.error(s.settings) for s in solutions}
-        best = min(solutions, key=lambda s: float(np.mean(self._blocks(s))))
-        if len(solutions) == 1:
-            return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors)
-        other = next(s for s in solutions if s is not best)
-        difference = self._blocks(other) - self._blocks(best)
-        middle, count = float(difference.mean()), len(difference)
-        half = float(stdtrit(count - 1, 0.975) * difference.std(ddof=1) / np.sqrt(count))
-        reason = ""
-        if middle < max(MIN_IMPROVEMENT, half):
-            reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
-            best = next(s for s in solutions if s.settings.attachment == self.start.attachment)
-        return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors, reason)
-
-    def _blocks(self, solution: FitSolution) -> Array:
+    def blocks(solution: FitSolution) -> Array:
         """Return the mean distance across the thread in each block of time of each run [% of length]."""
         result = []
-        for residual, run in zip(solution.residuals, self.replays.runs, strict=True):
+        for residual, run in zip(solution.residuals, replays.runs, strict=True):
             block, sizes = run.blocks, 100.0 * np.abs(residual)
             result += [float(sizes[block == k][run.known[block == k]].mean()) for k in np.unique(block)]
         return np.array(result)
 
-    def _identified(
-        self, solution: FitSolution, found: Sequence[Identifiability]
-    ) -> tuple[ThreadModelSettings, list[str]]:
-        """Return the fit of what can be identified, and what became of each number."""
-        statuses = [self._status(solution, index, each) for index, each in enumerate(found)]
-        if not any(each.reason for each in found):
-            return solution.settings, statuses
-        spare = [index for index, status in enumerate(statuses) if status == FIXED]
-        spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
-        most = self._error(solution.settings) + GIVEN_WAY
-        while True:
-            base = solution.settings
-            for parameter, status in zip(self.parameters, statuses, strict=True):
-                base = base if status != FIXED else parameter.reset(base, self.start)
-            fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-            settings = Objective(self.replays, base, fitted).fit(scale=solution.scale).settings if fitted else base
-            if self._error(settings) <= most or not spare:
-                return settings, statuses
-            statuses[spare.pop(0)] = STAND_IN
+    errors = {s.settings.attachment: replays.error(s.settings) for s in solutions}
+    best, *others = sorted(solutions, key=lambda s: float(blocks(s).mean()))
+    reason = ""
+    for other in others:
+        difference = blocks(other) - blocks(best)
+        middle, count = float(difference.mean()), len(difference)
+        half = float(stdtrit(count - 1, 0.975) * difference.std(ddof=1) / np.sqrt(count))
+        if middle < max(MIN_IMPROVEMENT, half):
+            reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
+            best = next(s for s in solutions if s.settings.attachment == start.attachment)
+    return best, AttachmentDecision(best.settings.attachment, start.attachment, errors, reason)
 
-    def _status(self, solution: FitSolution, index: int, each: Identifiability) -> str:
-        """Return what becomes of a number at first: the setup's is kept unless the data contradict it."""
-        if not each.reason:
-            return IDENTIFIED
-        parameter = self.parameters[index]
-        off = abs(parameter.to_fit(parameter.read(self.start)) - float(solution.x[index]))
-        return STAND_IN if off > each.half else FIXED
 
-    def _error(self, settings: ThreadModelSettings) -> float:
+def _fit_identified(
+    replays: Replays, solution: FitSolution, found: Sequence[Identifiability], start: ThreadModelSettings
+) -> tuple[ThreadModelSettings, list[str]]:
+    """Return the fit of what can be identified, and what became of each number.
+
+    What cannot be identified stays as the setup has it, unless the data contradict that, or predictions get worse.
+    """
+    parameters, statuses = solution.parameters, []
+    for parameter, x, each in zip(parameters, solution.x.tolist(), found, strict=True):
+        is_contradicted = abs(parameter.to_fit(parameter.read(start)) - x) > each.half
+        statuses.append(IDENTIFIED if not each.reason else STAND_IN if is_contradicted else FIXED)
+    if not any(each.reason for each in found):
+        return solution.settings, statuses
+
+    def error(settings: ThreadModelSettings) -> float:
         """Return the mean distance across the thread [% of length]."""
-        pairs = zip(self.replays.of([settings])[0], self.replays.runs, strict=True)
-        return float(np.mean([mean_across(v, p, settings.thread_length) for v, p in pairs]))
+        pairs = zip(replays.of([settings])[0], replays.runs, strict=True)
+        return float(np.mean([mean_across(v, run, settings.thread_length) for v, run in pairs]))
 
-    def _held_out(self, settings: ThreadModelSettings, fitted: Sequence[Parameter], scale: float, index: int) -> Points:
-        """Return what is predicted of a run by a fit to the others."""
-        others = [other for other in range(len(self.replays.runs)) if other != index]
-        if fitted:
-            settings = Objective(self.replays, settings, fitted, others).fit(scale=scale).settings
-        return self.replays.of([settings], [index])[0][0]
-
-    def _estimate(
-        self, solution: FitSolution, index: int, each: Identifiability, status: str, settings: ThreadModelSettings
-    ) -> Estimate:
-        parameter = self.parameters[index]
-        value = parameter.read(settings)
-        low = high = math.nan
-        if np.isfinite(each.half):
-            middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
-            low, high = parameter.interval(middle, each.half)
-        start, effect = parameter.read(self.start), 100.0 * each.effect
-        named = parameter.name, parameter.setting, parameter.unit
-        return Estimate(*named, value, start, low, high, status, each.reason, effect, parameter.kind == "log")
+    spare = [index for index, status in enumerate(statuses) if status == FIXED]
+    spare.sort(key=lambda i: (parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
+    most = error(solution.settings) + GIVEN_WAY
+    while True:
+        base = replace(start, attachment=solution.settings.attachment)
+        fitted = [parameter for parameter, status in zip(parameters, statuses, strict=True) if status != FIXED]
+        for parameter in fitted:
+            base = parameter.write(base, parameter.read(solution.settings))
+        settings = Objective(replays, base, fitted).fit(scale=solution.scale).settings if fitted else base
+        if error(settings) <= most or not spare:
+            return settings, statuses
+        statuses[spare.pop(0)] = STAND_IN

@@ -178,7 +178,7 @@ def _consistency_lines(
     mean = [("mean", f"mean over {found.width:.1f} s", "ink", "", 1.0)]
     lines += _lines({"mean": _paired(found.means, found.means)}, mean, at="windows")
     top = max(2.5, 1.1 * float(np.nanmax(found.means)), float(np.nanpercentile(columns["innovation_squared"], 98)))
-    return _paired(found.begins, found.ends), lines, round(top, 2)
+    return _paired(found.begins, found.begins + found.width), lines, round(top, 2)
 
 
 def _paired(first: Array, second: Array) -> Array:
@@ -208,14 +208,9 @@ def thinned(times: Array, columns: Mapping[str, Array], limit: int) -> tuple[Arr
     values = np.array(list(columns.values())).reshape(len(columns), len(times))
     if (count := len(times)) > limit:
         run = -(-count // (limit // 2))
-        runs = -(-count // run)
-        padded = np.full((len(columns), runs * run), np.nan)
-        padded[:, :count] = values
-        table = padded.reshape(len(columns), runs, run)
-        low, high = np.nan_to_num(table, nan=np.inf).argmin(axis=2), np.nan_to_num(table, nan=-np.inf).argmax(axis=2)
-        pair = np.stack([np.minimum(low, high), np.maximum(low, high)], axis=2)
-        values = np.take_along_axis(table, pair, axis=2).reshape(len(columns), 2 * runs)
-        first = np.arange(runs) * run
+        first = np.arange(0, count, run)
+        low, high = (extreme.reduceat(values, first, axis=1) for extreme in (np.fmin, np.fmax))  # nan if all are
+        values = np.stack([low, high], axis=2).reshape(len(columns), 2 * len(first))
         times = _paired(times[first], times[np.minimum(first + run // 2, count - 1)])
     times, values = with_gaps(times, values)
     return times, dict(zip(columns, values, strict=True))
