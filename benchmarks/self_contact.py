@@ -126,16 +126,8 @@ def move_model(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotio
 
 def move_rig(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotion:
     """Return what the same motion of the simulated rig's thread comes to."""
-    thread = ThreadProperties(
-        length=LENGTH,
-        segments=SEGMENTS,
-        bending_stiffness=STIFFNESS,
-        stretching_stiffness=STRETCHING,
-        drag_across=DRAG,
-        drag_along=0.5 * DRAG,
-        attachment=NeedleJoint.PINNED,
-        diameter=DIAMETER,
-    )
+    rod = LENGTH, SEGMENTS, STIFFNESS, STRETCHING, DRAG, 0.5 * DRAG
+    thread = ThreadProperties(*rod, NeedleJoint.PINNED, diameter=DIAMETER)
     surface, body = Surface(wall_radius=0.5 * DISH, self_contact=self_contact), NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0)
     rig = RigDynamics(body, thread, surface, None, np.zeros(2), 0.0, start_nodes(), largest_step=4e-3)
 

@@ -23,11 +23,6 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"
-WIDEST = math.log(1.5)  # of a logarithm: half an interval beyond says nothing of use
-LOGARITHM = 700.0  # whose exponential is a number yet
-STIFFNESS_RANGE = 1e3  # B is looked for within this factor of the material's
-OFFSET_COUNTS, MAX_OFFSET = 0.01, 0.1  # of the thread's length
-MIN_WEIGHT, MAX_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
 
 Settings = ThreadModelSettings
 
@@ -42,7 +37,6 @@ class Parameter:
         unit: of its value.
         kind: `log`: x = ln value, for what is positive; `plain`: x = value; `lost`: x = ln (1 - value).
         bounds: least and greatest value.
-        counts_of: the change of x that counts; a factor of two if None.
         getter: its value in settings, if it is not the setting itself.
         setter: settings with another value, likewise.
     """
@@ -52,13 +46,13 @@ class Parameter:
     unit: str
     kind: str
     bounds: Callable[[Settings], tuple[float, float]]
-    counts_of: Callable[[Settings], float] | None = None
     getter: Callable[[Settings], float] | None = None
     setter: Callable[[Settings, float], Settings] | None = None
 
     def counts(self, settings: Settings) -> float:
-        """Return the change of x that counts."""
-        return math.log(2.0) if self.counts_of is None else self.counts_of(settings)
+        """Return the change of x that counts: a factor of two, 1 % of the length, or one radian on all of it."""
+        length = settings.thread_length
+        return {"m": 0.01 * length, "1/m": 1.0 / length}.get(self.unit, math.log(2.0))
 
     def read(self, settings: Settings) -> float:
         """Return its value in settings."""
@@ -90,7 +84,7 @@ class Parameter:
 
     def interval(self, x: float, half: float) -> tuple[float, float]:
         """Return the ends of x - half ... x + half as values, the lower one first."""
-        limit = math.inf if self.kind == "plain" else LOGARITHM
+        limit = math.inf if self.kind == "plain" else 700.0  # whose exponential is a number yet
         low, high = sorted(map(self.from_fit, (max(x - half, -limit), min(x + half, limit))))
         return low, high
 
@@ -111,7 +105,7 @@ def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
     middle = stiffness_over_drag(replace(settings, elastic_modulus=0.0))  # the material's
     # Just within what a setup may say [Pa].
     most = stiffness_over_drag(replace(settings, elastic_modulus=0.99e12))
-    return middle / STIFFNESS_RANGE, min(middle * STIFFNESS_RANGE, most)
+    return 1e-3 * middle, min(1e3 * middle, most)
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:
@@ -129,11 +123,10 @@ def _offset(index: int, name: str) -> Parameter:
         return replace(settings, attachment_offset=tuple(both) if any(both) else ())
 
     def bounds(settings: Settings) -> tuple[float, float]:
-        most = min(0.01, MAX_OFFSET * settings.thread_length)
+        most = min(0.01, 0.1 * settings.thread_length)
         return -most, most
 
-    counts = lambda settings: OFFSET_COUNTS * settings.thread_length  # noqa: E731
-    return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, counts, read, write)
+    return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, read, write)
 
 
 STIFFNESS_OVER_DRAG = Parameter(
@@ -146,21 +139,14 @@ STIFFNESS_OVER_DRAG = Parameter(
     setter=with_stiffness_over_drag,
 )
 DRAG_ANISOTROPY = Parameter("drag anisotropy", "drag_anisotropy", "", "log", lambda settings: (0.05, 1.0))
-REST_CURVATURE = Parameter(
-    "rest curvature",
-    "rest_curvature",
-    "1/m",
-    "plain",
-    _curvature_bounds,
-    lambda settings: 1.0 / settings.thread_length,  # by which the thread turns by one radian on its whole length
-)
+REST_CURVATURE = Parameter("rest curvature", "rest_curvature", "1/m", "plain", _curvature_bounds)
 DAMPING = Parameter("kappa", "paper_damping", "", "lost", lambda settings: (0.0, 0.999))
 STIFFNESS_WEIGHT = Parameter(
     "W_stiff",
     "paper_stiffness_weight",
     "",
     "log",
-    lambda settings: (MIN_WEIGHT, MAX_WEIGHT),
+    lambda settings: (1e-6, 1e7),  # beyond, every step needs another solver
     getter=lambda settings: settings.paper_stiffness_weight or MATERIALS[settings.material].stiffness_weight,
 )
 OF_FORMULATION: dict[str, tuple[Parameter, ...]] = {

@@ -21,16 +21,15 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import InitialObservation, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
-from magnetosuture_thread.workers import WorkerDiedError, make_runner
+from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it
 MAX_FRAMES = 600  # compared, evenly over the run; every pose is replayed
 MIN_DURATION = 3.0  # s
 MIN_FRAMES = 20  # compared
 GAP = 500_000_000  # ns without a needle, after which the thread's way is not known
-SMOOTHED, STEPS = 1.0, 0.5  # s; over which the thread is averaged to tell whether it moves, and the needle how fast
 BLOCKS = 10  # of time, in each of which residuals are taken to be alike
-STILL, SLOW = 0.02, 0.15  # of the thread's length, by which some point of it moves
+SLOW = 0.15  # of the thread's length, by which some point of it moves
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,9 @@ class RecordedRun:
 
         The upper quartile over steps of half a second, so that a needle that stops now and then counts as it goes.
         """
-        parts = ((self.stamps - self.stamps[0]) * 1e-9 / STEPS).astype(int)
+        parts = ((self.stamps - self.stamps[0]) * 1e-9 / 0.5).astype(int)
         means = np.array([self.tails[parts == part].mean(axis=0) for part in np.unique(parts)])
-        steps = np.linalg.norm(np.diff(means, axis=0), axis=1) / STEPS
+        steps = np.linalg.norm(np.diff(means, axis=0), axis=1) / 0.5
         return float(np.percentile(steps, 75.0)) if len(steps) else 0.0
 
 
@@ -186,7 +185,7 @@ def read_run(
     )
     moved = _moved(run) / length
     if moved < SLOW:
-        why = "nothing moves" if moved < STILL else "the needle is too slow"
+        why = "nothing moves" if moved < 0.02 else "the needle is too slow"
         words = f"needle and thread move by {moved:.1%} of the thread's length in {duration:.0f} s"
         raise BagError(name, f"{why}: {words}, expected {SLOW:.0%} and more")
     return run
@@ -194,7 +193,7 @@ def read_run(
 
 def _moved(run: RecordedRun) -> float:
     """Return the diagonal of the box that the needle or a node moves in [m]; means over a second leave noise out."""
-    parts = (run.times / SMOOTHED).astype(int)
+    parts = (run.times).astype(int)
     nodes = np.concatenate([run.tails[run.frames][:, None], run.targets], axis=1)
     means = np.array(
         [np.ma.masked_invalid(nodes[parts == part]).mean(axis=0).filled(np.nan) for part in np.unique(parts)]
@@ -260,9 +259,7 @@ def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") 
         yield run
 
 
-def _run_task(
-    runs: Sequence[RecordedRun], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
-) -> Points:
+def _run_task(runs: Sequence[RecordedRun], task: Task, log: Log, progress: Progress) -> Points:
     index, settings = task
     return replay_with_parameters(runs[index], settings)
 
@@ -348,23 +345,23 @@ class Replays:
         runs: the recorded runs.
         run_tasks: gives the predicted nodes of tasks, in their order; here, one after the other, if None.
         best: is updated with every whole set of replays.
-        progress: called with the share done, which never falls.
+        expected: how many replays the search takes, roughly.
+        progress: called with the share of these that is done.
         log: called with a line at the end of each stage.
     """
 
     def __init__(
         self,
         runs: Sequence[RecordedRun],
-        run_tasks: RunTasks | None = None,
-        best: BestSettings | None = None,
-        progress: Callable[[float], None] = lambda share: None,
-        log: Callable[[str], None] = lambda line: None,
+        run_tasks: RunTasks | None,
+        best: BestSettings | None,
+        expected: int,
+        progress: Progress,
+        log: Log,
     ) -> None:
         self.runs, self.best = tuple(runs), best or BestSettings()
         self._run_tasks = run_tasks or self._run_here
-        self._progress, self._log = progress, log
-        self._begin = self._width = 0.0
-        self._done, self._expected = 0, 1
+        self._expected, self._progress, self._log = expected, progress, log
         self._known: dict[Task, Points] = {}
         self._errors: dict[ThreadModelSettings, float] = {}
 
@@ -383,8 +380,7 @@ class Replays:
         if len(chosen) == len(self.runs):
             for settings, vertices in zip(many, result, strict=True):
                 self._keep_best(settings, vertices)
-        self._done += len(missing)
-        self._progress(self._begin + self._width * self._done / (self._done + self._expected))
+        self._progress(min(0.99, self.best.replays / self._expected))
         return result
 
     def _keep_best(self, settings: ThreadModelSettings, vertices: list[Points]) -> None:
@@ -402,19 +398,8 @@ class Replays:
             self.of([settings])
         return self._errors[settings]
 
-    @contextmanager
-    def stage(self, result: str, share: float, replays: int) -> Iterator[None]:
-        """Run a stage of the search, and log what came of it.
-
-        Args:
-            result: what the stage does, for the log.
-            share: of the time that it takes.
-            replays: about how many it takes.
-        """
-        self._begin += self._width
-        self._width, self._done, self._expected = share, 0, max(1, replays)
-        self._progress(self._begin)
-        yield
+    def report(self, result: str) -> None:
+        """Log what a stage of the search came to."""
         error, count = self.best.error, self.best.replays
         self._log(f"{result}; least distance of the nodes {error:.3g} % of the length after {count} replays")
 

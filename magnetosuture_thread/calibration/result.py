@@ -19,7 +19,6 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
-WIDTH = 118
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
     "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
@@ -270,7 +269,7 @@ def _before_and_after(before: float, after: float, held_out: float) -> str:
 
 
 def _comment(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+    return textwrap.wrap(text, 118, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
 
 
 def _entry(name: str, value: Any, note: str = "") -> str:

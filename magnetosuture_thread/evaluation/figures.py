@@ -22,7 +22,6 @@ from magnetosuture_thread.thread.margins import SOLID
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
 AGAINST = {"truth": "the ground truth", "seen": "the measured centreline"}
 EXACT = 1e-3  # of a segment's length: what the solvers' tolerance leaves
-TOUCH = 1e-6  # m; a node this deep in an obstacle still counts as touching it
 # Of threads on light and on dark ground, told apart by red-green blind readers too; as on the operator's page.
 COLOURS = {
     "measured": ("#2f7bff", "#5b8cff"),
@@ -261,7 +260,7 @@ def _margin(about: BagDetails, metrics: RunMetrics) -> Headline:
 
 def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
     """Return what a margin may be at the least, within the solvers' tolerance [m]."""
-    return -TOUCH if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
+    return -1e-6 if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
 
 
 def _holds(about: BagDetails, least: MinimumMargin) -> bool:

@@ -25,11 +25,6 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
 from magnetosuture_thread.thread_observation import ThreadObservation
 
-TRACKED = 1  # as in the message TrackerState
-CURRENTS_IN_FORCE = 50_000_000  # ns; as long as they are published
-WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
-WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
-
 
 @dataclass(frozen=True)
 class CurrentDifference:
@@ -73,7 +68,7 @@ class CurrentSeries:
         pairs = [
             (self._received[stamp], recorded._received[int(stamps[index])])
             for stamp, index in zip(own, latest, strict=True)
-            if index >= 0 and stamp - stamps[index] <= CURRENTS_IN_FORCE
+            if index >= 0 and stamp - stamps[index] <= 50_000_000  # ns, for which currents are in force
         ]
         pairs = [(now, then) for now, then in pairs if now[0].shape == then[0].shape]
         if not pairs:
@@ -397,8 +392,8 @@ class LoopCollector:
             frames=len(frames),
             skipped=max(0, round((last - first) * 1e-9 * self._rate) + 1 - len(frames)),
             tracked=len(both),
-            lost=sum(state != TRACKED for state, _ in states),
-            wrong=int(np.sum((tail > WRONG_TAIL) | (heading > WRONG_HEADING))),
+            lost=sum(state != 1 for state, _ in states),  # TrackerState.TRACKED
+            wrong=int(np.sum((tail > 0.3e-3) | (heading > np.radians(5.0)))),
             saturated=float(np.mean(self._saturated or [False])),
             tail_error=_rms(tail),
             heading_error=_rms(heading),

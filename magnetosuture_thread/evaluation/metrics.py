@@ -33,11 +33,6 @@ from magnetosuture_thread.thread.margins import Margins
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
-END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
-MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is
-BAND = 0.95  # of the means of a consistent filter are within
-WHOLE = 0.97  # of the length; a thread of which so much is measured is not hidden
-MAX_REASONS = 12  # for which needles were not found are told apart
 
 
 @dataclass(frozen=True)
@@ -112,7 +107,7 @@ def target_points(curve: Points, length: float, segments: int) -> tuple[Array, f
     if len(curve) < 2 or not np.isfinite(curve).all():
         return points, 0.0
     arc, at = arc_lengths(curve), length * np.arange(1, segments + 1) / segments
-    known = at <= arc[-1] + END_TOLERANCE * length
+    known = at <= arc[-1] + 1e-3 * length  # the chords of a curve are a little short, and its free end counts
     points[known] = np.column_stack([np.interp(at[known], arc, axis) for axis in curve.T])
     return points, float(arc[-1])
 
@@ -258,7 +253,7 @@ class HiddenShares:
         known = np.isfinite(hidden) & np.isfinite(corrected)
         if not known.any():
             return None
-        shares = np.array([hidden > 1.0 - WHOLE, corrected == 0.0, hidden])[:, known]
+        shares = np.array([hidden > 0.03, corrected == 0.0, hidden])[:, known]
         return cls(*np.average(shares, axis=1, weights=_durations(series.times)[known]).tolist())
 
 
@@ -278,7 +273,7 @@ def mean_band(count: Array) -> tuple[Array, Array]:
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
     5.4. Deviation: none.
     """
-    low, high = (np.asarray(chdtri(count, 0.5 - side * 0.5 * BAND) / count) for side in (-1.0, 1.0))
+    low, high = (np.asarray(chdtri(count, above) / count) for above in (0.975, 0.025))
     return low, high
 
 
@@ -320,7 +315,7 @@ class Consistency:
         if not len(times):
             return None
         first, last = float(times.min()), float(times.max())
-        windows = max(1, math.floor((last - first) / MIN_WINDOW))
+        windows = max(1, math.floor((last - first) / 4.95))
         width = max((last - first) / windows, 1e-3)
         index = np.minimum(np.floor((times - first) / width).astype(np.int64), windows - 1)
         count = np.bincount(index, counts, windows)
@@ -483,7 +478,7 @@ class RunMetrics:
         self.tracked += observation.found
         if not observation.found:
             reason = observation.reason or "not said"
-            self.reasons[reason if reason in self.reasons or len(self.reasons) < MAX_REASONS else "others"] += 1
+            self.reasons[reason if reason in self.reasons or len(self.reasons) < 12 else "others"] += 1
             # Two that are less than this apart look like one in a plot.
             if self._found and not (self.lost and time - self.lost[-1][1] < MIN_DISTANCE):
                 self.lost.append([time, time])

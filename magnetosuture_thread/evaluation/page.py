@@ -26,12 +26,6 @@ if TYPE_CHECKING:
     from magnetosuture_thread.evaluation.plots import ReportPicture
 
 MAX_POINTS = 5000  # of a line
-KINDS = (
-    ("estimate_", "estimate", "estimated"),
-    ("", "prediction", "predicted"),
-    ("recorded_", "recorded prediction", "kind5"),
-)  # of threads: beginning of their columns, name, colour
-LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
 
 Line = tuple[str, str, str, str, float]  # column, name, colour, dash, scale to the axis's unit
 
@@ -118,15 +112,16 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
     series, observed, estimation = metrics.series, metrics.observed, metrics.estimation
     times, columns = thinned(series.times, {name: series.column(name) for name in series.names}, limit)
     frames, tracked = thinned(observed.times, {"processing": observed.column("processing")}, limit)
+    threads = [("estimate_", "estimate", "estimated"), ("", "prediction", "predicted")]
     errors = [
-        (f"{kind}error_{target}", f"{name} against {words}", colour, dash, 1.0)
-        for kind, name, colour in KINDS
+        (f"{prefix}error_{target}", f"{name} against {words}", colour, dash, 1.0)
+        for prefix, name, colour in [*threads, ("recorded_", "recorded prediction", "kind5")]
         for (target, words), dash in zip(AGAINST.items(), ("", "dot"), strict=True)
     ]
     solid = [(f"{MARGIN}{name}", name, colour, "", 1e3) for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
     others = [name for name in columns if name.startswith(MARGIN) and name.removeprefix(MARGIN) not in SOLID]
     margins = [
-        (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "", 1e6)
+        (column, column.removeprefix(MARGIN).replace("_", " "), f"kind{(0, 1, 3, 4)[k % 4]}", "", 1e6)
         for k, column in enumerate(others)
     ]
     forces = [

@@ -40,10 +40,7 @@ KIND_COLOURS = {
     "wall": ("#cbbfa9", "#6f624c"),
 }  # of a shape in a scene: face and edge
 BAD = "#c8102e"
-MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])
-FULL_CLEARANCE_MM = 1.0  # from which on a node is green
-CLOSE_UP = 0.08  # of the thread's length: half of the side of what is magnified
-BARS = (0.1e-3, 0.2e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # m; lengths of a scale bar
+MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])  # from 0 to 1 mm
 
 
 class Photo(NamedTuple):
@@ -129,7 +126,7 @@ def draw_worst_frame(
     greatest = 0.01 * float(np.nanmax(errors)) * length
     ends = np.vstack([vertices[node], targets[node - 1]])
     figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
-    half = max(CLOSE_UP * length, 0.75 * greatest)
+    half = max(0.08 * length, 0.75 * greatest)
     scene, close = _draw_dish_and_close_up(figure, shown, frame, ends.mean(axis=0), half)
     close.plot(*shown.view.to_pixels(ends).T, color=BAD, linewidth=1.6)
     if simulated:
@@ -206,7 +203,7 @@ def draw_threads(
     ):
         style: dict[str, Any] = {"color": colour, "linewidth": width * magnified, "alpha": alpha, "linestyle": dashes}
         axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
-    close = np.clip(1e3 * chosen.clearance[: len(nodes)] / FULL_CLEARANCE_MM, 0.0, 1.0)
+    close = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, 1.0)
     axes.scatter(
         *view.to_pixels(nodes).T, s=9.0 * magnified**2, color=MARGIN_COLOURS(close), linewidths=0.0, zorder=2.5
     )
@@ -227,7 +224,8 @@ def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
     """
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
-    bar = max((bar for bar in BARS if bar / metres <= share * (right - left)), default=BARS[0])
+    lengths = [figure * 10.0**power for power in range(-4, 0) for figure in (1, 2, 5)]  # m
+    bar = max((bar for bar in lengths if bar / metres <= share * (right - left)), default=lengths[0])
     x, y = left + 0.04 * (right - left), low + 0.04 * (high - low)
     for colour, width in (("white", 6.0), (INK, 3.0)):
         axes.plot([x, x + bar / metres], [y, y], color=colour, linewidth=width, solid_capstyle="butt", zorder=5)

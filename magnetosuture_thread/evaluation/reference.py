@@ -26,8 +26,8 @@ from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.workers import Progress
 
-Progress = Callable[[float], None]
 # What numpy and json raise on files that are something else.
 NOT_ONE = (
     *(OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, MemoryError, RecursionError),
@@ -202,7 +202,7 @@ def score(
     formulation: str,
     solver: str,
     segments: int | None = None,
-    progress: Callable[[float], None],
+    progress: Progress,
     keep: Callable[[CaseResult], None] = lambda result: None,
 ) -> Evaluation:
     """Score a formulation on trajectories: each with its own thread and parameters, nothing tuned for a case.

@@ -41,7 +41,6 @@ Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
 Line: TypeAlias = "tuple[str, str, str]"  # of a table for a person: name, value, remark
 
 MARKS = {"simulated": "*", "unverified": "?", "silences": "!"}  # of a bag, by the column that says so
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes the beginning of a formula for
 
 
 def row_of(about: BagDetails, figures: Figures) -> Row:
@@ -123,7 +122,8 @@ def table_csv(rows: Sequence[Row]) -> str:
     def cell(value: Value) -> Value:
         if not isinstance(value, str):
             return value
-        return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)
+        is_formula = value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        return f"'{printable(value)}" if is_formula else printable(value)
 
     stream = io.StringIO(newline="")
     writer = csv.DictWriter(stream, list(flat(_EMPTY)))

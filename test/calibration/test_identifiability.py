@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.calibration.fit import CHAIN, FitSolution, assess_identifiability, estimate_uncertainty
 from magnetosuture_thread.calibration.parameters import DRAG_ANISOTROPY, REST_CURVATURE, STIFFNESS_OVER_DRAG
 from magnetosuture_thread.calibration.recorded_run import RecordedRun
+from magnetosuture_thread.calibration.search import CHAIN, FitSolution, assess_identifiability, estimate_uncertainty
 from test.calibration.runs import SETTINGS, rig_passage
 
 PARAMETERS = (STIFFNESS_OVER_DRAG, DRAG_ANISOTROPY, REST_CURVATURE)
