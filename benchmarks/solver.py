@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from benchmarks.general_solvers import PEERS
+from benchmarks.general_solvers import PEERS, PeerSolver
 from benchmarks.report import figures_table
 from benchmarks.track import OBSTACLES, Case, case
 from magnetosuture_thread.commands.command import progress
@@ -153,7 +153,7 @@ def measure(
     for done, (n, dimension, obstacles) in enumerate(sizes):
         advance(done / len(sizes))
         motion = case(n, dimension, obstacles > 0, steps if n < 1000 else steps // 3)
-        solvers: list[Solver] = [BandedSolver(), OsqpSolver(), *(PEERS[name]() for name in PEERS if peers)]
+        solvers: list[Solver] = [BandedSolver(), OsqpSolver(), *(PeerSolver(name) for name in PEERS if peers)]
         captured = run_case(motion, BandedSolver())[0].captured
         for solver in solvers:
             if n > MAX_SEGMENTS.get(solver.name, 320):

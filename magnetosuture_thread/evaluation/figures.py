@@ -11,7 +11,6 @@ import numpy as np
 
 from magnetosuture_thread.evaluation.metrics import (
     Consistency,
-    HiddenShares,
     MinimumMargin,
     Percentiles,
     RunMetrics,
@@ -174,19 +173,16 @@ def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
         if target in errors
     ]
     if estimation.hidden is not None:
-        found += [_consistency(estimation.consistency), _hidden(estimation.hidden)]
+        found.append(_consistency(estimation.consistency))
     for parameter in estimation.learned:
         value, range_95 = str(parameter).split(", ", 1)
         found.append(Headline(parameter.name.replace("_", " "), value, range_95, "none", "learned by the estimate"))
     found += [_frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
-    if math.isfinite(tension := metrics.maximum("tension")):
-        pull = f"of a segment; the thread pulls the needle with at most {micronewtons(metrics.maximum('pull'))}"
-        found.append(Headline("peak tension", micronewtons(tension), pull, "none", "by the model's multipliers"))
     times = {"model step": ("step_time", metrics.series), "tracker": ("processing", metrics.observed)}
     for name, (column, series) in times.items():
         if spread := Percentiles.of(series.column(column)):
             found.append(_duration(name, spread, figures.interval))
-    return [*found, _latency(figures)]
+    return found
 
 
 def _grade(value: float, good: float, middling: float, *words: str) -> tuple[str, str]:
@@ -216,14 +212,6 @@ def _consistency(found: Consistency | None) -> Headline:
     detail = f"mean; in its 95 % band, {low:.2f} to {high:.2f}, in {within}"
     grade = _grade(-found.within / found.windows, -0.9, -0.5, "consistent", "often off", "not consistent")
     return Headline(name, format_number(found.mean), detail, *grade)
-
-
-def _hidden(found: HiddenShares) -> Headline:
-    words = "never" if found.time == 0.0 else "always" if found.time > 1.0 - 1e-9 else "at times"
-    detail = f"of the time, in part or all; {100.0 * found.length:.1f} % of the length in the mean"
-    if found.all_time > 0.0:
-        detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
-    return Headline("thread hidden", f"{100.0 * found.time:.1f} %", detail, "none" if found.time else "good", words)
 
 
 def _count(count: float, thing: str) -> str:
@@ -288,17 +276,6 @@ def _duration(name: str, found: Percentiles, interval: float) -> Headline:
         grade = _grade(found.p99 / interval, 0.5, 1.0, fast, "just keeps up", slow)
     detail = f"of one frame; 99th percentile {milliseconds(found.p99)}"
     return Headline(f"{name}, median", milliseconds(found.median), detail, *grade)
-
-
-def _latency(figures: Figures) -> Headline:
-    name, live = "latency, frame to prediction", figures.live
-    found = live.latency.get("frame to prediction")
-    if found is None:
-        return Headline(name, "none", "measured only where the running graph was recorded", "none", live.remark)
-    detail = f"median; 99th percentile {milliseconds(found.p99)}"
-    soon = found.p99 <= 2.0 * figures.interval
-    grade, words = ("good", "within two frames") if soon else ("middling", "longer than two frames")
-    return Headline(name, milliseconds(found.median), detail, grade, words)
 
 
 def format_number(value: float) -> str:

@@ -400,7 +400,10 @@ class LoopCollector:
             path_error=_rms(off),
             path_error_greatest=float(off.max(initial=0.0)),
             processing=Percentiles.of([taken for _, taken in states]),
-            latency={name: self._latency(arrived) for name, arrived in self._arrived.items()},
+            latency={
+                name: Percentiles.of([1e-9 * (at - stamp) for stamp, at in arrived.items() if stamp in self._setpoints])
+                for name, arrived in self._arrived.items()
+            },
             **figures_of(self._threads.metrics(frames=self.instants)),
         )
 
@@ -409,9 +412,6 @@ class LoopCollector:
         x, y, heading = self._truth[stamp]
         points, _ = needle_axis(np.array([x, y]), heading, *self._needle, np.ones(1))
         return np.asarray(points[0])
-
-    def _latency(self, arrived: dict[int, int]) -> Percentiles | None:
-        return Percentiles.of([(time - stamp) * 1e-9 for stamp, time in arrived.items() if stamp in self._setpoints])
 
 
 def _rms(values: Array) -> float:

@@ -253,16 +253,12 @@ class HiddenShares:
         known = np.isfinite(hidden) & np.isfinite(corrected)
         if not known.any():
             return None
+        steps = np.diff(series.times)
+        usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+        durations = np.append(steps, usual)  # the usual interval for the last one, and before a gap
+        durations = np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
         shares = np.array([hidden > 0.03, corrected == 0.0, hidden])[:, known]
-        return cls(*np.average(shares, axis=1, weights=_durations(series.times)[known]).tolist())
-
-
-def _durations(times: Array) -> Array:
-    """Return the time from each frame to the next; the usual interval for the last one and before a gap [s]."""
-    steps = np.diff(times)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
-    durations = np.append(steps, usual)
-    return np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
+        return cls(*np.average(shares, axis=1, weights=durations[known]).tolist())
 
 
 def mean_band(count: Array) -> tuple[Array, Array]:
