@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,8 +108,8 @@ class BagErrors:
     truth_held_out: float = math.nan
     across_before: float = math.nan
     across_after: float = math.nan
-    unverified: str = ""
-    simulated: str = ""
+    unverified: str = field(default="", kw_only=True)
+    simulated: str = field(default="", kw_only=True)
 
     @property
     def warning(self) -> str:
@@ -147,7 +147,8 @@ class BagFit(NamedTuple):
             for vertices in self[1:]
         ]
         across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
-        return BagErrors(run.name, len(run.frames), *errors, *across, run.unverified, run.simulated)
+        frames, unverified = len(run.frames), run.unverified
+        return BagErrors(run.name, frames, *errors, *across, unverified=unverified, simulated=run.simulated)
 
 
 @dataclass(frozen=True)

@@ -204,9 +204,8 @@ def draw_threads(
         style: dict[str, Any] = {"color": colour, "linewidth": width * magnified, "alpha": alpha, "linestyle": dashes}
         axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
     close = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, 1.0)
-    axes.scatter(
-        *view.to_pixels(nodes).T, s=9.0 * magnified**2, color=MARGIN_COLOURS(close), linewidths=0.0, zorder=2.5
-    )
+    u, v = view.to_pixels(nodes).T
+    axes.scatter(u, v, s=9.0 * magnified**2, color=MARGIN_COLOURS(close), linewidths=0.0, zorder=2.5)
 
 
 def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
