@@ -177,12 +177,7 @@ def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
     for parameter in estimation.learned:
         value, range_95 = str(parameter).split(", ", 1)
         found.append(Headline(parameter.name.replace("_", " "), value, range_95, "none", "learned by the estimate"))
-    found += [_frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
-    times = {"model step": ("step_time", metrics.series), "tracker": ("processing", metrics.observed)}
-    for name, (column, series) in times.items():
-        if spread := Percentiles.of(series.column(column)):
-            found.append(_duration(name, spread, figures.interval))
-    return found
+    return [*found, _frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
 
 
 def _grade(value: float, good: float, middling: float, *words: str) -> tuple[str, str]:
@@ -266,16 +261,6 @@ def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
 def _strain(strain: float) -> Headline:
     grade = _grade(strain, EXACT, 0.01, "inextensible", "more than 0.1 %", "more than 1 %")
     return Headline("maximum stretch", f"{format_number(100.0 * strain)} %", "of a segment, either way", *grade)
-
-
-def _duration(name: str, found: Percentiles, interval: float) -> Headline:
-    grade = "none", "frame rate not known"
-    if interval > 0.0:
-        fast = f"keeps up with {1.0 / interval:.3g} frames/s"
-        slow = "slower than the frames, on this machine"
-        grade = _grade(found.p99 / interval, 0.5, 1.0, fast, "just keeps up", slow)
-    detail = f"of one frame; 99th percentile {milliseconds(found.p99)}"
-    return Headline(f"{name}, median", milliseconds(found.median), detail, *grade)
 
 
 def format_number(value: float) -> str:
