@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
 
@@ -173,26 +173,26 @@ class TwoHostBench:
 
     def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
         """Pull the cable at random moments."""
-        self._hosts.impair(report.delay, report.loss)
+        self._hosts.execute(f"impair {report.delay} {report.loss}")
         self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
         for number in range(cuts):
             self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
             progress((number + 1) / cuts)
-        self._hosts.impair(0.0, 0.0)
+        self._hosts.execute("impair 0 0")
 
     def _cut(self, report: CutReport, stops: bool) -> None:
         watch = self._watch
         watch.wait(watch.is_driven, "the coils are not driven")
         watch.spin(self._random.uniform(0.0, PULL_DELAY))
         watch.wait(lambda: time.time() - watch.driven < RECENT, "the coils are not driven")
-        self._hosts.pull()
+        self._hosts.execute("pull")
         pulled = time.time()
         watch.spin(self._random.uniform(*PULLED_TIME))
         if stops:
             _press("stop")
         report.zero.append(max(0.0, watch.driven - pulled))
         report.late += report.zero[-1] > COMMAND_TIMEOUT
-        self._hosts.plug()
+        self._hosts.execute("plug")
         plugged = time.time()
         if stops:
             report.stops += 1
@@ -265,13 +265,10 @@ def _press(*switches: str) -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    for name, default, what in (
-        ("cuts", 150, "cuts of a network as it is"),
-        ("impaired-cuts", 50, f"cuts where packets are {1e3 * DELAY:g} ms late and {100.0 * LOSS:g} %% are lost"),
-    ):
-        parser.add_argument(
-            f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what} (default: {default})"
-        )
+    option, late = parser.add_argument, f"packets are {1e3 * DELAY:g} ms late and {100.0 * LOSS:g} %% are lost"
+    option("--cuts", type=whole_number, default=150, metavar="N", help="cuts of a network as it is (default: 150)")
+    text = f"cuts where {late} (default: 50)"
+    option("--impaired-cuts", type=whole_number, default=50, metavar="N", help=text)
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
@@ -286,17 +283,13 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
 
 def network_table(reports: list[CutReport]) -> Table:
     """Return the figures of each network as a table."""
-    table = Table(title="Two hosts, simulated rig")
-    zero = f"at zero within {COMMAND_TIMEOUT:g} s"
-    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept"):
-        table.add_column(heading)
+    rows = []
     for report in reports:
         found = report.to_json()
-        table.add_row(
-            f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost",
-            f"{found['cuts'] - report.late} of {found['cuts']}",
-            f"{found['zero_median']:.3f}, {found['zero_maximum']:.3f}",
-            f"{found['resumed_median']:.2f}, {found['resumed_maximum']:.2f}",
-            f"{report.stops_kept} of {report.stops}",
+        zero, resumed = (
+            f"{found[f'{name}_median']:.3f}, {found[f'{name}_maximum']:.3f}" for name in ("zero", "resumed")
         )
-    return table
+        in_time, stops = f"{found['cuts'] - report.late} of {found['cuts']}", f"{report.stops_kept} of {report.stops}"
+        rows.append((f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost", in_time, zero, resumed, stops))
+    columns = ("network", f"at zero within {COMMAND_TIMEOUT:g} s", "median, maximum [s]", "goes on [s]", "stops kept")
+    return make_table("Two hosts, simulated rig", columns, rows)

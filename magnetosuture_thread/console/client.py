@@ -13,9 +13,9 @@ from typing import Any, Protocol
 
 from aiohttp import WSMsgType, web
 
-from magnetosuture_thread.console.access import same_token
+from magnetosuture_thread.console.access import RateCounter, same_token
 from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
-from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController, Velocity
+from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
 
@@ -287,16 +287,12 @@ class Client:
         hold: Callable[[], None],
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
-        self.is_script = True
-        self._socket, self._request = socket, request
-        self._settings, self._token = settings, token
+        self.is_script, self._can_command = True, False
+        self._socket, self._request, self._settings, self._token = socket, request, settings, token
         self._jog, self._requests, self._hold = jog, requests, hold
-        self._outbox = Outbox()
-        self._wake = asyncio.Event()
-        self._can_command = False
-        self._delay = DelayEstimator()
-        self._last_in_time = 0.0  # arrival of the last message that was not late
-        self._second, self._message_count, self._excess = 0, 0, 0
+        self._outbox, self._wake = Outbox(), asyncio.Event()
+        self._delay, self._last_in_time = DelayEstimator(), 0.0  # arrival of the last message that was not late
+        self._rate, self._message_count, self._excess = RateCounter(), 0, 0
 
     def send_latest(self, kind: str, message: Message) -> None:
         """Send the latest `state` or `frame` when the page can receive it."""
@@ -342,15 +338,9 @@ class Client:
         self._can_command = self.has_token = same_token(token := parsed.values["token"], self._token)
         # Programs other than browsers name no origin.
         self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
-        settings = self._settings
-        self._reply(
-            "welcome",
-            client=self.number,
-            can_command=self._can_command,
-            refusal="the token is wrong" if token and not self._can_command else "",
-            speed=settings.speed,
-            max_speed=settings.max_speed,
-        )
+        refusal = "the token is wrong" if token and not self._can_command else ""
+        speeds = {"speed": self._settings.speed, "max_speed": self._settings.max_speed}
+        self._reply("welcome", client=self.number, can_command=self._can_command, refusal=refusal, **speeds)
         return True
 
     def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
@@ -402,34 +392,26 @@ class Client:
     async def _dispatch(self, message: ClientMessage, now: float) -> None:
         values = message.values
         if message.type == "jog":
-            await self._on_jog(values["velocity"], values["sent"], now)
+            if not self._in_time(values["sent"], now):
+                self._jog.interrupt(self.number)
+                if now - self._last_in_time > 1.0:  # s; it must reconnect
+                    await self._socket.close(code=1008, message=b"all messages are late")
+            elif not self._jog.jog(self.number, values["velocity"]):
+                self._reply("error", text="jog: this page does not have control; take control first")
         elif message.type == "hold":
             if self._in_time(values["sent"], now) and self._jog.holder == self.number:
                 self._hold()
         elif message.type == "end_jog":
             self._jog.end_jog(self.number)
         elif message.type == "acquire_control":
-            self._reply("result", request=message.type, refusal=self._jog.acquire_control(self.number))
+            self._report(message.type, self._jog.acquire_control(self.number))
         elif message.type == "release_control":
             self._jog.release_control(self.number)
         elif message.type == "visibility":
             self._jog.set_visible(self.number, values["visible"])
         elif message.type != "hello":
-            self._requests.start(
-                self.number,
-                message,
-                "a script" if self.is_script else "an operator",
-                lambda name, refusal: self._reply("result", request=name, refusal=refusal),
-            )
-
-    async def _on_jog(self, velocity: Velocity, sent: float, now: float) -> None:
-        if self._in_time(sent, now):
-            if not self._jog.jog(self.number, velocity):
-                self._reply("error", text="jog: this page does not have control; take control first")
-            return
-        self._jog.interrupt(self.number)
-        if now - self._last_in_time > 1.0:  # s; it must reconnect
-            await self._socket.close(code=1008, message=b"all messages are late")
+            operator = "a script" if self.is_script else "an operator"
+            self._requests.start(self.number, message, operator, self._report)
 
     def _in_time(self, sent: float, now: float) -> bool:
         """Return whether a message of a hold is not late; report it else."""
@@ -443,11 +425,13 @@ class Client:
 
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""
-        second = int(now)
-        self._second, self._message_count = second, self._message_count + 1 if second == self._second else 1
+        self._message_count = self._rate.count(self.address, now)
         exceeded = self._message_count > MAX_MESSAGE_RATE
         self._excess += exceeded
         return exceeded
+
+    def _report(self, request: str, refusal: str) -> None:
+        self._reply("result", request=request, refusal=refusal)
 
     def _reply(self, kind: str, **fields: Any) -> None:
         self._outbox.reply(json.dumps({"type": kind, **fields}))
@@ -459,7 +443,9 @@ class Client:
                 await self._wake.wait()
                 self._wake.clear()
                 while (message := self._outbox.next()) is not None:
-                    await asyncio.wait_for(self._send(message), 2.0)  # s; else it does not receive
+                    socket = self._socket
+                    sent = socket.send_str(message) if isinstance(message, str) else socket.send_bytes(message)
+                    await asyncio.wait_for(sent, 2.0)  # s; else it does not receive
         except (asyncio.TimeoutError, ConnectionError):
             self._abort()
 
@@ -467,9 +453,3 @@ class Client:
         transport = self._request.transport
         if transport is not None:
             transport.abort()
-
-    async def _send(self, message: Message) -> None:
-        if isinstance(message, str):
-            await self._socket.send_str(message)
-        else:
-            await self._socket.send_bytes(message)

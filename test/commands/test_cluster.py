@@ -16,11 +16,11 @@ from typing import cast
 
 import pytest
 
-from magnetosuture_thread import cli
+from magnetosuture_thread import cli, workers
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.evaluation.tables import TIMES
-from magnetosuture_thread.workers import Work, WorkerDiedError, cluster, make_runner
+from magnetosuture_thread.workers import Work, WorkerDiedError, make_runner
 
 SOURCE = """
 import os
@@ -132,7 +132,7 @@ def test_an_absent_scheduler_gives_one_line(capfd: pytest.CaptureFixture[str], t
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     options = ["--output", str(tmp_path / "out"), "--scheduler", address]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cluster, "CONNECT_TIMEOUT", 0.2)
+        patch.setattr(workers, "CONNECT_TIMEOUT", 0.2)
         assert cli.main(["evaluate", str(short_bag), *options]) == 2
     assert "the address of a running Dask scheduler" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()

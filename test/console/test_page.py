@@ -269,13 +269,6 @@ def test_without_the_token_every_control_is_off(browser: Browser, served: Served
     context.close()
 
 
-def choose(page: Page, setup: str) -> None:
-    """Choose a setup in the list, and confirm that the run ends."""
-    page.click("#setup")
-    page.click(f'#setups [data-name="{setup}"]')
-    page.click("#confirm")
-
-
 def test_a_release_reaches_the_page_whatever_element_has_the_focus(operator: Operator):
     """Each element is entered by keyboard and mouse, with what it opens left open, while a key is held and let go."""
     operator.take_control()
@@ -300,27 +293,6 @@ def test_a_release_reaches_the_page_whatever_element_has_the_focus(operator: Ope
             operator.last(REST)
             operator.page.keyboard.press("Escape")
     operator.nothing_more()
-
-
-def test_setup_pause_and_record_reach_the_host(operator: Operator):
-    expect(operator.page.locator("#pause")).to_be_disabled()
-    operator.take_control()
-    choose(operator.page, "petri_35mm_polyamide")
-    operator.until(lambda: operator.served.host.shown["setup"] == "petri_35mm_polyamide")
-    operator.page.click("#pause")
-    expect(operator.page.locator("#headline")).to_have_text("Paused")
-    operator.page.click("#pause")
-    operator.page.click("#record")
-    expect(operator.page.locator("#recording")).to_contain_text("output/console/take_1")
-    operator.page.click("#record")
-    operator.until(lambda: len(operator.served.host.requests) == 5)
-    assert operator.served.host.requests == [
-        ("select_setup", "petri_35mm_polyamide"),
-        ("pause", True),
-        ("pause", False),
-        ("record", True),
-        ("record", False),
-    ]
 
 
 CAUSES: list[tuple[str, dict[str, Any], str]] = [  # why nothing moves, in the order in which they are to be resolved
