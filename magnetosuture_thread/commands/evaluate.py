@@ -102,18 +102,17 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
         if given != options.default_of(name):
             why = "for reference trajectories; PATH is none" if is_bags else "for bags; PATH is a reference trajectory"
             raise ConfigurationError(f"--{name}", str(given), f"nothing: it is only {why}")
-    if is_bags and options.output is None:
-        raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
-    with terminal.progress("evaluate") as advance:
-        if is_bags:
-            given = command.given(options, "paths", "output", "against", "formulation", "workers", "scheduler")
-            rows = evaluate_bags(**given, **command.bag_selection(options), log=terminal.log, progress=advance)
-        else:
-            evaluation = _score_references(options, advance)
     if not is_bags:
+        with terminal.progress("evaluate") as advance:
+            evaluation = _score_references(options, advance)
         terminal.print(tables.evaluation_table(evaluation))
         command.write_json(options.json, evaluation.to_mapping())
         return command.DONE
+    if options.output is None:
+        raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
+    given = command.given(options, "paths", "output", "against", "formulation", "workers", "scheduler")
+    with terminal.progress("evaluate") as advance:
+        rows = evaluate_bags(**given, **command.bag_selection(options), log=terminal.log, progress=advance)
     terminal.print(tables.bags_table(rows))
     terminal.log(f"results: {options.output}")
     return command.FAILED if any(row["problem"] for row in rows) else command.DONE

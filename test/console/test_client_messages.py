@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
+from magnetosuture_thread.console.client import ClientMessage, parse_client_message
 from magnetosuture_thread.errors import InvalidInputError
 
 MAX_SPEED = 0.01

@@ -7,8 +7,7 @@ import contextlib
 
 import pytest
 
-from magnetosuture_thread.console.client import RequestHandler
-from magnetosuture_thread.console.client_messages import ClientMessage
+from magnetosuture_thread.console.client import ClientMessage, RequestHandler
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.errors import InvalidInputError
 from test.console.scene import RecordingGraph, RecordingHost
