@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -263,28 +263,24 @@ class _Procedure:
         return f"the procedure {self.result['procedure']} is {self.result['state']}, {met}"
 
 
+@dataclass
 class _Run:
     """One run of the graph; see `simulate`."""
 
-    def __init__(
-        self,
-        setup: Setup,
-        task: _Path | _Procedure,
-        duration: float | None,
-        rate: float | None,
-        boards: bool,
-        log: Log,
-        progress: Progress,
-    ) -> None:
-        self._setup, self._task, self._duration, self._rate = setup, task, duration, rate
-        self._boards, self._log, self._progress = boards, log, progress
+    setup: Setup
+    task: _Path | _Procedure
+    duration: float | None
+    rate: float | None
+    boards: bool
+    log: Log
+    progress: Progress
 
     def record(self, folder: Path, name: str) -> str:
         """Run the graph and record it; return what went wrong, so that the bag stays."""
-        setup, task = self._setup, self._task
+        setup, task = self.setup, self.task
         arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
-        if self._rate is not None:
-            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self._rate)}"]
+        if self.rate is not None:
+            arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
         text, what = setup.path.read_text(encoding="utf-8"), f"the whole rig, closed loop, setup {setup.name}"
         notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
         every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *task.recorded)
@@ -293,11 +289,11 @@ class _Run:
         processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
             simulated = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
-            arguments += _wired(ports, len(setup.coils.coil_angles)) if self._boards else simulated
+            arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else simulated
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
-            with live.own_graph(processes, arguments, folder / "logs", nodes, self._log) as graph:
-                sink, clock = _Sink(bag), self._rate is not None
+            with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
+                sink, clock = _Sink(bag), self.rate is not None
                 recorder = clients.Recorder(graph.domain, recorded, simulated_clock=clock, receive=sink.receive)
                 try:
                     return self._run(graph, recorder, sink)
@@ -306,23 +302,23 @@ class _Run:
 
     def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str:
         with graph.interruption:
-            _wait(recorder, graph.check, self._log)
-        if self._boards:
+            _wait(recorder, graph.check, self.log)
+        if self.boards:
             _arm()
-        self._log("running" if self._rate is None else f"running at {self._rate:g} times the speed")
+        self.log("running" if self.rate is None else f"running at {self.rate:g} times the speed")
         sink.running = True
         try:
             # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
             # and the bag would lack the start.
-            graph.nodes.start(self._task.node, arguments=("-p", f"{self._task.node}:audience:=2"))
-            with graph.interruption, self._task.client:
+            graph.nodes.start(self.task.node, arguments=("-p", f"{self.task.node}:audience:=2"))
+            with graph.interruption, self.task.client:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
             return INTERRUPTED  # passed on once the bag is whole
 
     def _steer(self, recorder: clients.Recorder, check: Callable[[], None]) -> str:
         """Record until the path or procedure is done, or the time is over; return what went wrong."""
-        task, rate, duration = self._task, self._rate or 1.0, self._duration
+        task, rate, duration = self.task, self.rate or 1.0, self.duration
         stage, began = 0, time.monotonic()
         while True:
             check()
@@ -331,7 +327,7 @@ class _Run:
             if task.stage > stage:
                 stage, began = task.stage, time.monotonic()
             elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
-            self._progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
+            self.progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
             if task.ended:
                 recorder.spin(0.5 / rate)
             if problem or task.ended:
