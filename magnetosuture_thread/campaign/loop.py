@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,8 +94,8 @@ class Measurement:
     observation: ThreadObservation | None = field(compare=False)
 
 
-class LoopRecorder:
-    """Gets what nodes and rig would publish; this one drops it. Times are those of the loop's stamps [s]."""
+class LoopRecorder(Protocol):
+    """Gets what the nodes and the rig would publish. Times are those of the loop's stamps [s]."""
 
     def on_frame(self, now: float, frame: RigFrame) -> None:
         """Take a frame with its ground truth."""
@@ -133,7 +134,7 @@ class ClosedLoop:
         recorder: LoopRecorder | None = None,
     ) -> None:
         self.setup, self.rig, self._controller = setup, rig, controller
-        self._recorder = recorder or LoopRecorder()
+        self._recorder = recorder
         self._random, self._losses = np.random.default_rng([seed, 1]), losses
         self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
         latch, self._driver = ArmingLatch(), DriverState(True)
@@ -165,14 +166,16 @@ class ClosedLoop:
             self._measured(heapq.heappop(self._waiting))
         output = self.bridge.step(self.now, self.now, self._driver)
         self._reason, self._drift = output.reason, output.drift
-        self._recorder.on_bridge(self.now, output)
+        if self._recorder is not None:
+            self._recorder.on_bridge(self.now, output)
         self.rig.apply(self._gains * output.allocation.currents, self.now - START)
         self.now += 1.0 / self.setup.coils.rate
         return frame
 
     def _look(self) -> LoopFrame:
         frame = self.rig.look(self.now - START, rendered=self._tracker is not None)
-        self._recorder.on_frame(self.now, frame)
+        if self._recorder is not None:
+            self._recorder.on_frame(self.now, frame)
         lost = self._random.uniform() < self._losses
         if not lost and (measured := self._measure(frame)) is not None:
             heapq.heappush(self._waiting, measured)
@@ -234,7 +237,8 @@ class ClosedLoop:
             self._condition = replace(self._condition, slowdown=1.0)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
         self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
-        self._recorder.on_measurement(now, measured, result, self._commanded)
+        if self._recorder is not None:
+            self._recorder.on_measurement(now, measured, result, self._commanded)
 
 
 def condition_of(result: PredictionResult) -> ThreadCondition:
@@ -252,8 +256,8 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
     return ThreadCondition(thread.positions, tension, nodes, slowdown, problem)
 
 
-class RunBag(LoopRecorder):
-    """Records a run. Every message is logged at the simulated time at which a node would get it.
+class RunBag:
+    """Records a run, as a `LoopRecorder`. Every message is logged at the simulated time at which a node would get it.
 
     Args:
         bag: to write to.
