@@ -15,7 +15,7 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -240,7 +240,6 @@ class ClusterRunner(TaskRunner):
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"}):
             # A task of its own and not scattered data, which would be lost with the workers that hold it.
             self._loaded = self._client.submit(pickle.loads, pickle.dumps(self._work), pure=False)
-        self._executor = self._client.get_executor(pure=False)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -248,7 +247,8 @@ class ClusterRunner(TaskRunner):
         self._client.close()
 
     def _submit(self, task: Any) -> Future[Any]:
-        future: Future[Any] = self._executor.submit(_run_there, self._loaded, task, _software())
+        # Dask's own future, which has what is used of one: it tells of a scheduler that is lost too.
+        future: Future[Any] = self._client.submit(_run_there, self._loaded, task, _software(), pure=False)
         return future
 
     def _result_of(self, future: Future[Any]) -> tuple[Any, list[str]]:
@@ -262,7 +262,9 @@ class ClusterRunner(TaskRunner):
             raise self._refused("workers with the same packages as here", error) from None
         except KilledWorker as error:
             raise WorkerDiedError(" ".join(str(error).split())) from None
-        except (CancelledError, asyncio.CancelledError) as error:
+        except (asyncio.CancelledError, OSError) as error:
+            if getattr(future, "status", "") == "error":  # of the task itself
+                raise
             raise self._refused("a scheduler that stays", error) from None
 
     def _refused(self, expectation: str, problem: object) -> ConfigurationError:

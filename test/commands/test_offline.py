@@ -115,18 +115,6 @@ def test_observations_of_poses_hold_what_was_recorded(pose_bag: Path, straight_p
     assert shares[-1] == 1.0
 
 
-def test_observations_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_pull: ReferenceTrajectory):
-    found = observed(short_bag)
-    seen = list(found)
-    assert (found.source, found.count, found.found) == ("camera", 30, 28)
-    assert found.refused == {"no needle for sure": 2}
-    assert [bool(each.reason) for each in seen] == [True] * 2 + [False] * 28
-    for k, observation in enumerate(seen[2:], 2):
-        assert np.linalg.norm(observation.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
-        assert (observation.measured.shape, observation.ground_truth.shape) == ((64, 2), (51, 2))
-        assert observation.processing > 0.0
-
-
 def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_path: Path):
     lens, bend = lens_with(-0.05, (640, 480)), distorted(-0.05)
     view = SETUP.rig.camera(SETUP.scene).view
