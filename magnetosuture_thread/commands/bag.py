@@ -17,8 +17,6 @@ from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.texts import one_line
 
-MAX_PLACES = 100  # of damage that are shown; `--json` writes all
-
 DESCRIPTION = """\
 Check a recorded bag, or repair it.
 
@@ -98,9 +96,9 @@ def _times(first: int | None, last: int | None, start: int) -> str:
 
 
 def _shown(places: list[str]) -> list[str]:
-    """Return a line for each damaged place, and how many are not shown."""
-    others = len(places) - MAX_PLACES
-    return [f"  {place}" for place in places[:MAX_PLACES]] + ([f"  and {others} other places"] if others > 0 else [])
+    """Return a line for each of 100 damaged places, and how many are not shown; `--json` writes all."""
+    others = len(places) - 100
+    return [f"  {place}" for place in places[:100]] + ([f"  and {others} other places"] if others > 0 else [])
 
 
 def _table(found: dict[str, Any]) -> Table:

@@ -32,9 +32,6 @@ from magnetosuture_thread.workers import Log, Progress
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-READING_SHARE = 0.15  # share of the time for reading the bags, and tracking their frames
-INTERRUPTED = 130  # exit code, as shells have it
-
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -89,7 +86,7 @@ def run_calibrate(options: argparse.Namespace, terminal: command.Terminal) -> in
     for line in calibration_lines(values):
         terminal.log(line)
     terminal.log(f"parameters: {options.output}")
-    return command.DONE if result.finished else INTERRUPTED
+    return command.DONE if result.finished else 130  # as shells have it
 
 
 def calibrate_bags(
@@ -133,12 +130,13 @@ def calibrate_bags(
     """
     from magnetosuture_thread.calibration.plot import draw_calibration  # late, as it imports matplotlib
 
+    reading = 0.15  # share of the time for reading the bags, and tracking their frames
     passages: list[RecordedRun] = []
     first: tuple[str, Setup, ThreadModelSettings] | None = None  # bag, its own setup, and where the fit starts
     for index, path in enumerate(bags):
 
         def advance(share: float, index: int = index) -> None:
-            progress(READING_SHARE * (index + share) / len(bags))
+            progress(reading * (index + share) / len(bags))
 
         with open_bag(path, log, **selection) as given:
             settings = thread_settings(given.setup, material, formulation)
@@ -165,7 +163,7 @@ def calibrate_bags(
     best = BestSettings()
 
     def search(share: float) -> None:
-        progress(READING_SHARE + (1.0 - READING_SHARE) * share)
+        progress(reading + (1.0 - reading) * share)
 
     try:
         with replay_pool(passages, min(workers, os.cpu_count() or 1), scheduler) as run:

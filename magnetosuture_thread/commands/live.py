@@ -43,8 +43,6 @@ for _name in interface.STANDBY_NODES:
     OWN += ["-p", f"{_name}:autostart:=active"]
 # Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
 FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
-# A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
 
 
 @contextmanager
@@ -151,7 +149,9 @@ class GraphInput:
         # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
         scene = qos.with_name("scene.yaml")
         write_scene(self.given.setup.scene, scene)
-        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES, *OWN]
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *OWN]
+        # A replayed bag never moves a needle, so its bridge may arm itself.
+        arguments += ["-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed"]
         if self.transport:
             arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
         return arguments

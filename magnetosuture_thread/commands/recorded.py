@@ -435,7 +435,6 @@ def measure_step(step: Step, metrics: RunMetrics, refused: Counter[str], recorde
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
 SETUP_NOTE = "scenario"  # of a bag, which holds the setup's text
-MIN_LOOP_DURATION = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 
 
 class BagSelection(TypedDict, total=False):
@@ -493,8 +492,8 @@ class BagInput:
 
     def check_loop(self) -> None:
         """Raise `BagError` if the bag is too short to be played in a loop."""
-        if self.duration < MIN_LOOP_DURATION:
-            problem = f"gives {self.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more"
+        if self.duration < 1.5:  # s; nodes take a jump back of a second and less for messages that come late
+            problem = f"gives {self.duration:.2f} s to play over and over; expected 1.5 s or more"
             raise BagError(self.recording.path, problem)
 
 

@@ -32,8 +32,6 @@ from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 
-# Published while nodes start, for the bag's beginning.
-ONCE = (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded)
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
@@ -350,7 +348,7 @@ class _Sink:
     def receive(self, topic: str, arrival: int, data: bytes) -> None:
         """Take a message."""
         if not self.running:
-            if topic in ONCE:
+            if topic in (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded):
                 self._early[topic] = data
             return
         if self._begin is None:
