@@ -194,13 +194,15 @@ def write_page(result: CampaignResult) -> str:
         not_reached = [] if row["result"].reached else ["not all goals reached"]
         for why in (*not_reached, *(REASONS[name] for name in sorted(row["broken"]))):
             reasons.setdefault(why, []).append(row["result"].seed)
-    scene = result.setup.scene
+    scene, reached = result.setup.scene, [each.figures for each in result.runs if each.reached]
     return read_template(__package__, "campaign.html", {"spaced": lambda text: text.replace("_", " ")}).render(
         details=result,
         runs=rows,
         failed=[row for row in failed if row["pictures"]],
         left_out=len(failed[200:]),
-        tiles=_tiles(result) if rows else [],
+        reached=len(reached),
+        ratios=[each.time_s / each.ideal_time_s for each in reached if each.ideal_time_s > 0.0],
+        median=median,
         reasons=sorted(reasons.items(), key=lambda each: -len(each[1])),
         shapes=[{"kind": shape.kind, "path": _outline(shape.geometry)} for shape in scene.shapes],
         dish_radius=1e3 * scene.dish.radius,
@@ -209,29 +211,6 @@ def write_page(result: CampaignResult) -> str:
         limits=run,
         style=page_style() + read_source(__package__, "campaign.css"),
     )
-
-
-def _tiles(result: CampaignResult) -> list[tuple[str, str, bool, str]]:
-    """Return the headline figures: name, value, whether it is good, and detail."""
-    count, required, successes = len(result.runs) + len(result.died), result.min_clearance, result.successes
-    figures, reached = [each.figures for each in result.runs], [each.figures for each in result.runs if each.reached]
-    clearance = min(each.min_needle_clearance_m for each in figures)
-    penetration = max(each.max_thread_penetration_m for each in figures)
-    rest, deepest = max(each.longest_rest_s for each in figures), run.PENETRATION_TOLERANCE
-    at_least, at_most = f"of all runs; at least {1e3 * required:.3f} mm", f"of all runs; at most {1e6 * deepest:g} µm"
-    is_deep, all_reached = penetration > deepest, len(reached) == count
-    tiles = [
-        ("runs that succeeded", f"{successes} of {count}", successes == count, "all goals, all limits"),
-        ("runs that reached all goals", f"{len(reached)} of {count}", all_reached, "limits apart"),
-        ("closest needle", f"{1e3 * clearance:.3f} mm", clearance >= required, at_least),
-        ("deepest node of the thread", f"{1e6 * penetration:.1f} µm", not is_deep, at_most),
-        ("longest rest", f"{rest:.1f} s", rest <= run.MAX_REST, f"of all runs; at most {run.MAX_REST:g} s"),
-    ]
-    if ratios := [each.time_s / each.ideal_time_s for each in reached if each.ideal_time_s > 0.0]:
-        most, limit = max(ratios), run.MAX_TIME_RATIO
-        detail = f"median of runs that reached all goals; maximum {most:.2f}, at most {limit:g}"
-        tiles.append(("time over ideal time", f"{median(ratios):.2f}", most <= limit, detail))
-    return tiles
 
 
 def _add_pictures(row: dict[str, Any], result: CampaignResult) -> None:
