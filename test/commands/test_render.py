@@ -81,10 +81,7 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
     assert np.std(tails - truth) == pytest.approx(1e-4, rel=0.2)
     assert poses[0].decode().pose.covariance[0] == pytest.approx(1e-8)
     measured = np.array(
-        [
-            [(each.pose.pose.position.x, each.pose.pose.position.y) for each in record.decode().poses]
-            for record in threads
-        ]
+        [[(each.pose.position.x, each.pose.position.y) for each in record.decode().poses] for record in threads]
     )
     assert measured.shape == (120, 64, 2)
     assert np.array_equal(measured[:, 0], tails)  # a measured thread begins at the measured tail
