@@ -29,13 +29,13 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, PAUSE_RIG, RESET
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import Topic
 
 TOPICS = (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS, *topics.SIMULATED, topics.RIG_CURRENTS)
 # Whatever their content, these requests are orders, not attacks: only who may give them could be asked.
-ORDERS = (ARM, EMERGENCY_STOP, RESET, PAUSE_RIG)
+ORDERS = (Service.ARM, Service.EMERGENCY_STOP, Service.RESET, Service.PAUSE_RIG)
 FIRST_IMPOSSIBLE_TRANSITION = 9
 NUMBERS = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 TEXTS = ("", " ", "dish", "map", "no_such", "use_sim_time", "viscosity", "a..b", "\x1b[2J", "‮", "../../etc/passwd", "{")
@@ -223,8 +223,8 @@ def main() -> None:
     executor.add_node(node)
     names = list(node.declare_parameter("nodes", [""]).value or ())
     clients = {name: node.create_client(GetParameters, f"{name}/get_parameters") for name in names}
-    stop, reset = (node.create_client(Trigger, name) for name in (EMERGENCY_STOP, RESET))
-    arm = node.create_client(SetBool, ARM)
+    stop, reset = (node.create_client(Trigger, name) for name in (Service.EMERGENCY_STOP, Service.RESET))
+    arm = node.create_client(SetBool, Service.ARM)
     turns = itertools.cycle(names)
 
     def ask(client: Client, request: Any) -> tuple[Any, float]:
