@@ -7,6 +7,7 @@ by the stamps of who sends. Needs chromium and playwright. Takes three minutes.
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import re
 import shutil
@@ -17,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -26,7 +28,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
 from magnetosuture_thread.configuration import read_yaml
 from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
@@ -39,7 +41,7 @@ SETUP, SEGMENTS, FRAME_RATE = "petri_35mm_polyamide", 81, 30.0  # the latter in 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WIDTH, HEIGHT = 1366, 768  # of the page [px]
 TIMEOUT = 240.0  # s for the graph to be there; the first start on a machine compiles
-GRACE = 20.0  # s for the command to end
+GRACE = 60.0  # s for the command to end
 HELD, RELEASED = 0.25, 0.35  # s that a key is held, and not held, on average
 KEYS = (("ArrowRight", "ArrowLeft"), ("ArrowUp", "ArrowDown"))  # by axis; the second where the tip is beyond 0
 STATIONS = {OPERATOR_COMMAND: "the page's command in the graph", NEEDLE_SETPOINT: "the filtered velocity at the bridge"}
@@ -84,15 +86,12 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
 
 def page_table(delays: Sequence[dict[str, Any]]) -> Table:
     """Return the figures as a table that fits 80 columns."""
-    title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
-    table = Table(title=title, title_justify="left", title_style="bold")
-    table.add_column("", no_wrap=True)
-    for name in ("median", "p99", "maximum", "keys", "lost"):
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for each in delays:
         values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest"))
-        table.add_row(each["station"], *values, str(each["count"]), str(each["lost"]))
-    return table
+        rows.append((each["station"], *values, str(each["count"]), str(each["lost"])))
+    title = f"operator's page, simulated rig, n = {SEGMENTS}; ms from a key press"
+    return make_table(title, ("", "median", "p99", "maximum", "keys", "lost"), rows)
 
 
 def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], dict[str, float]]:
@@ -119,14 +118,12 @@ def _measure(presses: int, progress: Callable[[float], None]) -> tuple[list[dict
     return delays, {name: (after[name] - before[name]) / took for name in ("drawn", "states", "frames")}
 
 
-class _Server:
+@dataclass
+class RunningConsole:
     """The command `magnetosuture console`, running; what it prints goes to a file."""
 
-    def __init__(self, setup: Path, output: Path) -> None:
-        command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
-        self._output = output
-        with output.open("wb") as file:
-            self._process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+    process: subprocess.Popen[bytes]
+    output: Path
 
     def find(self, pattern: str) -> str:
         """Wait for a line, and return what the pattern's group holds.
@@ -135,25 +132,40 @@ class _Server:
             GraphError: the command ended, or prints no such line.
         """
         deadline = time.monotonic() + TIMEOUT
-        while time.monotonic() < deadline and self._process.poll() is None:
-            if found := re.search(pattern, self._output.read_text()):
+        while time.monotonic() < deadline and self.process.poll() is None:
+            if found := re.search(pattern, self.output.read_text(), re.MULTILINE):
                 return found[1]
-            time.sleep(0.05)
-        last = self._output.read_text().splitlines()[-1:]
-        raise GraphError(f"the console ended, or is not ready after {TIMEOUT:g} s: {' '.join(last)}")
+            time.sleep(0.02)
+        raise GraphError(f"the console ended, or shows no {pattern} after {TIMEOUT:g} s: {self.output.read_text()}")
 
-    def end(self) -> None:
-        """Press Ctrl-C."""
-        self._process.send_signal(signal.SIGINT)
+    def end(self) -> int:
+        """Press Ctrl-C; return the exit code."""
+        self.process.send_signal(signal.SIGINT)
         try:
-            self._process.wait(GRACE)
+            return self.process.wait(GRACE)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            self.process.kill()
+            return self.process.wait()
 
 
 @contextmanager
-def _serving() -> Iterator[_Server]:
+def running_console(*arguments: str, **environment: str) -> Iterator[RunningConsole]:
+    """Run the command on a free port; end it at the end if it has not."""
+    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
+    own = {**os.environ, **environment}
+    with TemporaryDirectory() as folder, Path(folder, "output").open("wb") as file:
+        # In a session of its own: Ctrl-C at a terminal is not for it.
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own, start_new_session=True)
+        console = RunningConsole(process, Path(file.name))
+        try:
+            yield console
+        finally:
+            if console.process.poll() is None:
+                console.end()
+
+
+@contextmanager
+def _serving() -> Iterator[RunningConsole]:
     """Run the command with the setup that is measured."""
     content = read_yaml(read_setup(SETUP).path, "setup file")
     content["/**/thread_model"]["ros__parameters"]["segments"] = SEGMENTS
@@ -161,11 +173,8 @@ def _serving() -> Iterator[_Server]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{SETUP}.yaml"
         path.write_text(yaml.safe_dump(content), encoding="utf-8")
-        server = _Server(path, Path(folder) / "output")
-        try:
-            yield server
-        finally:
-            server.end()
+        with running_console(str(path)) as console:
+            yield console
 
 
 def _press(page: Page, presses: int, progress: Callable[[float], None]) -> None:

@@ -9,19 +9,19 @@ import itertools
 import math
 import random
 import re
-import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
+import rclpy
 from builtin_interfaces.msg import Time
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import GetParameters
 from rclpy.client import Client
-from rclpy.clock import Clock as RclClock
-from rclpy.clock import ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
@@ -31,8 +31,6 @@ from std_srvs.srv import SetBool, Trigger
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import GuardedNode
-from magnetosuture_thread.nodes.run import run
 from magnetosuture_thread.nodes.topics import Topic
 
 TOPICS = (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS, *topics.SIMULATED, topics.RIG_CURRENTS)
@@ -213,82 +211,47 @@ def _interface(name: str) -> Any:
     return getattr(import_module(".".join((package, *(middle or ("msg",))))), own)
 
 
-class ProbeNode(GuardedNode):
-    """Prints a line for each answer: the node's name, or `STOP`, and the seconds until the answer came.
+def main() -> None:
+    """Ask the nodes of the parameter `nodes` in turn, and print a line for each answer.
 
-    It prints `READY` once all nodes have answered: while kernels compile, a node answers nobody. The bridge is armed
-    before each emergency stop; where that was not possible, `UNARMED` is printed. Parameter: `nodes`, their names.
+    A line has the node's name, or `STOP`, and the seconds until the answer came. `READY` is printed once all nodes have
+    answered: while kernels compile, a node answers nobody. The bridge is armed before each emergency stop; where that
+    was not possible, `UNARMED` is printed.
     """
+    rclpy.init()
+    node, executor = rclpy.create_node("probe"), SingleThreadedExecutor()
+    executor.add_node(node)
+    names = list(node.declare_parameter("nodes", [""]).value or ())
+    clients = {name: node.create_client(GetParameters, f"{name}/get_parameters") for name in names}
+    stop, reset = (node.create_client(Trigger, name) for name in (Service.EMERGENCY_STOP, Service.RESET))
+    arm = node.create_client(SetBool, Service.ARM)
+    turns = itertools.cycle(names)
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__("probe", **options)
-        names = self.declare_parameter("nodes", [""]).value
-        self._nodes = {name: self.create_client(GetParameters, f"{name}/get_parameters") for name in names}
-        self._stop = self.create_client(Trigger, Service.EMERGENCY_STOP)
-        self._reset = self.create_client(Trigger, Service.RESET)
-        self._arm = self.create_client(SetBool, Service.ARM)
-        self._turns = itertools.cycle(names)
-        self._asked = 0
-        self._silent = set(names)  # who have not answered yet
-        self._since: float | None = None
-        self._then: Callable[[Any, float], None] = lambda answer, delay: None
-        self._future: Any = None
-        self.create_timer(PERIOD, self._look, clock=RclClock(clock_type=ClockType.STEADY_TIME))
+    def ask(client: Client, request: Any) -> tuple[Any, float]:
+        began, future = time.monotonic(), client.call_async(request)
+        executor.spin_until_future_complete(future, LIMIT)
+        return future.result() if future.done() else None, time.monotonic() - began
 
-    def _look(self) -> None:
-        """Ask the next question, unless the last one waits for its answer."""
-        if self._since is not None:
-            if time.monotonic() - self._since > LIMIT:
-                self._future.cancel()
-                self._answered(None, LIMIT)
-        elif self._silent:
-            name = next(self._turns)
-            if self._nodes[name].service_is_ready() and self._stop.service_is_ready() and self._arm.service_is_ready():
-                self._ask(self._nodes[name], GetParameters.Request(), lambda answer, delay: self._greet(name, answer))
-        elif self._asked % STOP_EVERY == 0:
-            self._ask(self._reset, Trigger.Request(), lambda answer, delay: self._on_reset())
-        else:
-            name = next(self._turns)
-            request = GetParameters.Request(names=["use_sim_time"])
-            self._ask(self._nodes[name], request, lambda answer, delay: self._print(name, delay))
-
-    def _ask(self, client: Any, request: Any, then: Callable[[Any, float], None]) -> None:
-        self._since, self._then = time.monotonic(), then
-        self._future = client.call_async(request)
-        # The time is taken when the answer is there, not at the next look.
-        self._future.add_done_callback(self._on_answer)
-
-    def _on_answer(self, future: Any) -> None:
-        if future is self._future and self._since is not None:
-            self._answered(future.result(), time.monotonic() - self._since)
-
-    def _answered(self, answer: Any, delay: float) -> None:
-        self._since = None
-        self._then(answer, delay)
-
-    def _on_reset(self) -> None:
-        self._ask(self._arm, SetBool.Request(data=True), lambda answer, delay: self._on_armed(answer))
-
-    def _on_armed(self, answer: Any) -> None:
+    silent = set(names)
+    while silent:
+        name = next(turns)
+        if all(each.wait_for_service(LIMIT) for each in (clients[name], stop, arm)):
+            silent -= {name} if ask(clients[name], GetParameters.Request())[0] is not None else set()
+    print(READY, flush=True)
+    for asked in itertools.count(1):
+        time.sleep(PERIOD)
+        if asked % STOP_EVERY:
+            name = next(turns)
+            _, delay = ask(clients[name], GetParameters.Request(names=["use_sim_time"]))
+            print(name, f"{delay:.6f}", flush=True)
+            continue
+        ask(reset, Trigger.Request())
+        answer, _ = ask(arm, SetBool.Request(data=True))
         if answer is None or not answer.success:
             print(UNARMED, flush=True)
-        self._ask(self._stop, Trigger.Request(), lambda answer, delay: self._print(STOP, delay))
-
-    def _greet(self, name: str, answer: Any) -> None:
-        if answer is not None:
-            self._silent.discard(name)
-        if not self._silent:
-            print(READY, flush=True)
-
-    def _print(self, name: str, delay: float) -> None:
-        self._asked += 1
-        print(name, f"{delay:.6f}", flush=True)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the node as a program."""
-    return run(ProbeNode, arguments)
+        print(STOP, f"{ask(stop, Trigger.Request())[1]:.6f}", flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        main()

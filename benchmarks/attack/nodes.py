@@ -61,8 +61,9 @@ class _Attack:
 
     def figures(self) -> tuple[dict[str, Any], list[str]]:
         """Return the figures, with what was broken, and lines for a person."""
-        events, sent = self.events, ", ".join(f"{number} {kind}" for kind, number in self.sent.items())
-        lines = [f"{sent}: {events['ended']} nodes ended, {events['unanswered']} requests without an answer"]
+        counts, sent = {name: self.events[name] for name in ("ended", "unanswered", UNARMED)}, dict(self.sent)
+        words = ", ".join(f"{number} {kind}" for kind, number in sent.items())
+        lines = [f"{words}: {counts['ended']} nodes ended, {counts['unanswered']} requests without an answer"]
         answers = {}
         for name, each in sorted(self.delays.items()):
             median, p99, largest = (float(1e3 * value) for value in np.quantile(each, (0.5, 0.99, 1.0)))
@@ -74,8 +75,7 @@ class _Attack:
                 self.broken.append(f"{name}: {late} of {len(each)} answers {took}")
         if not self.delays[STOP]:
             self.broken.append("no emergency stop was answered")
-        counts = {"ended": events["ended"], "unanswered": events["unanswered"], "unarmed": events[UNARMED]}
-        return {"sent": dict(self.sent), **counts, "answers": answers, "broken": self.broken}, lines
+        return {"sent": sent, **counts, "answers": answers, "broken": self.broken}, lines
 
     def attack(self, count: int, chance: random.Random, clock: bool) -> None:
         """Attack a graph of its own."""
@@ -98,10 +98,9 @@ class _Attack:
                 self.events[UNARMED] += line == UNARMED
 
     def _attack(self, graph: OwnGraph, logs: Path, count: int, chance: random.Random, clock: bool) -> None:
-        context = Context()
+        context, options = Context(), {"start_parameter_services": False}
         rclpy.init(context=context, domain_id=graph.domain, args=[])
-        node = rclpy.create_node("attacker", context=context, start_parameter_services=False)
-        listener = rclpy.create_node("listener", context=context, start_parameter_services=False)
+        node, listener = (rclpy.create_node(name, context=context, **options) for name in ("attacker", "listener"))
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         try:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -25,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power import PowerStage
 from magnetosuture_thread.setups import read_setup
@@ -37,11 +36,10 @@ if TYPE_CHECKING:
 SETUP = "petri_35mm_polyamide"
 BURST, PAUSE = 0.2, 0.3  # s of commands, and of silence on average
 MOVING = 0.3  # s for which the coils must be driven before something is killed
-ATTEMPTS = 12  # to arm, each of up to 10 s
-RESTART_AFTER = 6  # attempts; on a busy machine a bridge takes a minute to start
-START_TIMEOUT = 60.0  # s for processes to start and to be heard, on a busy machine
+START_TIMEOUT = 120.0  # s for a bridge to start and to be heard, on a busy machine
 REARM_AFTER = 10.0  # s without current, after which the bridge is armed again
-TIMEOUT = 30.0  # s for anything to happen
+TIMEOUT = 60.0  # s for anything to happen
+PARTS = ("commander", "tracker", "coil_bridge")
 FULL = 32767  # duty of the full supply
 KILL_BOUND = 0.25  # s; driver_timeout, and the boards' own clock
 SUPPLY, RESISTANCE, INDUCTANCE = 24.0, 1.0, 0.005  # V, ohm, H of the simulated boards and coils
@@ -129,9 +127,6 @@ class BridgeBench:
         client: makes one for the bridge's switches.
         logs: folder of what the processes print.
         progress: called with the share of a stage done, 0 to 1.
-
-    Attributes:
-        restarts: how often a process that was started after a kill was not heard, until the bridge was started anew.
     """
 
     def __init__(
@@ -139,7 +134,6 @@ class BridgeBench:
     ) -> None:
         self.watch = DriveWatch(stage)
         self._nodes, self._client, self._logs, self._progress = nodes, client, logs, progress
-        self.restarts = 0
 
     def start(self, name: str, **parameters: float | str) -> None:
         """Start the bridge, or a stand-in for a commander, a tracker or a fuzzer."""
@@ -214,37 +208,24 @@ class BridgeBench:
         return greatest
 
     def drive(self) -> None:
-        """Wait until the coils have been driven for a while, and start all anew where they are not."""
-        for _ in range(3):
-            try:
-                self.wait(self._driven_for_a_while, "the coils to be driven", START_TIMEOUT)
-                return
-            except GraphError:
-                # A killed process may leave Fast DDS's shared memory such that no later one is heard.
-                self.restarts += 1
-                for name in ("commander", "tracker", "coil_bridge"):
-                    self._nodes.kill(name)
-                for name in ("coil_bridge", "tracker", "commander"):
-                    self.start(name)
-        self.wait(self._driven_for_a_while, "the coils to be driven")
+        """Wait until the coils have been driven for a while."""
+        self.wait(
+            lambda: self._driven() and time.monotonic() - self.watch.turns[-1][0] > MOVING, "the coils to be driven"
+        )
 
     def arm(self) -> None:
-        """Arm the bridge; start it anew where it is not heard."""
-        for attempt in range(ATTEMPTS):
+        """Arm the bridge, which may just start."""
+        deadline = time.monotonic() + START_TIMEOUT
+        while True:
             try:
-                # Another each time: the one that is not heard may be the client.
                 with self._client() as client:
                     client.execute("reset")  # one that was killed while armed waits for it
                     client.execute("arm")
                 return
             except GraphError as error:
                 self._nodes.check()
-                if attempt == ATTEMPTS - 1:
+                if time.monotonic() > deadline:
                     raise GraphError(f"the bridge cannot be armed: {error}") from None
-                if attempt == RESTART_AFTER - 1:
-                    self.restarts += 1
-                    self._nodes.kill("coil_bridge")
-                    self._nodes.start("coil_bridge")
 
     def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
         """Wait until a condition holds.
@@ -262,9 +243,6 @@ class BridgeBench:
     def _driven(self) -> bool:
         self.watch.look()
         return self.watch.driven
-
-    def _driven_for_a_while(self) -> bool:
-        return self._driven() and time.monotonic() - self.watch.turns[-1][0] > MOVING
 
 
 def measure_bridge(
@@ -289,16 +267,11 @@ def measure_bridge(
     Returns:
         The figures: `delays` as of `zero_delays`; `loop`, by how much an interval of the loop differs from its period
         (median, 99th percentile, greatest) [ms], its `rate` [Hz] and the process's `scheduling`; `hostile` messages,
-        the `greatest_current` meanwhile and its limit `max_current` [A]; `restarts` as of `BridgeBench`.
+        the `greatest_current` meanwhile and its limit `max_current` [A].
     """
     # Only here, where it is needed: without ROS the other commands still work.
     from magnetosuture_thread.nodes.clients import CoilClient
-    from magnetosuture_thread.nodes.processes import (
-        NodeProcesses,
-        environment_of,
-        graph_environment,
-        reserved_domain,
-    )
+    from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
 
     settings = read_setup(SETUP).coils
     delays: list[dict[str, Any]] = []
@@ -320,7 +293,9 @@ def measure_bridge(
         file = folder / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**/coil_bridge": {"ros__parameters": parameters}}), encoding="utf-8")
         arguments = ["--params-file", str(read_setup(SETUP).path), "--params-file", str(file)]
-        environment, logs = graph_environment(domain), folder / "logs"
+        # Not by shared memory: what a killed process leaves of it may keep a later one from being heard.
+        environment = {**graph_environment(domain), "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+        logs = folder / "logs"
         stage.open()
         try:
             with environment_of(environment), NodeProcesses((), arguments, environment, logs) as nodes, _load(busy):
@@ -332,7 +307,7 @@ def measure_bridge(
                 with CoilClient() as client:
                     loop, scheduling = client.loop_timing()
                 bench.start("commander")
-                for victim in ("commander", "tracker", "coil_bridge"):
+                for victim in PARTS:
                     log(f"{kills} times kill -9 of the {victim}")
                     add(f"kill -9 of {victim}", bench.kills(victim, kills), KILL_BOUND)
                 log(f"{hostile} hostile messages")
@@ -342,7 +317,7 @@ def measure_bridge(
     return {
         "delays": delays,
         **{"loop": loop, "scheduling": scheduling, "rate": settings.rate, "hostile": hostile},
-        **{"greatest_current": greatest, "max_current": settings.max_current, "restarts": bench.restarts},
+        **{"greatest_current": greatest, "max_current": settings.max_current},
     }
 
 
@@ -355,44 +330,36 @@ def _load(busy: bool) -> Iterator[None]:
         yield
     finally:
         for hog in hogs:
-            hog.send_signal(signal.SIGKILL)
+            hog.kill()
             hog.wait()
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    for name, default, what in (
-        ("trials", 500, "a commander that falls silent"),
-        ("kills", 20, "kill -9 of each process"),
-        ("hostile", 10_000, "hostile messages"),
-    ):
-        parser.add_argument(
-            f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what} (default: {default})"
-        )
+    option = parser.add_argument
+    option("--trials", type=whole_number, default=500, metavar="N", help="a commander that falls silent (default: 500)")
+    option("--kills", type=whole_number, default=20, metavar="N", help="kill -9 of each process (default: 20)")
+    option("--hostile", type=whole_number, default=10_000, metavar="N", help="hostile messages (default: 10000)")
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
     """Time the bridge; return the figures."""
+    given = options.trials, options.kills, options.hostile
     with progress(console, "bridge") as advance:
-        figures = measure_bridge(
-            options.trials, options.kills, options.hostile, log=make_log(console), progress=advance
-        )
+        figures = measure_bridge(*given, log=make_log(console), progress=advance)
     console.print(bridge_table(figures))
     return figures, True
 
 
 def bridge_table(figures: dict[str, Any]) -> Table:
     """Return the figures as a table that fits 80 columns."""
-    table = Table(title="coil bridge with simulated boards, all cores busy; times in ms", title_justify="left")
-    table.caption = f"zero: of the duties of all boards; loop at {figures['rate']:g} Hz, {figures['scheduling']}"
-    table.add_column("", no_wrap=True)
-    for name in ("median", "p99", "maximum", "bound", "beyond"):
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for each in figures["delays"]:
         values = (f"{1e3 * each[name]:.1f}" for name in ("median", "p99", "greatest", "bound"))
-        table.add_row(each["event"], *values, f"{each['beyond']}/{each['count']}")
-    table.add_row("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", "")
+        rows.append((each["event"], *values, f"{each['beyond']}/{each['count']}"))
+    rows.append(("loop off its period", *(f"{value:.2f}" for value in figures["loop"]), "", ""))
     current, limit = f"{figures['greatest_current']:.2f} A", f"{figures['max_current']:.2f} A"
-    table.add_row(f"{figures['hostile']} hostile messages", "", "", current, limit, "alive")
-    table.add_row("restarts after a kill", "", "", "", "", str(figures["restarts"]))
-    return table
+    rows.append((f"{figures['hostile']} hostile messages", "", "", current, limit, "alive"))
+    caption = f"zero: of the duties of all boards; loop at {figures['rate']:g} Hz, {figures['scheduling']}"
+    title, columns = "coil bridge with simulated boards, all cores busy; times in ms", ("median", "p99", "maximum")
+    return make_table(title, ("", *columns, "bound", "beyond"), rows, caption)

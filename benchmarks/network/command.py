@@ -13,6 +13,7 @@ import random
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
-from magnetosuture_thread.commands.command import make_log, progress, whole_number
+from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.setups import read_setup
 
@@ -100,8 +101,12 @@ class CutReport:
         return {"cuts": len(self.zero), **times, **{name: getattr(self, name) for name in names}}
 
 
-class RigWatch:
-    """Subscribes to the currents that the bridge gives to the simulated rig, and to its state.
+class CableBench:
+    """The graph over two hosts, the cable between them, and what the bridge gives to the simulated rig.
+
+    Args:
+        hosts: the rig's and the desk's.
+        processes: none of which may end.
 
     Attributes:
         driven: when the bridge last gave currents that are not zero, by the system's clock [s]; -inf before the first.
@@ -110,29 +115,58 @@ class RigWatch:
         reasons: why the currents are zero.
         spin: takes what comes for a while [s].
         close: leaves the graph.
-
-    Args:
-        processes: none of which may end.
     """
 
-    def __init__(self, processes: Sequence[NodeProcesses]) -> None:
+    def __init__(self, hosts: TwoHosts, processes: Sequence[NodeProcesses]) -> None:
         from magnetosuture_thread.nodes import topics
         from magnetosuture_thread.nodes.clients import Recorder
 
-        self._processes, self._state = processes, topics.BRIDGE_STATE
-        self._currents = topics.RIG_CURRENTS
+        self._hosts, self._processes, self._random = hosts, processes, random.Random(1)
+        self._state, self._currents = topics.BRIDGE_STATE, topics.RIG_CURRENTS
         taken = [self._currents, self._state]
-        self._recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
-        self.close, self.spin = self._recorder.close, self._recorder.spin
+        recorder = Recorder(DOMAIN, taken, simulated_clock=False, receive=self._receive)
+        self.close, self.spin = recorder.close, recorder.spin
         self.driven = self.since = -np.inf
         self.armed, self.reasons = False, ""
 
-    def wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
-        """Take what comes until a condition holds.
+    def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
+        """Pull the cable at random moments."""
+        self._hosts.execute(f"impair {report.delay} {report.loss}")
+        self._wait(self._is_driven, "the coils are not driven", START_TIMEOUT)
+        for number in range(cuts):
+            self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
+            progress((number + 1) / cuts)
+        self._hosts.execute("impair 0 0")
 
-        Raises:
-            GraphError: it does not within the timeout [s].
-        """
+    def _cut(self, report: CutReport, stops: bool) -> None:
+        self._wait(self._is_driven, "the coils are not driven")
+        self.spin(self._random.uniform(0.0, PULL_DELAY))
+        self._wait(lambda: time.time() - self.driven < RECENT, "the coils are not driven")
+        self._hosts.execute("pull")
+        pulled = time.time()
+        self.spin(self._random.uniform(*PULLED_TIME))
+        if stops:
+            _press("stop")
+        report.zero.append(max(0.0, self.driven - pulled))
+        report.late += report.zero[-1] > COMMAND_TIMEOUT
+        self._hosts.execute("plug")
+        plugged, before = time.time(), self.driven
+        if stops:
+            self.spin(STILL_TIME)
+            report.stops += 1
+            report.stops_kept += self.driven == before and not self.armed
+            _press("reset", "arm")
+        else:
+            self._wait(lambda: self.driven > plugged, "the coils are not driven again")
+            report.resumed.append(self.driven - plugged)
+
+    def _is_driven(self) -> bool:
+        """Return whether the coils are driven, and have been for a while."""
+        now = time.time()
+        return now - self.driven < DRIVEN_TIME <= now - self.since
+
+    def _wait(self, condition: Callable[[], bool], what: str, timeout: float = TIMEOUT) -> None:
+        """Take what comes until a condition holds; raise `GraphError` if it does not within the timeout [s]."""
         end = time.monotonic() + timeout
         while not condition():
             for each in self._processes:
@@ -140,11 +174,6 @@ class RigWatch:
             if time.monotonic() > end:
                 raise GraphError(f"after {timeout:g} s {what}; coil_bridge: {self.reasons or 'no reason'}")
             self.spin(0.02)
-
-    def is_driven(self) -> bool:
-        """Whether the coils are driven, and have been for a while."""
-        now = time.time()
-        return now - self.driven < DRIVEN_TIME <= now - self.since
 
     def _receive(self, topic: str, arrival: int, data: bytes) -> None:
         if topic == self._state.channel.recorded:
@@ -157,55 +186,6 @@ class RigWatch:
             if given - self.driven > DRIVEN_TIME:
                 self.since = given
             self.driven = given
-
-
-class TwoHostBench:
-    """The graph over two hosts, and the cable between them.
-
-    Args:
-        hosts: the rig's and the desk's.
-        watch: of the bridge.
-    """
-
-    def __init__(self, hosts: TwoHosts, watch: RigWatch) -> None:
-        self._hosts, self._watch = hosts, watch
-        self._random = random.Random(1)
-
-    def pull_cable(self, report: CutReport, cuts: int, progress: Progress) -> None:
-        """Pull the cable at random moments."""
-        self._hosts.impair(report.delay, report.loss)
-        self._watch.wait(self._watch.is_driven, "the coils are not driven", START_TIMEOUT)
-        for number in range(cuts):
-            self._cut(report, stops=number % STOP_EVERY == STOP_EVERY - 1)
-            progress((number + 1) / cuts)
-        self._hosts.impair(0.0, 0.0)
-
-    def _cut(self, report: CutReport, stops: bool) -> None:
-        watch = self._watch
-        watch.wait(watch.is_driven, "the coils are not driven")
-        watch.spin(self._random.uniform(0.0, PULL_DELAY))
-        watch.wait(lambda: time.time() - watch.driven < RECENT, "the coils are not driven")
-        self._hosts.pull()
-        pulled = time.time()
-        watch.spin(self._random.uniform(*PULLED_TIME))
-        if stops:
-            _press("stop")
-        report.zero.append(max(0.0, watch.driven - pulled))
-        report.late += report.zero[-1] > COMMAND_TIMEOUT
-        self._hosts.plug()
-        plugged = time.time()
-        if stops:
-            report.stops += 1
-            report.stops_kept += not self._is_driven_within(STILL_TIME) and not watch.armed
-            _press("reset", "arm")
-        else:
-            watch.wait(lambda: watch.driven > plugged, "the coils are not driven again")
-            report.resumed.append(watch.driven - plugged)
-
-    def _is_driven_within(self, duration: float) -> bool:
-        before = self._watch.driven
-        self._watch.spin(duration)
-        return self._watch.driven > before
 
 
 def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, progress: Progress) -> list[CutReport]:
@@ -237,16 +217,12 @@ def measure_network(networks: Sequence[tuple[float, float, int]], log: Log, prog
             NodeProcesses(
                 AT_THE_DESK, at_the_desk, environment, Path(folder, "desk"), prefix=hosts.at_the_desk
             ) as desk,
+            closing(CableBench(hosts, (rig, desk))) as bench,
         ):
-            watch = RigWatch((rig, desk))
-            try:
-                bench = TwoHostBench(hosts, watch)
-                for delay, loss, cuts in filter(lambda network: network[2], networks):
-                    log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
-                    reports.append(CutReport(delay, loss))
-                    bench.pull_cable(reports[-1], cuts, progress)
-            finally:
-                watch.close()
+            for delay, loss, cuts in filter(lambda network: network[2], networks):
+                log(f"{cuts} cuts, with packets {1e3 * delay:g} ms late and {100.0 * loss:g} % lost")
+                reports.append(CutReport(delay, loss))
+                bench.pull_cable(reports[-1], cuts, progress)
     return reports
 
 
@@ -265,13 +241,10 @@ def _press(*switches: str) -> None:
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of this benchmark."""
-    for name, default, what in (
-        ("cuts", 150, "cuts of a network as it is"),
-        ("impaired-cuts", 50, f"cuts where packets are {1e3 * DELAY:g} ms late and {100.0 * LOSS:g} %% are lost"),
-    ):
-        parser.add_argument(
-            f"--{name}", type=whole_number, default=default, metavar="N", help=f"{what} (default: {default})"
-        )
+    option, late = parser.add_argument, f"packets are {1e3 * DELAY:g} ms late and {100.0 * LOSS:g} %% are lost"
+    option("--cuts", type=whole_number, default=150, metavar="N", help="cuts of a network as it is (default: 150)")
+    text = f"cuts where {late} (default: 50)"
+    option("--impaired-cuts", type=whole_number, default=50, metavar="N", help=text)
 
 
 def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], bool]:
@@ -286,17 +259,13 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
 
 def network_table(reports: list[CutReport]) -> Table:
     """Return the figures of each network as a table."""
-    table = Table(title="Two hosts, simulated rig")
-    zero = f"at zero within {COMMAND_TIMEOUT:g} s"
-    for heading in ("network", zero, "median, maximum [s]", "goes on [s]", "stops kept"):
-        table.add_column(heading)
+    rows = []
     for report in reports:
         found = report.to_json()
-        table.add_row(
-            f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost",
-            f"{found['cuts'] - report.late} of {found['cuts']}",
-            f"{found['zero_median']:.3f}, {found['zero_maximum']:.3f}",
-            f"{found['resumed_median']:.2f}, {found['resumed_maximum']:.2f}",
-            f"{report.stops_kept} of {report.stops}",
+        zero, resumed = (
+            f"{found[f'{name}_median']:.3f}, {found[f'{name}_maximum']:.3f}" for name in ("zero", "resumed")
         )
-    return table
+        in_time, stops = f"{found['cuts'] - report.late} of {found['cuts']}", f"{report.stops_kept} of {report.stops}"
+        rows.append((f"{1e3 * report.delay:g} ms, {100.0 * report.loss:g} % lost", in_time, zero, resumed, stops))
+    columns = ("network", f"at zero within {COMMAND_TIMEOUT:g} s", "median, maximum [s]", "goes on [s]", "stops kept")
+    return make_table("Two hosts, simulated rig", columns, rows)

@@ -1,20 +1,32 @@
-"""Two hosts and the cable between them, as network namespaces of this machine."""
+"""Two hosts and the cable between them, as network namespaces of this machine.
+
+As a program it is the cable, between two TAP devices, which can be pulled, delay packets and lose them: not every
+kernel can delay and lose packets by itself (netem). Commands come in lines on standard input, and each is answered by
+an empty line: `pull`, `plug`, `impair DELAY LOSS` (s, share).
+"""
 
 from __future__ import annotations
 
 import ctypes
+import fcntl
+import heapq
 import os
+import random
+import select
 import shutil
+import struct
 import subprocess
 import sys
-from types import TracebackType
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
 
 from magnetosuture_thread.errors import GraphError
 
-_CLONE_NEWNET = 0x40000000
+_CLONE_NEWNET, _TUNSETIFF, _TUNSETCARRIER, _IFF_TAP_NO_PI = 0x40000000, 0x400454CA, 0x400454E2, 0x1002
 # Nodes of one machine exchange messages by shared memory, which two hosts do not have in common.
 _OWN_SHARED_MEMORY = 'mount -t tmpfs tmpfs /dev/shm && exec "$0" "$@"'
-COMMANDS = ("ip", "nsenter", "unshare", "mount")
 
 
 class TwoHosts:
@@ -22,100 +34,71 @@ class TwoHosts:
 
     It is meant for the main thread of a process of its own: threads that run already stay where they are.
 
+    Attributes:
+        at_the_desk: what a command begins with that is to run on the desk's host.
+
     Raises:
         GraphError: this process may not make namespaces, or a command for that is missing.
     """
 
     def __init__(self) -> None:
-        self._rig, self._desk = (f"{name}_{os.getpid()}" for name in ("rig", "desk"))
+        self._hosts = [f"{name}_{os.getpid()}" for name in ("rig", "desk")]
+        enter = ("nsenter", f"--net=/run/netns/{self._hosts[1]}", "unshare", "--mount")
+        self.at_the_desk = (*enter, "sh", "-c", _OWN_SHARED_MEMORY)
         self._network = os.open("/proc/self/ns/net", os.O_RDONLY)
-        self._cable: _Cable | None = None
+        self._cable: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> TwoHosts:
         """Make the hosts and the cable, and join the rig's host."""
-        missing = [name for name in COMMANDS if shutil.which(name) is None]
+        missing = [name for name in ("ip", "nsenter", "unshare", "mount") if shutil.which(name) is None]
         if missing:
             raise GraphError(f"{', '.join(missing)}: not found; install iproute2 and util-linux")
+        devices = [f"{host}_{os.getpid() % 100_000}" for host in ("r", "d")]
+        command = [sys.executable, "-m", "benchmarks.network.hosts", *devices]
         try:
-            devices = [f"{host}_{os.getpid() % 100_000}" for host in ("r", "d")]
-            self._cable = _Cable(devices)
-            for number, (host, device) in enumerate(zip((self._rig, self._desk), devices, strict=True), 1):
+            self._cable = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            if self._answer() != "ready":
+                raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
+            for number, (host, device) in enumerate(zip(self._hosts, devices, strict=True), 1):
                 _run("ip", "netns", "add", host)
                 _run("ip", "link", "set", device, "netns", host, "name", "eth0")
                 for name in ("lo", "eth0"):
                     _run("ip", "-n", host, "link", "set", name, "up")
                 _run("ip", "-n", host, "address", "add", f"10.0.0.{number}/24", "dev", "eth0")
                 _run("ip", "-n", host, "route", "add", "default", "dev", "eth0")
-            _join(f"/run/netns/{self._rig}")
+            _join(f"/run/netns/{self._hosts[0]}")
         except BaseException:
             self._remove()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Join the machine's own network again, and remove the hosts."""
         _join(f"/proc/self/fd/{self._network}")
         self._remove()
 
-    @property
-    def at_the_desk(self) -> tuple[str, ...]:
-        """What a command begins with that is to run on the desk's host."""
-        enter = ("nsenter", f"--net=/run/netns/{self._desk}", "unshare", "--mount")
-        return (*enter, "sh", "-c", _OWN_SHARED_MEMORY)
-
-    def pull(self) -> None:
-        """Pull the cable at the desk, whose host sees that; the rig's sees nothing but silence."""
-        self._execute("pull")
-
-    def plug(self) -> None:
-        """Put it back."""
-        self._execute("plug")
-
-    def impair(self, delay: float, loss: float) -> None:
-        """Delay and lose packets, in either direction.
+    def execute(self, command: str) -> None:
+        """Pull the cable at the desk, whose host sees that (the rig's sees nothing but silence), plug or impair it.
 
         Args:
-            delay: of each packet [s].
-            loss: share of packets that is lost, 0 to 1; with 0 and no delay the cable is as before.
+            command: `pull`, `plug`, or `impair DELAY LOSS` [s, share of packets].
         """
-        self._execute(f"impair {delay} {loss}")
-
-    def _execute(self, command: str) -> str:
         assert self._cable is not None
-        return self._cable.execute(command)
+        assert self._cable.stdin is not None
+        self._cable.stdin.write(f"{command}\n")
+        self._cable.stdin.flush()
+        self._answer()
+
+    def _answer(self) -> str:
+        assert self._cable is not None
+        assert self._cable.stdout is not None
+        return self._cable.stdout.readline().strip()
 
     def _remove(self) -> None:
         if self._cable is not None:
-            self._cable.end()
-        for host in (self._rig, self._desk):
+            self._cable.communicate()  # its devices end with it
+        for host in self._hosts:
             subprocess.run(("ip", "netns", "delete", host), capture_output=True, check=False)
-
-
-class _Cable:
-    """The process of a cable between two TAP devices, which are there once it is made."""
-
-    def __init__(self, devices: list[str]) -> None:
-        command = [sys.executable, "-m", "benchmarks.network.cable", *devices]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        if self._answer() != "ready":
-            raise GraphError("no TAP device can be made; that takes root's rights and /dev/net/tun")
-
-    def execute(self, command: str) -> str:
-        """Execute a command; return the answer."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{command}\n")
-        self._process.stdin.flush()
-        return self._answer()
-
-    def end(self) -> None:
-        """End it; its devices end with it."""
-        self._process.communicate()
-
-    def _answer(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline().strip()
 
 
 def _run(*command: str) -> None:
@@ -131,3 +114,66 @@ def _join(path: str) -> None:
             raise GraphError(f"setns: {os.strerror(ctypes.get_errno())}")
     finally:
         os.close(descriptor)
+
+
+def carry(
+    ends: tuple[int, int], inlet: int, set_carrier: Callable[[bool], None], answer: Callable[[str], None]
+) -> None:
+    """Take frames from each of two devices to the other until the commands end.
+
+    Frames that are on their way when the cable is pulled arrive all the same.
+
+    Args:
+        ends: file descriptors of the devices, which do not block.
+        inlet: file descriptor that the commands come from.
+        set_carrier: tells the second device whether it is connected.
+        answer: called once a command is executed.
+    """
+    waiting: list[tuple[float, int, int, bytes]] = []  # due, order, end that gets it, frame
+    pulled, delay, loss, commands, chance, order = False, 0.0, 0.0, b"", random.Random(1), count()
+    while True:
+        left = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
+        ready, _, _ = select.select([*ends, inlet], [], [], left)
+        for end in (0, 1):
+            if ends[end] in ready:
+                frame = os.read(ends[end], 65536)
+                if not pulled and chance.random() >= loss and len(waiting) < 10_000:
+                    heapq.heappush(waiting, (time.monotonic() + delay, next(order), 1 - end, frame))
+        if inlet in ready:
+            if not (read := os.read(inlet, 4096)):
+                return
+            *lines, commands = (commands + read).split(b"\n")
+            for name, *values in (line.decode().split() for line in lines):
+                if name == "impair":
+                    delay, loss = map(float, values)
+                else:
+                    pulled = name == "pull"
+                    set_carrier(not pulled)
+                answer("")
+        while waiting and waiting[0][0] <= time.monotonic():
+            _, _, end, frame = heapq.heappop(waiting)
+            with suppress(OSError):  # the host has taken its device down
+                os.write(ends[end], frame)
+
+
+def _make_device(name: str) -> int:
+    descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
+    fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TAP_NO_PI))
+    return descriptor
+
+
+def main(first: str, second: str) -> None:
+    """Make two TAP devices, which last as long as this process, and connect them."""
+    ends = _make_device(first), _make_device(second)
+    print("ready", flush=True)
+    carrier = ends[1], _TUNSETCARRIER
+    carry(
+        ends,
+        sys.stdin.fileno(),
+        lambda present: fcntl.ioctl(*carrier, struct.pack("i", present)),
+        lambda text: print(text, flush=True),
+    )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

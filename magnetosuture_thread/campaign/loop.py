@@ -19,18 +19,7 @@ from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.messages.packing import (
-    Outputs,
-    camera_outputs,
-    estimate_outputs,
-    ground_truth_outputs,
-    packed_currents,
-    packed_filter_state,
-    packed_twist,
-    pose_outputs,
-    prediction_outputs,
-    thread_outputs,
-)
+from magnetosuture_thread.messages import packing
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.rig.camera import encode_jpeg
@@ -144,22 +133,17 @@ class ClosedLoop:
         coil_gains: Vector | None = None,
         recorder: LoopRecorder | None = None,
     ) -> None:
-        self._recorder = recorder
         self.setup, self.rig, self._controller = setup, rig, controller
-        self._random = np.random.default_rng([seed, 1])
-        self._losses = losses
+        self._recorder = recorder
+        self._random, self._losses = np.random.default_rng([seed, 1]), losses
         self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
-        latch = ArmingLatch()
+        latch, self._driver = ArmingLatch(), DriverState(True)
         self.bridge = CoilBridge(setup.coils, latch, setup.scene)
-        self._driver = DriverState(True)
         latch.activate()
         self.bridge.arm(self._driver)
         self.session = ThreadSession(setup.model, setup.scene)
         self._tracker = TrackerSession(setup.vision, setup.scene) if camera else None
-        self.now = START
-        self._period = 1.0 / setup.coils.rate
-        self._frame_period = 1.0 / setup.rig.frame_rate
-        self._next_frame = START
+        self.now = self._next_frame = START
         self._waiting: list[Measurement] = []
         self._count = 0
         self._condition = ThreadCondition(problem="no thread yet")
@@ -174,7 +158,7 @@ class ClosedLoop:
         """
         frame = None
         if self.now >= self._next_frame - 1e-9:
-            self._next_frame += self._frame_period
+            self._next_frame += 1.0 / self.setup.rig.frame_rate
             frame = self._look()
         else:
             self.rig.advance(self.now - START)
@@ -185,7 +169,7 @@ class ClosedLoop:
         if self._recorder is not None:
             self._recorder.on_bridge(self.now, output)
         self.rig.apply(self._gains * output.allocation.currents, self.now - START)
-        self.now += self._period
+        self.now += 1.0 / self.setup.coils.rate
         return frame
 
     def _look(self) -> LoopFrame:
@@ -193,8 +177,7 @@ class ClosedLoop:
         if self._recorder is not None:
             self._recorder.on_frame(self.now, frame)
         lost = self._random.uniform() < self._losses
-        measured = None if lost else self._measure(frame)
-        if measured is not None:
+        if not lost and (measured := self._measure(frame)) is not None:
             heapq.heappush(self._waiting, measured)
         return LoopFrame(
             self.now - START,
@@ -209,19 +192,18 @@ class ClosedLoop:
 
     def _measure(self, frame: RigFrame) -> Measurement | None:
         due = self.now + LATENCY
-        if self._tracker is not None:
-            if frame.image is None:
-                return None
-            track = self._tracker.on_image(self.now, frame.image).track
-            if not len(track.tail) or len(track.heading) == 0:
-                return None
-            observation = track.observation
-            return Measurement(due, self.now, track.tail, track.heading, track.covariance, observation)
-        tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
-        angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
-        covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
-        heading = np.array([math.cos(angle), math.sin(angle)])
-        return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+        if self._tracker is None:
+            tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
+            angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
+            covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
+            heading = np.array([math.cos(angle), math.sin(angle)])
+            return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+        if frame.image is None:
+            return None
+        track = self._tracker.on_image(self.now, frame.image).track
+        if not len(track.tail) or len(track.heading) == 0:
+            return None
+        return Measurement(due, self.now, track.tail, track.heading, track.covariance, track.observation)
 
     def _observe(self, thread: Points) -> ThreadObservation:
         """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
@@ -230,13 +212,8 @@ class ClosedLoop:
         points = points_at(thread, at)
         knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
         noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
-        piece = ThreadPiece(
-            points + THREAD_DEVIATION * noise,
-            np.full(len(points), THREAD_DEVIATION),
-            PieceEnd.TAIL,
-            PieceEnd.FREE,
-            (0.0, 0.0),
-        )
+        deviation, ends = np.full(len(points), THREAD_DEVIATION), (PieceEnd.TAIL, PieceEnd.FREE)
+        piece = ThreadPiece(points + THREAD_DEVIATION * noise, deviation, *ends, (0.0, 0.0))
         return ThreadObservation((piece,), complete=True)
 
     def _measured(self, measured: Measurement) -> None:
@@ -253,9 +230,8 @@ class ClosedLoop:
         result = self.session.on_pose(nanoseconds, pose)
         self.session.late_estimates()
         margins = result.margins
-        self.bridge.on_margins(
-            stamp, margins is not None, margins.friction.slowdown if margins else 1.0, result.scene_version, now
-        )
+        slowdown = margins.friction.slowdown if margins else 1.0
+        self.bridge.on_margins(stamp, margins is not None, slowdown, result.scene_version, now)
         self._condition = replace(condition_of(result), drift=self._drift)
         if self.setup.coils.friction_feedback != "all":
             self._condition = replace(self._condition, slowdown=1.0)
@@ -270,20 +246,14 @@ def condition_of(result: PredictionResult) -> ThreadCondition:
     thread = result.estimate or result.prediction
     if thread is None:
         return ThreadCondition(problem=result.reason)
-    margins, problem = result.margins, ""
-    if margins is None:
-        problem = result.reason
-    estimate = result.estimate
+    margins, estimate, forces = result.margins, result.estimate, result.prediction and result.prediction.forces
+    problem = result.reason if margins is None else ""
     if estimate is not None and estimate.unmeasured_for > 1.0:  # s, after which it is unsure
         problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
-    forces = result.prediction.forces if result.prediction is not None else None
-    return ThreadCondition(
-        thread.positions,
-        forces.peak_tension if forces is not None else 0.0,
-        len(margins.friction.nodes) if margins is not None else 0,
-        margins.friction.slowdown if margins is not None else 1.0,
-        problem,
-    )
+    tension, nodes, slowdown = forces.peak_tension if forces else 0.0, 0, 1.0
+    if margins is not None:
+        nodes, slowdown = len(margins.friction.nodes), margins.friction.slowdown
+    return ThreadCondition(thread.positions, tension, nodes, slowdown, problem)
 
 
 class RunBag:
@@ -292,50 +262,45 @@ class RunBag:
     Args:
         bag: to write to.
         setup: what the nodes believe.
-        start: time of its begin [s].
         camera: whether frames are rendered.
     """
 
-    def __init__(self, bag: BagWriter, setup: Setup, start: float, *, camera: bool) -> None:
+    def __init__(self, bag: BagWriter, setup: Setup, *, camera: bool) -> None:
         self._bag, self._rig, self._material = bag, setup.rig, setup.model.material
         for channel in (*RECORDED, *((interface.COMPRESSED_IMAGE, interface.CAMERA_INFO) if camera else ())):
             bag.add_topic(channel.recorded, channel.type_name)
-        begin = _nanoseconds(start)
+        begin = round(1e9 * START)
         bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
         self._view = setup.rig.view(setup.scene)
         self._command = 0  # stamp of the last [ns]
 
     def on_frame(self, now: float, frame: RigFrame) -> None:
         """Write a frame, if it was rendered, and the ground truth."""
-        stamp, rig = _nanoseconds(now), self._rig
+        stamp, rig = round(1e9 * now), self._rig
         if frame.image is not None:
             jpeg, size = encode_jpeg(frame.image, rig.jpeg_quality), (rig.camera_width, rig.camera_height)
-            self._write(stamp, camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
-        self._write(stamp, ground_truth_outputs(stamp, frame))
+            self._write(stamp, packing.camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
+        self._write(stamp, packing.ground_truth_outputs(stamp, frame))
 
     def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
         """Write what was measured, predicted and estimated in a frame, and the command that came of it."""
-        time, stamp, observation = _nanoseconds(now), result.stamp, measured.observation
-        self._write(time, pose_outputs(stamp, measured.tail, measured.heading, measured.covariance))
+        time, stamp, observation = round(1e9 * now), result.stamp, measured.observation
+        self._write(time, packing.pose_outputs(stamp, measured.tail, measured.heading, measured.covariance))
         if observation is not None:
-            self._write(time, thread_outputs(stamp, observation, observation.from_tail))
-        self._write(time, prediction_outputs(result, self._material))
-        self._write(time, estimate_outputs(result))
-        self._bag.write(interface.NEEDLE_COMMAND.recorded, time, packed_twist(time, commanded))
+            self._write(time, packing.thread_outputs(stamp, observation, observation.from_tail))
+        self._write(time, packing.prediction_outputs(result, self._material))
+        self._write(time, packing.estimate_outputs(result))
+        self._bag.write(interface.NEEDLE_COMMAND.recorded, time, packing.packed_twist(time, commanded))
         self._command = time
 
     def on_bridge(self, now: float, output: BridgeOutput) -> None:
         """Write currents and what became of the command, from the first command on."""
-        time = _nanoseconds(now)
+        time = round(1e9 * now)
         if not (output.publish and self._command):
             return
-        self._bag.write(interface.CURRENTS.recorded, time, packed_currents(time, self._command, output))
-        self._bag.write(interface.FILTER_STATE.recorded, time, packed_filter_state(self._command, output))
+        self._bag.write(interface.CURRENTS.recorded, time, packing.packed_currents(time, self._command, output))
+        self._bag.write(interface.FILTER_STATE.recorded, time, packing.packed_filter_state(self._command, output))
 
-    def _write(self, time: int, outputs: Outputs) -> None:
+    def _write(self, time: int, outputs: packing.Outputs) -> None:
         for channel, data in outputs:
             self._bag.write(channel.recorded, time, data)
-
-
-def _nanoseconds(time: float) -> int:
-    return round(1e9 * time)

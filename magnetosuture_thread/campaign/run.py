@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,7 @@ from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecord
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.executor import (
-    ENDED,
-    UNLIMITED,
-    PendingPath,
-    ProcedureExecutor,
-    ProcedureState,
-    ThreadCondition,
-    plan_now,
-)
+from magnetosuture_thread.planning import executor
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
@@ -32,7 +25,6 @@ from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
 
 MAX_TIME = 600.0  # s; of a run
-PLANNING_TIME = 0.2  # s; in which a path is planned: 0.01 in the open, 0.5 through a gap and around a shape
 # What a run must keep to succeed, besides its goals.
 KEEP_OUT_TOLERANCE = 5e-6  # m
 PENETRATION_TOLERANCE = 1e-6  # m
@@ -87,11 +79,8 @@ def vary(setup: Setup, seed: int) -> Variation:
     x, y, heading = rig.needle_start
     for _ in range(100):
         dx, dy = 1e-3 * random.uniform(-1.0, 1.0, 2)
-        start = (
-            x + float(dx),
-            y + float(dy),
-            math.remainder(heading + 0.15 * random.uniform(-1.0, 1.0), math.tau),
-        )
+        turned = math.remainder(heading + 0.15 * random.uniform(-1.0, 1.0), math.tau)
+        start = (x + float(dx), y + float(dy), turned)
         curvature = rig.thread_start_curvature * factor(0.3)
         drawn = replace(changed, needle_start=start, thread_start_curvature=curvature)
         try:
@@ -133,7 +122,7 @@ class RunFigures:
     max_tension_n: float = 0.0
     max_friction_nodes: int = 0
     max_tension_excess_n: float = -math.inf
-    max_friction_excess: int = -UNLIMITED
+    max_friction_excess: int = -executor.UNLIMITED
 
     def beyond_limits(self, keep_out: float) -> dict[str, str]:
         """Return what a run did not keep: by the name of the figure, what was found and what is allowed.
@@ -144,26 +133,20 @@ class RunFigures:
             keep_out: of the bridge [m].
         """
         clearance, allowed = self.min_needle_clearance_m, keep_out - KEEP_OUT_TOLERANCE
-        ratio = MAX_TIME_RATIO * self.ideal_time_s
+        deep, rest, ratio = self.max_thread_penetration_m, self.longest_rest_s, MAX_TIME_RATIO * self.ideal_time_s
         tension, friction = self.max_tension_excess_n, self.max_friction_excess
-        checks = {
-            "min_needle_clearance_m": (
-                clearance < allowed,
-                f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)",
-            ),
-            "max_thread_penetration_m": (
-                self.max_thread_penetration_m > PENETRATION_TOLERANCE,
-                f"a node of the thread {1e6 * self.max_thread_penetration_m:.1f} um in wall or shape",
-            ),
-            "longest_rest_s": (
-                self.longest_rest_s > MAX_REST,
-                f"a rest of {self.longest_rest_s:.1f} s ({MAX_REST:g} allowed)",
-            ),
-            "max_tension_n": (tension > 0.0, f"a tension {1e3 * tension:.3g} mN above the limit of its goal"),
-            "max_friction_nodes": (friction > 0, f"{friction} more nodes under friction than its goal allows"),
-            "time_s": (self.time_s > ratio > 0.0, f"{self.time_s:.0f} s ({ratio:.0f} allowed)"),
-        }
-        return {name: words for name, (is_broken, words) in checks.items() if is_broken}
+        near = f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)"
+        within = f"a node of the thread {1e6 * deep:.1f} um in wall or shape"
+        strong = f"a tension {1e3 * tension:.3g} mN above the limit of its goal"
+        checks = (
+            ("min_needle_clearance_m", clearance < allowed, near),
+            ("max_thread_penetration_m", deep > PENETRATION_TOLERANCE, within),
+            ("longest_rest_s", rest > MAX_REST, f"a rest of {rest:.1f} s ({MAX_REST:g} allowed)"),
+            ("max_tension_n", tension > 0.0, strong),
+            ("max_friction_nodes", friction > 0, f"{friction} more nodes under friction than its goal allows"),
+            ("time_s", self.time_s > ratio > 0.0, f"{self.time_s:.0f} s ({ratio:.0f} allowed)"),
+        )
+        return {name: words for name, is_broken, words in checks if is_broken}
 
 
 @dataclass(frozen=True)
@@ -329,19 +312,10 @@ def run_procedure(
     """
     planner = setup.planner.planner(setup.scene)
     planner.check(procedure)
-    pilot = _Pilot(procedure, planner)
-    executor = pilot.executor
-    rig = Rig(variation.setup.rig, setup.scene)
-    loop = ClosedLoop(
-        setup,
-        rig,
-        pilot.compute_command,
-        variation.seed,
-        camera=camera,
-        losses=variation.losses,
-        coil_gains=variation.coil_gains,
-        recorder=recorder,
-    )
+    pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
+    execution = pilot.executor
+    truth: dict[str, Any] = {"losses": variation.losses, "coil_gains": variation.coil_gains, "recorder": recorder}
+    loop = ClosedLoop(setup, rig, pilot.compute_command, variation.seed, camera=camera, **truth)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     figures = extremes.figures
@@ -352,74 +326,57 @@ def run_procedure(
             frame = loop.step()
             if frame is None:
                 continue
-            running = executor.state is ProcedureState.RUNNING
-            extremes.update(frame, running, executor.goal, None if executor.path is None else executor.path.middles)
+            running, path = execution.state is executor.ProcedureState.RUNNING, execution.path
+            extremes.update(frame, running, execution.goal, None if path is None else path.middles)
             if math.isnan(began) and running:
-                began, planned = frame.time, _planned_time(executor, frame)
-            ahead = max(0.0, executor.travel - before)
-            before = executor.travel
+                began, planned = frame.time, _planned_time(execution, frame)
+            ahead = max(0.0, execution.travel - before)
+            before = execution.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
-            if executor.state in ENDED:
-                reason = executor.reason
+            if execution.state in executor.ENDED:
+                reason = execution.reason
                 break
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"
     figures.time_s = rig.time - began if math.isfinite(began) else rig.time
     figures.ideal_time_s = planned * (weighted / way if way > 0.0 else 1.0)
-    reached = executor.state is ProcedureState.DONE
+    reached = execution.state is executor.ProcedureState.DONE
     reasons = [*filter(None, [reason]), *figures.beyond_limits(setup.coils.keep_out).values()]
-    return RunResult(
-        variation.seed,
-        not reasons,
-        "; ".join(reasons),
-        reached,
-        len(procedure.goals) if reached else executor.goal,
-        figures,
-        rig.time,
-        extremes.last_instants() if reasons else (),
-        extremes.closest if reasons else None,
-    )
+    met = len(procedure.goals) if reached else execution.goal
+    last, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
+    words = "; ".join(reasons)
+    return RunResult(variation.seed, not reasons, words, reached, met, figures, rig.time, last, closest)
 
 
-def _planned_time(executor: ProcedureExecutor, frame: LoopFrame) -> float:
+def _planned_time(execution: executor.ProcedureExecutor, frame: LoopFrame) -> float:
     """Return the time of the paths from here to the end at their goals' speeds [s]; 0, and end it, without a way."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
     try:
-        paths = executor.planner.plan_all(executor.procedure, *executor.planner.pose(frame.tail, heading))
+        paths = execution.planner.plan_all(execution.procedure, *execution.planner.pose(frame.tail, heading))
     except PlanningError as error:
-        executor.abort(str(error))
+        execution.abort(str(error))
         return 0.0
-    return planned_duration(executor.procedure, paths)
-
-
-@dataclass(frozen=True)
-class _PlannedPath:
-    """A path that is known after the time that planning takes."""
-
-    path: PendingPath
-    is_due: Callable[[], bool]
-
-    def done(self) -> bool:
-        return self.is_due()
-
-    def result(self) -> BodyPath:
-        return self.path.result()
+    return planned_duration(execution.procedure, paths)
 
 
 class _Pilot:
-    """Executes a procedure as the needle planner does: paths are ready `PLANNING_TIME` after they are asked for."""
+    """Executes a procedure as the needle planner does: paths are ready 0.2 s after they are asked for.
+
+    Planning takes 0.01 s in the open, 0.5 s through a gap and around a shape.
+    """
 
     def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
-        self.executor = ProcedureExecutor(procedure, planner, self._submit)
+        self.executor = executor.ProcedureExecutor(procedure, planner, self._submit)
         self._now = 0.0
 
-    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: ThreadCondition) -> Vector:
+    def compute_command(self, stamp: float, tail: Vector, heading: Vector, thread: executor.ThreadCondition) -> Vector:
         """Return the velocity of the tip, and begin as soon as the thread is known."""
         self._now = stamp
-        if self.executor.state is ProcedureState.READY and not thread.problem:
+        if self.executor.state is executor.ProcedureState.READY and not thread.problem:
             self.executor.start()
         return self.executor.update(stamp, tail, heading, thread)
 
-    def _submit(self, task: Callable[[], BodyPath]) -> PendingPath:
-        due = self._now + PLANNING_TIME
-        return _PlannedPath(plan_now(task), lambda: self._now >= due - 1e-9)
+    def _submit(self, task: Callable[[], BodyPath]) -> executor.PendingPath:
+        due, path = self._now + 0.2, executor.plan_now(task)
+        pending: Any = SimpleNamespace(done=lambda: self._now >= due - 1e-9, result=path.result)
+        return pending

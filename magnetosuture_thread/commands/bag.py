@@ -8,26 +8,14 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from rich.text import Text
 
 from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import pluralize
-from magnetosuture_thread.commands.command import (
-    DONE,
-    FAILED,
-    Terminal,
-    add_actions,
-    add_remap,
-    output_file,
-    write_json,
-)
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.texts import one_line
-
-MAX_PLACES = 100  # of damage that are shown; `--json` writes all
 
 DESCRIPTION = """\
 Check a recorded bag, or repair it.
@@ -38,16 +26,16 @@ BAG is an mcap or sqlite3 file of any recorder, or the folder of a bag.
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    check, repair = add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, repair=run_repair)
+    check, repair = command.add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, repair=run_repair)
     for action in (check, repair):
         action.add_argument("bag", type=Path, metavar="BAG", help="a bag's file or folder")
-        add_remap(action)
+        command.add_remap(action)
     check.add_argument("--frame", default="dish", metavar="NAME", help="the bag's name of the dish frame")
-    check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    check.add_argument("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
     repair.add_argument("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
 
 
-def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Report what a bag holds, and whether it is intact.
 
     The whole bag is read: every checksum, and every message's time and stamp. For each topic: its type, how
@@ -60,11 +48,11 @@ def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
     terminal.print(_table(found))
     for line in _lines(found):
         terminal.log(line)
-    write_json(options.json, found)
-    return FAILED if found["damage"] or found["refused"] or found["unverified"] else DONE
+    command.write_json(options.json, found)
+    return command.FAILED if found["damage"] or found["refused"] or found["unverified"] else command.DONE
 
 
-def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_repair(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Write every intact message of a bag into a new one.
 
     Messages, their times and numbers, definitions and notes stay as they are; chunks, indices and metadata.yaml are
@@ -95,7 +83,7 @@ def run_repair(options: argparse.Namespace, terminal: Terminal) -> int:
     lines += _shown([f"{place}{_times(place.first, place.last, bag.start)}" for place in places])
     for line in (*lines, f"{report.messages} messages in {options.output}"):
         terminal.log(line)
-    return DONE
+    return command.DONE
 
 
 def _times(first: int | None, last: int | None, start: int) -> str:
@@ -108,24 +96,22 @@ def _times(first: int | None, last: int | None, start: int) -> str:
 
 
 def _shown(places: list[str]) -> list[str]:
-    """Return a line for each damaged place, and how many are not shown."""
-    others = len(places) - MAX_PLACES
-    return [f"  {place}" for place in places[:MAX_PLACES]] + ([f"  and {others} other places"] if others > 0 else [])
+    """Return a line for each of 100 damaged places, and how many are not shown; `--json` writes all."""
+    others = len(places) - 100
+    return [f"  {place}" for place in places[:100]] + ([f"  and {others} other places"] if others > 0 else [])
 
 
 def _table(found: dict[str, Any]) -> Table:
     """Return a row for each topic."""
-    table = Table(title=f"{found['messages']} messages in {found['duration_s']:.3f} s", box=SIMPLE_HEAD, padding=0)
-    table.caption = "times in s since the first message; * is taken by our graph"
-    table.add_column("topic", overflow="fold")
-    for name in ("messages", "Hz", "first", "last", "gap", "back"):
-        table.add_column(name, justify="right", no_wrap=True)
+    rows = []
     for topic in found["topics"]:
         times = (topic[key] for key in ("rate_hz", "first_s", "last_s", "greatest_gap_s"))
-        name, messages = one_line(topic["topic"]) + (" *" if topic["known"] else ""), str(topic["messages"])
         cells = ("-" if value is None else f"{value:.2f}" for value in times)
-        table.add_row(Text(name), messages, *cells, str(topic["stamps_going_back"]))
-    return table
+        name = one_line(topic["topic"]) + (" *" if topic["known"] else "")
+        rows.append((name, str(topic["messages"]), *cells, str(topic["stamps_going_back"])))
+    title = f"{found['messages']} messages in {found['duration_s']:.3f} s"
+    caption = "times in s since the first message; * is taken by our graph"
+    return command.make_table(title, ("topic", "messages", "Hz", "first", "last", "gap", "back"), rows, caption)
 
 
 def _lines(found: dict[str, Any]) -> Iterator[str]:

@@ -7,41 +7,30 @@ from dataclasses import replace
 
 import numpy as np
 
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    add_frames,
-    number_argument,
-    output_file,
-    runs,
-)
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.commands.track import FrameSource
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.texts import one_line
-from magnetosuture_thread.vision.calibration import (
-    calibrate_by_dish,
-    calibrate_by_markers,
-    measure_needle_length,
-)
+from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
 from magnetosuture_thread.vision.lens import read_lens
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_calibrate_camera)
+    command.runs(parser, run_calibrate_camera)
     option = parser.add_argument
-    add_frames(parser)
+    command.add_frames(parser)
     diameter = "inner diameter of the dish [m]"
-    option("--dish-diameter", type=number_argument(0.005, 0.5), required=True, metavar="D", help=diameter)
+    option("--dish-diameter", type=command.number_argument(0.005, 0.5), required=True, metavar="D", help=diameter)
     markers = "of the ArUco markers around the dish [m] (default: by the dish's rim)"
-    option("--markers", type=number_argument(1e-3, 2.0), nargs=2, metavar=("SPACING", "SIDE"), help=markers)
+    option("--markers", type=command.number_argument(1e-3, 2.0), nargs=2, metavar=("SPACING", "SIDE"), help=markers)
     needle = "measure the needle's length too: its length, known within 10 %%, and the width of its body [m]"
-    option("--needle", type=number_argument(5e-5, 0.05), nargs=2, metavar=("LENGTH", "WIDTH"), help=needle)
-    option("--output", type=output_file, required=True, metavar="FILE", help="parameter file to write")
+    option("--needle", type=command.number_argument(5e-5, 0.05), nargs=2, metavar=("LENGTH", "WIDTH"), help=needle)
+    option("--output", type=command.output_file, required=True, metavar="FILE", help="parameter file to write")
 
 
-def run_calibrate_camera(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find where the dish is in the camera's image.
 
     The result is its centre, the scale and, by markers, the rotation. FILE gets a section vision_tracker of a ROS 2
@@ -65,15 +54,15 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: Terminal) -> int
         problem = lens.problem_with(frame.image.shape) if lens is not None else None
         if problem is not None and given is not None:
             raise problem
-        images.append(frame.image if lens is None or problem is not None else lens.undistorted(frame.image))
+        images.append(np.asarray(frame.image if lens is None or problem else lens.undistorted(frame.image)))
     source.log_refused(terminal.log)
     if not images:
         raise BagError(options.frames[0], "holds no frame that can be read")
-    images = [np.asarray(image) for image in images]
-    if options.markers is None:
-        found = calibrate_by_dish(images, options.dish_diameter)
-    else:
+    by_markers = options.markers is not None
+    if by_markers:
         found = calibrate_by_markers(images, options.dish_diameter, *options.markers)
+    else:
+        found = calibrate_by_dish(images, options.dish_diameter)
     if options.needle is not None:
         found = replace(found, needle_length=measure_needle_length(images, found, *options.needle))
     with whole_file(options.output) as partial:
@@ -82,9 +71,9 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: Terminal) -> int
     u, v = found.view.centre_px
     scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
     terminal.log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
-    by = f"markers, residual {found.residual_px:.2f} px" if options.markers else "the dish's rim"
+    by = f"markers, residual {found.residual_px:.2f} px" if by_markers else "the dish's rim"
     terminal.log(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
     if found.needle_length is not None:
         terminal.log(f"the needle is {1e3 * found.needle_length:.3f} mm long")
     terminal.log(f"parameters: {options.output}")
-    return DONE
+    return command.DONE

@@ -13,22 +13,20 @@ from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.coils.calibration import fit_calibration, read_measurements
-from magnetosuture_thread.commands.command import DONE, Terminal, output_file, runs
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_file
-
-MAX_BACKGROUND = 1e-3  # T; that of the earth is a twentieth of it
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_calibrate_coils)
+    command.runs(parser, run_calibrate_coils)
     option = parser.add_argument
     option("measurements", type=Path, metavar="MEASUREMENTS", help="CSV file")
-    option("--output", type=output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
+    option("--output", type=command.output_file, required=True, metavar="FILE", help="calibration to write (YAML)")
     option("--name", default="", metavar="RIG", help="the rig's name (default: the file's)")
 
 
-def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find the coils' properties from probe measurements.
 
     The model of the coils is fitted to what a probe measured in the dish, and written as a calibration, which the
@@ -42,9 +40,9 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
     """
     fit = fit_calibration(read_measurements(options.measurements))
     x, y = fit.background
-    if math.hypot(x, y) > MAX_BACKGROUND:
-        text, expected = f"a background of {1e3 * math.hypot(x, y):.3g} mT", f"at most {1e3 * MAX_BACKGROUND:g} mT"
-        raise InvalidInputError(str(options.measurements), text, f"{expected}; are all fields in T?")
+    if math.hypot(x, y) > 1e-3:  # T; that of the earth is a twentieth of it
+        text = f"a background of {1e3 * math.hypot(x, y):.3g} mT"
+        raise InvalidInputError(str(options.measurements), text, "at most 1 mT; are all fields in T?")
     source = f"from {fit.readings} readings in {options.measurements.name}"
     notes = f"{source}, residual {fit.residual:.2e} T, background {x:.2e}, {y:.2e} T"
     date = datetime.date.today().isoformat()
@@ -62,20 +60,19 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: Terminal) -> int:
         if coil["poor"]:
             terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")
     terminal.log(f"calibration: {options.output}")
-    return DONE
+    return command.DONE
 
 
 def _coil_table(fit: dict[str, Any]) -> Table:
     """Return a row for each coil, as `CalibrationFit.to_json` gives them."""
-    table = Table(title=f"coils as {fit['model']}")
-    table.caption = "with standard deviations; ? is poorly determined"
-    for name in ("coil", "angle [deg]", "distance [mm]", "radius [mm]", "field [mT/A]", "residual [uT]"):
-        table.add_column(name, justify="left" if name == "coil" else "right", no_wrap=True)
+    names = ("coil", "angle [deg]", "distance [mm]", "radius [mm]", "field [mT/A]", "residual [uT]")
     columns = (("angle", math.degrees(1.0), 2), ("distance", 1e3, 2), ("radius", 1e3, 2), ("field_per_current", 1e3, 4))
-    for coil in fit["coils"]:
-        values = (_value(coil, *column) for column in columns)
-        table.add_row(coil["name"], *values, f"{1e6 * coil['residual']:.1f}")
-    return table
+    rows = [
+        (coil["name"], *(_value(coil, *column) for column in columns), f"{1e6 * coil['residual']:.1f}")
+        for coil in fit["coils"]
+    ]
+    caption = "with standard deviations; ? is poorly determined"
+    return command.make_table(f"coils as {fit['model']}", names, rows, caption)
 
 
 def _value(coil: dict[str, Any], key: str, scale: float, digits: int) -> str:

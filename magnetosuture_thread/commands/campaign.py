@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from collections.abc import Collection
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,30 +17,12 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-from rich.table import Table
 
 from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.campaign.loop import START, RunBag
-from magnetosuture_thread.campaign.run import (
-    KEEP_OUT_TOLERANCE,
-    MAX_REST,
-    MAX_TIME_RATIO,
-    PENETRATION_TOLERANCE,
-    RunInstant,
-    RunResult,
-    check_run,
-    run_procedure,
-    vary,
-)
-from magnetosuture_thread.commands.command import (
-    DONE,
-    FAILED,
-    Terminal,
-    add_workers,
-    count_argument,
-    runs,
-)
+from magnetosuture_thread.campaign import run
+from magnetosuture_thread.campaign.loop import RunBag
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.errors import BagError
@@ -63,21 +44,21 @@ REASONS = {
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_campaign)
+    command.runs(parser, run_campaign)
     option = parser.add_argument
     option("procedure", metavar="PROCEDURE", help="a procedure's name or YAML file")
-    option("--seeds", type=count_argument("runs", 1, 100_000), default=1, metavar="N", help="runs (default: 1)")
-    first = count_argument("a seed", 0, 2**31 - 1)
+    count, first = command.count_argument("runs", 1, 100_000), command.count_argument("a seed", 0, 2**31 - 1)
+    option("--seeds", type=count, default=1, metavar="N", help="runs (default: 1)")
     option("--first-seed", type=first, default=0, metavar="K", help="seed of the first run (default: 0)")
     option("--setup", default="", metavar="NAME", help="a setup's name or YAML file (default: the procedure's)")
     option("--camera", action="store_true", help="render and track frames (default: add the tracker's noise)")
     bags = "seeds whose runs are recorded as bags (default: none)"
     option("--bags", type=first, nargs="+", default=[], metavar="SEED", help=bags)
-    add_workers(parser)
+    command.add_workers(parser)
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
 
 
-def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_campaign(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Run an autonomous procedure in the simulated closed loop, once for each seed.
 
     Rig, the tracker's noise or the camera and tracker themselves, estimator, planner and coil bridge run in one process
@@ -94,7 +75,7 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
     if not set(bags) <= set(seeds):
         raise ConfigurationError("--bags", sorted(set(bags) - set(seeds)), f"seeds of {seeds[0]} to {seeds[-1]}")
     setup = read_procedure_setup(procedure, options.setup)
-    check_run(procedure, setup, vary(setup, seeds[0]))
+    run.check_run(procedure, setup, run.vary(setup, seeds[0]))
     result = CampaignResult(procedure, setup, options.camera, bags={seed: f"bags/seed_{seed}" for seed in bags})
     work = partial(_run, procedure, setup, setup.path.read_text(encoding="utf-8"), options.camera)
     with (
@@ -103,7 +84,7 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
         make_runner(work, options.workers, options.scheduler) as runner,
     ):
         tasks = [(seed, folder / result.bags[seed] if seed in bags else None) for seed in seeds]
-        found: dict[int, RunResult] = {}
+        found: dict[int, run.RunResult] = {}
         for index, made in runner.run(tasks, terminal.log, advance):
             seed = seeds[index]
             if isinstance(made, WorkerDiedError):
@@ -111,31 +92,22 @@ def run_campaign(options: argparse.Namespace, terminal: Terminal) -> int:
                 terminal.log(f"seed {seed}: {made}")
                 continue
             found[seed], used_time = made
-            outcome = "success" if found[seed].success else found[seed].reason
             speed = found[seed].simulated_s / used_time
-            terminal.log(f"seed {seed}: {outcome} ({speed:.1f} times real time)")
+            terminal.log(f"seed {seed}: {found[seed].reason or 'success'} ({speed:.1f} times real time)")
         result.runs.extend(found[seed] for seed in seeds if seed in found)
         (folder / "campaign.json").write_text(json.dumps(result.to_json(), indent=1) + "\n", encoding="utf-8")
         (folder / "campaign.html").write_text(write_page(result), encoding="utf-8")
     title = f"{result.procedure.name} on {result.setup.name}: {result.successes} of {len(seeds)} runs succeeded"
-    table = Table(title=f"{title} (simulated)", title_justify="left", title_style="bold")
-    for name in ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for run in result.runs:
-        figures = run.figures
-        table.add_row(
-            str(run.seed),
-            "yes" if run.success else "no",
-            str(run.goals_met),
-            f"{figures.time_s:.1f}",
-            f"{figures.ideal_time_s:.1f}",
-            f"{1e3 * figures.min_needle_clearance_m:.3f}",
-            f"{figures.longest_rest_s:.2f}",
-            f"{figures.wrap_degrees:.0f}",
-        )
-    terminal.print(table)
+    columns = ("seed", "success", "goals", "time [s]", "ideal [s]", "clearance [mm]", "rest [s]", "wrap [deg]")
+    cells = []
+    for each in result.runs:
+        figures, clearance = each.figures, 1e3 * each.figures.min_needle_clearance_m
+        times = (f"{figures.time_s:.1f}", f"{figures.ideal_time_s:.1f}", f"{clearance:.3f}")
+        others = (f"{figures.longest_rest_s:.2f}", f"{figures.wrap_degrees:.0f}")
+        cells.append((str(each.seed), "yes" if each.success else "no", str(each.goals_met), *times, *others))
+    terminal.print(command.make_table(f"{title} (simulated)", columns, cells, left=0))
     terminal.print(f"report: {options.output / 'campaign.html'}", soft_wrap=True)
-    return FAILED if result.died else DONE
+    return command.FAILED if result.died else command.DONE
 
 
 @dataclass(frozen=True)
@@ -154,19 +126,19 @@ class CampaignResult:
     procedure: Procedure
     setup: Setup
     camera: bool
-    runs: list[RunResult] = field(default_factory=list)
+    runs: list[run.RunResult] = field(default_factory=list)
     died: dict[int, str] = field(default_factory=dict)
     bags: dict[int, str] = field(default_factory=dict)
 
     @property
     def successes(self) -> int:
         """Runs in which every goal was reached and every limit held."""
-        return sum(run.success for run in self.runs)
+        return sum(each.success for each in self.runs)
 
     @property
     def min_clearance(self) -> float:
         """Clearance of the needle's axis that a run has to keep [m]."""
-        return self.setup.coils.keep_out - KEEP_OUT_TOLERANCE
+        return self.setup.coils.keep_out - run.KEEP_OUT_TOLERANCE
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, in the unit that each name ends with."""
@@ -176,7 +148,7 @@ class CampaignResult:
             "camera": self.camera,
             "simulated": True,
             "successes": self.successes,
-            "runs": [run.to_json() for run in self.runs],
+            "runs": [each.to_json() for each in self.runs],
             "died": {str(seed): reason for seed, reason in self.died.items()},
         }
 
@@ -189,7 +161,7 @@ def _run(
     task: tuple[int, Path | None],
     log: Log,
     progress: Progress,
-) -> tuple[RunResult, float]:
+) -> tuple[run.RunResult, float]:
     """Run one seed, with the folder of its bag if any; return what came of it, and its processor time [s]."""
     began, (seed, folder) = process_time(), task
     if folder is not None and not folder.parents[1].is_dir():
@@ -198,98 +170,65 @@ def _run(
     notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
     with ExitStack() as stack:
         bag = None if folder is None else stack.enter_context(BagWriter(folder, notes))
-        recorder = None if bag is None else RunBag(bag, setup, START, camera=camera)
-        found = run_procedure(procedure, setup, vary(setup, seed), camera=camera, recorder=recorder)
+        recorder = None if bag is None else RunBag(bag, setup, camera=camera)
+        found = run.run_procedure(procedure, setup, run.vary(setup, seed), camera=camera, recorder=recorder)
     return found, process_time() - began
 
 
 def write_page(result: CampaignResult) -> str:
     """Return the report as a page of HTML, with pictures of failed runs."""
-    keep_out = result.setup.coils.keep_out
     rows: list[dict[str, Any]] = [
-        {"result": run, "broken": set(run.figures.beyond_limits(keep_out)), "pictures": (), "closest": None}
-        for run in result.runs
+        {
+            "result": each,
+            "broken": set(each.figures.beyond_limits(result.setup.coils.keep_out)),
+            "pictures": [],
+            "closest": None,
+        }
+        for each in result.runs
     ]
     failed = [row for row in rows if not row["result"].success]
     for row in failed[:200]:  # of the others the figures are in the table
-        row |= _pictures(result, row["result"], row["broken"])
+        _add_pictures(row, result)
     reasons: dict[str, list[int]] = {}
-    for row in rows:
-        run = row["result"]
-        not_reached = ["not all goals reached"] if not (run.success or run.reached) else []
+    for row in failed:
+        not_reached = [] if row["result"].reached else ["not all goals reached"]
         for why in (*not_reached, *(REASONS[name] for name in sorted(row["broken"]))):
-            reasons.setdefault(why, []).append(run.seed)
-    scene = result.setup.scene
+            reasons.setdefault(why, []).append(row["result"].seed)
+    scene, reached = result.setup.scene, [each.figures for each in result.runs if each.reached]
     return read_template(__package__, "campaign.html", {"spaced": lambda text: text.replace("_", " ")}).render(
         details=result,
         runs=rows,
         failed=[row for row in failed if row["pictures"]],
         left_out=len(failed[200:]),
-        tiles=_tiles(result) if rows else [],
+        reached=len(reached),
+        ratios=[each.time_s / each.ideal_time_s for each in reached if each.ideal_time_s > 0.0],
+        median=median,
         reasons=sorted(reasons.items(), key=lambda each: -len(each[1])),
         shapes=[{"kind": shape.kind, "path": _outline(shape.geometry)} for shape in scene.shapes],
         dish_radius=1e3 * scene.dish.radius,
         needle_width=1e3 * result.setup.rig.needle_width,
         halo_width=2e3 * result.min_clearance,
-        max_rest=MAX_REST,
-        max_time_ratio=MAX_TIME_RATIO,
+        limits=run,
         style=page_style() + read_source(__package__, "campaign.css"),
     )
 
 
-def _tiles(result: CampaignResult) -> list[dict[str, str]]:
-    """Return the headline figures: name, value, grade and detail."""
-    count, required = len(result.runs) + len(result.died), result.min_clearance
-    reached = [run for run in result.runs if run.reached]
-    figures = [run.figures for run in result.runs]
-    clearance = min(each.min_needle_clearance_m for each in figures)
-    penetration = max(each.max_thread_penetration_m for each in figures)
-    rest = max(each.longest_rest_s for each in figures)
-    ratios = [run.figures.time_s / run.figures.ideal_time_s for run in reached if run.figures.ideal_time_s > 0.0]
-    successes = result.successes
-    rows: list[tuple[str, str, bool, str]] = [
-        ("runs that succeeded", f"{successes} of {count}", successes == count, "all goals, all limits"),
-        ("runs that reached all goals", f"{len(reached)} of {count}", len(reached) == count, "limits apart"),
-        (
-            "closest needle",
-            f"{1e3 * clearance:.3f} mm",
-            clearance >= required,
-            f"of all runs; at least {1e3 * required:.3f} mm",
-        ),
-        (
-            "deepest node of the thread",
-            f"{1e6 * penetration:.1f} µm",
-            penetration <= PENETRATION_TOLERANCE,
-            f"of all runs; at most {1e6 * PENETRATION_TOLERANCE:g} µm",
-        ),
-        ("longest rest", f"{rest:.1f} s", rest <= MAX_REST, f"of all runs; at most {MAX_REST:g} s"),
-    ]
-    if ratios:
-        most = max(ratios)
-        detail = f"median of runs that reached all goals; maximum {most:.2f}, at most {MAX_TIME_RATIO:g}"
-        rows.append(("time over ideal time", f"{median(ratios):.2f}", most <= MAX_TIME_RATIO, detail))
-    return [
-        {"name": name, "value": value, "grade": "good" if is_good else "bad", "detail": detail}
-        for name, value, is_good, detail in rows
-    ]
-
-
-def _pictures(result: CampaignResult, run: RunResult, broken: Collection[str]) -> dict[str, Any]:
-    """Return the pictures of a failed run: the whole dish at its end, its last seconds, and its closest instant.
+def _add_pictures(row: dict[str, Any], result: CampaignResult) -> None:
+    """Add the pictures of a failed run: the whole dish at its end, its last seconds, and its closest instant.
 
     The closest is there if the needle came too close, before the last seconds.
     """
-    if not run.last_instants:
-        return {}
+    instants, closest = row["result"].last_instants, row["result"].closest_instant
+    if not instants:
+        return
     scene, speed = result.setup.scene, result.procedure.limits[0].speed
-    pictures = [_picture(run.last_instants[-1], scene, speed, overview=True)]
-    pictures += [_picture(instant, scene, speed) for instant in run.last_instants]
-    closest, begin = run.closest_instant, run.last_instants[0].frame.time
-    is_earlier = closest is not None and closest.frame.time < begin and "min_needle_clearance_m" in broken
-    return {"pictures": pictures, "closest": _picture(closest, scene, speed) if closest and is_earlier else None}
+    row["pictures"] = [_picture(instants[-1], scene, speed, overview=True)]
+    row["pictures"] += [_picture(instant, scene, speed) for instant in instants]
+    if closest and closest.frame.time < instants[0].frame.time and "min_needle_clearance_m" in row["broken"]:
+        row["closest"] = _picture(closest, scene, speed)
 
 
-def _picture(instant: RunInstant, scene: Scene, speed: float, *, overview: bool = False) -> dict[str, Any]:
+def _picture(instant: run.RunInstant, scene: Scene, speed: float, *, overview: bool = False) -> dict[str, Any]:
     """Return an instant as an SVG shows it, the whole dish or the surroundings of the needle.
 
     Args:

@@ -6,14 +6,18 @@ import argparse
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
+from rich.table import Table
+from rich.text import Text
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags import parse_remap
@@ -168,10 +172,14 @@ def add_span(parser: argparse._ActionsContainer, bag: str = "the bag") -> None:
     option("--duration", type=number_argument(1e-3, 1e9), metavar="S", help="seconds (default: to the end)")
 
 
+def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the values of some options by name, to pass them on."""
+    return {name: getattr(options, name) for name in names}
+
+
 def bag_selection(options: argparse.Namespace) -> dict[str, Any]:
     """Return how a bag is read: see `commands.recorded.BagSelection`."""
-    names = (name for name in ("source", "start", "duration", "frame") if hasattr(options, name))
-    chosen = {name: getattr(options, name) for name in names}
+    chosen = given(options, *(name for name in ("source", "start", "duration", "frame") if hasattr(options, name)))
     return {"setup_name": options.setup, "remap": dict(options.remap), **chosen}
 
 
@@ -181,20 +189,16 @@ def check_outputs(options: argparse.Namespace) -> None:
     Raises:
         ConfigurationError: with the option.
     """
-    given = vars(options)
-    inputs = []
-    for name, value in given.items():
+    inputs, taken = list[Path](), list[Path]()
+    for name, value in vars(options).items():
         if name not in OUTPUTS:
             listed = value if isinstance(value, list) else [value]
-            inputs += [Path(each) for each in listed if isinstance(each, Path) or (isinstance(each, str) and each)]
-    taken = list[Path]()
+            inputs += [Path(each) for each in listed if isinstance(each, Path | str) and each != ""]
     for name in OUTPUTS:
-        path = given.get(name)
+        path = getattr(options, name, None)
         if not isinstance(path, Path) or path == STANDARD_OUTPUT:
             continue
-        problem = input_problem(path, inputs)
-        if not path.is_dir():
-            problem = problem or output_problem(path)
+        problem = input_problem(path, inputs) or ("" if path.is_dir() else output_problem(path))
         if not problem and path.absolute() in taken:
             problem = "is named by another option too; expected a file of its own"
         if problem:
@@ -242,21 +246,41 @@ class Terminal:
     Attributes:
         log: called with a line for a person, which is printed as it is, however long.
         print: called with a table.
+        progress: shows a progress bar of a name; see `progress`.
     """
 
     def __init__(self) -> None:
-        self._console = make_console()
-        self.log, self.print = make_log(self._console), self._console.print
+        console = make_console()
+        self.log, self.print, self.progress = make_log(console), console.print, partial(progress, console)
 
-    def progress(self, name: str) -> AbstractContextManager[Callable[[float], None]]:
-        """Show a progress bar; see `progress`."""
-        return progress(self._console, name)
+
+def make_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], caption: str = "", *, left: int = 1
+) -> Table:
+    """Return a table to print.
+
+    Args:
+        title: above it.
+        columns: their names.
+        rows: the cells of each, shown as they are.
+        caption: below it.
+        left: how many columns hold words; the others hold numbers, to the right.
+    """
+    table = Table(title=title, caption=caption or None, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title_style="bold")
+    for index, name in enumerate(columns):
+        if index < left:
+            table.add_column(name, overflow="fold", min_width=min(12, 12 - 6 * index))
+        else:
+            table.add_column(name, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table
 
 
 def write_json(path: Path | None, figures: Any) -> None:
     """Write figures to the file given by --json, if any."""
     if path:
-        from magnetosuture_thread.commands.output import whole_file
+        from magnetosuture_thread.commands.output import whole_file  # late, as --help needs no bags
 
         with whole_file(path) as partial:
             partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -18,14 +19,7 @@ from typing import Any
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    namespace_argument,
-    runs,
-    whole_number,
-)
-from magnetosuture_thread.commands.live import FORECAST, OWN, START_TIMEOUT, GraphInput, Place, log_compiling, own_place
+from magnetosuture_thread.commands import command, live
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
 from magnetosuture_thread.configuration import from_mapping, to_mapping
@@ -48,15 +42,15 @@ SERVED = ("address", "port", "token", "certificate", "private_key", "origin")  #
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_console)
+    command.runs(parser, run_console)
     option = parser.add_argument
     option("setup", metavar="SETUP", nargs="?", default="", help="its name or YAML file (default: of a 35 mm dish)")
     graph = parser.add_mutually_exclusive_group()
     graph.add_argument("--graph", action="store_true", help="on the graph that runs on this ROS domain")
     graph.add_argument("--replay", type=Path, metavar="BAG", help="on a bag that is played through the nodes")
-    option("--namespace", type=namespace_argument, default="", metavar="NAME", help="of the running graph")
+    option("--namespace", type=command.namespace_argument, default="", metavar="NAME", help="of the running graph")
     option("--address", help="network address to serve on (default: the setup's, 127.0.0.1)")
-    option("--port", type=whole_number, help="of it; 0 takes a free one (default: the setup's, 8090)")
+    option("--port", type=command.whole_number, help="of it; 0 takes a free one (default: the setup's, 8090)")
     option("--certificate", metavar="FILE", help="serve over TLS by this certificate, a PEM file")
     key = "of the certificate, where it is not in the same file"
     option("--key", dest="private_key", metavar="FILE", help=key)
@@ -66,7 +60,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--record", type=Path, default=Path("output/recordings"), metavar="DIR", help=recordings)
 
 
-def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_console(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Serve the operator's page.
 
     It shows the dish with needle and thread, the margins and the state of all nodes; the needle is jogged by arrow
@@ -91,44 +85,40 @@ def run_console(options: argparse.Namespace, terminal: Terminal) -> int:
     def settings(setup: Setup) -> ConsoleSettings:
         return from_mapping(ConsoleSettings, {**to_mapping(setup.console), **served})
 
-    name = options.setup or DEFAULT_SETUP
+    name, log = options.setup or DEFAULT_SETUP, terminal.log
     host: RecordingHost
     with ExitStack() as stack:
         if options.graph:
             setup = read_setup(name)
             graph = ConsoleGraph(stack.enter_context(joined(namespace=options.namespace)), settings(setup))
-            host = RecordingHost(graph, setup, options.record, terminal.log)
-        elif options.replay is not None:
-            source = GraphInput(stack.enter_context(open_bag(options.replay, terminal.log, setup_name=options.setup)))
-            source.given.check_loop()
-            shown = settings(source.given.setup)
-            shown = replace(shown, image_transport=source.transport) if source.transport else shown
-            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
-            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain, simulated_clock=True)), shown)
-            host = ReplayHost(graph, source, place, terminal.log)
-            terminal.log(f"starting {', '.join(source.nodes)} (ROS domain {place.domain}, this machine only)")
+            host = RecordingHost(graph, setup, options.record, log)
         else:
-            shown = settings(read_setup(name))
-            place = stack.enter_context(own_place(Path(stack.enter_context(TemporaryDirectory()))))
-            graph = ConsoleGraph(stack.enter_context(joined(domain=place.domain)), shown)
-            host = SimulatedHost(graph, name, place, options.record, terminal.log)
-            terminal.log(f"starting the graph around a simulated rig (ROS domain {place.domain}, this machine only)")
-        asyncio.run(_serve(graph, host, terminal.log))
-    return DONE
+            source = None
+            if options.replay is not None:
+                source = live.GraphInput(stack.enter_context(open_bag(options.replay, log, setup_name=options.setup)))
+                source.given.check_loop()
+            shown = settings(read_setup(name) if source is None else source.given.setup)
+            shown = replace(shown, image_transport=source.transport) if source and source.transport else shown
+            logs, domain = Path(stack.enter_context(TemporaryDirectory())), stack.enter_context(live.own_domain())
+            node = stack.enter_context(joined(domain=domain, simulated_clock=source is not None))
+            graph = ConsoleGraph(node, shown)
+            if source is None:
+                host = SimulatedHost(graph, name, logs, options.record, log)
+            else:
+                host = ReplayHost(graph, source, domain, logs, log)
+            what = "the graph around a simulated rig" if source is None else ", ".join(source.nodes)
+            log(f"starting {what} (ROS domain {domain}, this machine only)")
+        asyncio.run(_serve(graph, host, log))
+    return command.DONE
 
 
 async def _serve(graph: ConsoleGraph, host: RecordingHost, log: Log) -> None:
     """Serve the page until this process gets a signal to end, or the graph breaks."""
-
-    def report(url: str) -> None:
-        log(f"open {url}")
-        log("Ctrl-C ends everything")
-
     ends = [which for which in STOPS if signal.getsignal(which) is not signal.SIG_IGN]
     try:
         host.start()
         server, period = ConsoleServer(graph.settings, graph, host), 0.2  # s between two checks of the nodes
-        await serve_until(ends, server, host.watch, period, report)
+        await serve_until(ends, server, host.watch, period, lambda url: log(f"open {url}\nCtrl-C ends everything"))
     finally:
         await host.close()
     log("ended")
@@ -147,29 +137,28 @@ class BagRecording:
     def __init__(
         self, output: Path, notes: Mapping[str, str], graph: ConsoleGraph, recorded: Sequence[topics.Topic]
     ) -> None:
-        self.output = output
-        self._notes = notes
+        self.output, self._notes = output, notes
         self._inboxes = [Inbox(graph.node, topic, 1000) for topic in recorded]
-        self._ending = threading.Event()
-        self._writing: asyncio.Task[None] | None = None
+        self._begun, self._ending = asyncio.Event(), threading.Event()
+        loop = asyncio.get_running_loop()
+        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(self._begun.set))
+        self._writing = asyncio.create_task(writing)
 
     @property
     def ended(self) -> bool:
         """Whether it has ended, by `end` or because the disk is full."""
-        return self._writing is not None and self._writing.done()
+        return self._writing.done()
 
     async def begin(self) -> None:
-        """Begin to record.
+        """Wait until it records.
 
         Raises:
             BagError: the output exists or cannot be written.
         """
-        loop = asyncio.get_running_loop()
-        begun = loop.create_future()
-        writing = asyncio.to_thread(self._write, lambda: loop.call_soon_threadsafe(begun.set_result, None))
-        self._writing = asyncio.create_task(writing)
+        begun = asyncio.create_task(self._begun.wait())
         await asyncio.wait((begun, self._writing), return_when=asyncio.FIRST_COMPLETED)
-        if self._writing.done():
+        begun.cancel()
+        if self.ended:
             await self.end()
 
     async def end(self) -> None:
@@ -179,13 +168,11 @@ class BagRecording:
             BagError: the disk is full or fails; what was recorded before is there.
         """
         self._ending.set()
-        if self._writing is not None:
-            await asyncio.wait([self._writing])  # which a cancellation of this does not end: the inboxes are in use
+        await asyncio.wait([self._writing])  # which a cancellation of this does not end: the inboxes are in use
         for inbox in self._inboxes:
             inbox.close()
         self._inboxes = []
-        if self._writing is not None:
-            self._writing.result()
+        self._writing.result()
 
     def _write(self, begun: Callable[[], object]) -> None:
         with (
@@ -206,11 +193,8 @@ class BagRecording:
 def new_name(folder: Path, name: str) -> Path:
     """Return a folder that does not exist yet for a recording, named by the time and the setup."""
     stem = f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{name}".rstrip("_")
-    output, count = folder / stem, 1
-    while output.exists():
-        count += 1
-        output = folder / f"{stem}_{count}"
-    return output
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    return next(folder / each for each in names if not (folder / each).exists())
 
 
 class RecordingHost(GraphHost):
@@ -225,9 +209,7 @@ class RecordingHost(GraphHost):
 
     def __init__(self, graph: ConsoleGraph, setup: Setup, recordings: Path, log: Log) -> None:
         super().__init__(graph)
-        self.setup = setup
-        self.busy = ""
-        self.log = log
+        self.setup, self.busy, self.log = setup, "", log
         self._recordings = recordings
         self._recording: BagRecording | None = None
 
@@ -307,17 +289,17 @@ class SimulatedHost(RecordingHost):
     Args:
         graph: to serve.
         setup: name or path of the initial setup.
-        place: where the nodes run.
+        logs: folder for what each node prints.
         recordings: folder that gets a bag for each recording.
         log: called with a line for a person.
     """
 
     mode = "simulated"
 
-    def __init__(self, graph: ConsoleGraph, setup: str, place: Place, recordings: Path, log: Log) -> None:
+    def __init__(self, graph: ConsoleGraph, setup: str, logs: Path, recordings: Path, log: Log) -> None:
         super().__init__(graph, read_setup(setup), recordings, log)
         shipped = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
-        self._setup_name, self._setups, self._place = setup, list(dict.fromkeys([*shipped, setup])), place
+        self._setup_name, self._setups, self._logs = setup, list(dict.fromkeys([*shipped, setup])), logs
         self._nodes: NodeProcesses | None = None
         self._since, self._logged = 0.0, set[str]()
         self._block(f"starting {self.setup.name}")
@@ -328,10 +310,11 @@ class SimulatedHost(RecordingHost):
 
     def start(self) -> None:
         """Start the nodes; they are busy until each of them has reported its state."""
-        arguments = ["--params-file", str(self.setup.path.resolve()), *OWN, *FORECAST]
+        arguments = ["--params-file", str(self.setup.path.resolve()), *live.OWN, *live.FORECAST]
         arguments += ["-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=active"]  # a person arms it
         # Here and not in another thread: the nodes end with the thread that has started them.
-        self._nodes = self._place.nodes((SCENE_SERVER, RIG, *PROCESSES, PLANNER), arguments).__enter__()
+        processes = (SCENE_SERVER, RIG, *PROCESSES, PLANNER)
+        self._nodes = NodeProcesses(processes, arguments, dict(os.environ), self._logs).__enter__()
         self._since = time.monotonic()
 
     async def select_setup(self, setup: str) -> str:
@@ -366,7 +349,7 @@ class SimulatedHost(RecordingHost):
         if not self.busy:
             return
         nodes = self.graph.nodes().items()
-        log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
+        live.log_compiling({name: about["message"] for name, about in nodes}, self._logged, self.log)
         missing = [name for name in (SCENE_SERVER, RIG, *NODES, PLANNER) if not self.graph.is_active(name)]
         bridge = self.graph.state()["bridge"] or {}
         if not missing and bridge.get("driver_ready"):  # the bridge may find the rig seconds after we have
@@ -376,9 +359,9 @@ class SimulatedHost(RecordingHost):
             self.log(f"perception: {self._nodes.prefer('perception', 5)}")
             self._block("")
             self.log(f"{self.setup.name} runs; the coils are not armed")
-        elif time.monotonic() - self._since > START_TIMEOUT:
+        elif time.monotonic() - self._since > live.START_TIMEOUT:
             unheard = ", ".join(missing) or "a bridge that is ready"
-            raise GraphError(f"after {START_TIMEOUT:g} s nothing is heard of {unheard}")
+            raise GraphError(f"after {live.START_TIMEOUT:g} s nothing is heard of {unheard}")
 
     async def close(self) -> None:
         """End recording and nodes."""
@@ -398,16 +381,18 @@ class ReplayHost(RecordingHost):
     Args:
         graph: to serve.
         source: the bag.
-        place: where the nodes run.
+        domain: ROS domain of the nodes.
+        logs: folder for what each node prints.
         log: called with a line for a person.
     """
 
     mode = "replay"
 
-    def __init__(self, graph: ConsoleGraph, source: GraphInput, place: Place, log: Log) -> None:
+    def __init__(self, graph: ConsoleGraph, source: live.GraphInput, domain: int, logs: Path, log: Log) -> None:
         super().__init__(graph, source.given.setup, Path(), log)
-        self._source, self._domain = source, place.domain
-        self._nodes = place.nodes(source.processes, source.arguments(place.logs / "lossless.yaml"))
+        self._source, self._domain = source, domain
+        arguments = source.arguments(logs / "lossless.yaml")
+        self._nodes = NodeProcesses(source.processes, arguments, dict(os.environ), logs)
         self._ending = threading.Event()
         self._playing: asyncio.Task[None] | None = None
         self.busy = f"starting the nodes for {source.given.recording.path}"
@@ -442,15 +427,11 @@ class ReplayHost(RecordingHost):
 
     def _play(self) -> None:
         """Play until `close` is called; in a thread, as a replay waits for the graph itself."""
-        live = self._source.live(self._domain, 1.0, lambda topic, time, data: None, self._check, self.log)
-        try:
-            live.wait_for_graph()
+        replay = self._source.live(self._domain, 1.0, lambda topic, time, data: None, self._check, self.log)
+        with closing(replay), suppress(_EndedError):
+            replay.wait_for_graph()
             self.busy = ""
-            live.play_on(self._source.records)
-        except _EndedError:
-            pass
-        finally:
-            live.close()
+            replay.play_on(self._source.records)
 
     def _check(self) -> None:
         if self._ending.is_set():

@@ -9,6 +9,7 @@ import platform
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,58 +21,18 @@ from magnetosuture_thread import ConfigurationError, MagnetosutureError, interfa
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.recording import CHANNELS, Recording
 from magnetosuture_thread.bags.storage import METADATA_FILE, find_bag_files
-from magnetosuture_thread.commands.command import (
-    DONE,
-    FAILED,
-    Terminal,
-    add_source,
-    add_span,
-    add_workers,
-    bag_location,
-    bag_selection,
-    count_argument,
-    output_file,
-    runs,
-    write_json,
-)
+from magnetosuture_thread.commands import command, recorded
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import (
-    NOT_FOUND,
-    BagInput,
-    BagSelection,
-    measure_step,
-    open_bag,
-    predictions,
-)
 from magnetosuture_thread.commands.replay import find_photos
 from magnetosuture_thread.commands.track import numbered
 from magnetosuture_thread.configuration import Configuration, configuration_fields
 from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.evaluation import reference, tables
 from magnetosuture_thread.evaluation.figures import STAGES, BagDetails, Figures, LiveFigures
 from magnetosuture_thread.evaluation.metrics import Percentiles, RunMetrics
 from magnetosuture_thread.evaluation.page import write_page
 from magnetosuture_thread.evaluation.plots import draw_case, draw_worst_frame
-from magnetosuture_thread.evaluation.reference import (
-    NOT_ONE,
-    CaseResult,
-    Evaluation,
-    ReferenceTrajectory,
-    StepFigures,
-    find_references,
-    run_case,
-    score,
-    score_each,
-)
-from magnetosuture_thread.evaluation.tables import (
-    Row,
-    bags_table,
-    evaluation_table,
-    failed_row,
-    flat,
-    row_of,
-    table_csv,
-    table_json,
-)
+from magnetosuture_thread.evaluation.tables import Row
 from magnetosuture_thread.files import is_url
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import STORAGE_SUFFIXES
@@ -93,30 +54,30 @@ REFERENCE_OPTIONS = ("solver", "segments", "rig", "json", "pictures")
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_evaluate)
+    command.runs(parser, run_evaluate)
     parser.set_defaults(default_of=parser.get_default)
-    parser.add_argument("paths", type=bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
+    option = parser.add_argument
+    option("paths", type=command.bag_location, nargs="+", metavar="PATH", help="bags, or trajectories; see above")
     formulation = "how a step is written (default: a bag's setup's; rod)"
-    parser.add_argument("--formulation", choices=("rod", "paper"), help=formulation)
+    option("--formulation", choices=("rod", "paper"), default="", help=formulation)
     bags = parser.add_argument_group("bags")
-    option = bags.add_argument
-    option("--output", type=Path, metavar="DIR", help="folder to make; required")
+    bags.add_argument("--output", type=Path, metavar="DIR", help="folder to make; required")
     against = "measured thread (seen) or ground truth (default: both where present, the worst frames by ground truth)"
-    option("--against", choices=("auto", "truth", "seen"), default="auto", help=against)
-    add_source(bags, "each bag")
-    add_span(bags, "each bag")
-    add_workers(bags)
+    bags.add_argument("--against", choices=("auto", "truth", "seen"), default="auto", help=against)
+    command.add_source(bags, "each bag")
+    command.add_span(bags, "each bag")
+    command.add_workers(bags)
     option = parser.add_argument_group("reference trajectories").add_argument
     option("--solver", choices=("banded", "osqp"), help="what solves a step (default: banded)")
-    segments = "number of segments (default: the paper's, as each file says)"
-    option("--segments", type=count_argument("segments", 3, 2000), metavar="N", help=segments)
+    count = command.count_argument("segments", 3, 2000)
+    option("--segments", type=count, metavar="N", help="number of segments (default: the paper's, as each file says)")
     rig = "score the simulated rig's thread instead of the model (default: N = 100)"
     option("--rig", action="store_true", help=rig)
-    option("--json", type=output_file, metavar="FILE", help="write the figures to a file")
+    option("--json", type=command.output_file, metavar="FILE", help="write the figures to a file")
     option("--pictures", type=Path, metavar="FOLDER", help="draw each case into a folder")
 
 
-def run_evaluate(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Score the thread model on bags, or on reference trajectories.
 
     Bags: the thread of each is predicted and estimated without a graph, as fast as the machine can, and compared with
@@ -141,30 +102,20 @@ def run_evaluate(options: argparse.Namespace, terminal: Terminal) -> int:
         if given != options.default_of(name):
             why = "for reference trajectories; PATH is none" if is_bags else "for bags; PATH is a reference trajectory"
             raise ConfigurationError(f"--{name}", str(given), f"nothing: it is only {why}")
-    if is_bags and options.output is None:
-        raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
-    with terminal.progress("evaluate") as advance:
-        if not is_bags:
-            evaluation = _score_references(options, advance)
-        else:
-            rows = evaluate_bags(
-                options.paths,
-                options.output,
-                against=options.against,
-                formulation=options.formulation or "",
-                workers=options.workers,
-                scheduler=options.scheduler,
-                log=terminal.log,
-                progress=advance,
-                **bag_selection(options),
-            )
     if not is_bags:
-        terminal.print(evaluation_table(evaluation))
-        write_json(options.json, evaluation.to_mapping())
-        return DONE
-    terminal.print(bags_table(rows))
+        with terminal.progress("evaluate") as advance:
+            evaluation = _score_references(options, advance)
+        terminal.print(tables.evaluation_table(evaluation))
+        command.write_json(options.json, evaluation.to_mapping())
+        return command.DONE
+    if options.output is None:
+        raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
+    given = command.given(options, "paths", "output", "against", "formulation", "workers", "scheduler")
+    with terminal.progress("evaluate") as advance:
+        rows = evaluate_bags(**given, **command.bag_selection(options), log=terminal.log, progress=advance)
+    terminal.print(tables.bags_table(rows))
     terminal.log(f"results: {options.output}")
-    return FAILED if any(row["problem"] for row in rows) else DONE
+    return command.FAILED if any(row["problem"] for row in rows) else command.DONE
 
 
 def evaluate_bags(
@@ -177,7 +128,7 @@ def evaluate_bags(
     scheduler: str = "",
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[recorded.BagSelection],
 ) -> list[Row]:
     """Evaluate bags, each for itself.
 
@@ -219,9 +170,9 @@ def evaluate_bags(
                 (folder / f"{task.name}.html").write_text(page, encoding="utf-8")
             rows[index] = row
         ordered = [rows[index] for index in range(len(tasks))]
-        (folder / "table.csv").write_text(table_csv(ordered), encoding="utf-8", newline="")
-        (folder / "table.json").write_text(table_json(ordered), encoding="utf-8")
-        if problem := write_parquet(folder / "table.parquet", [flat(row) for row in ordered]):
+        (folder / "table.csv").write_text(tables.table_csv(ordered), encoding="utf-8", newline="")
+        (folder / "table.json").write_text(tables.table_json(ordered), encoding="utf-8")
+        if problem := write_parquet(folder / "table.parquet", [tables.flat(row) for row in ordered]):
             log(f"no table.parquet: {problem}")
     return ordered
 
@@ -237,7 +188,7 @@ def evaluate_one(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Ro
 
 
 def _failed(task: EvaluationTask, problem: str) -> Row:
-    return failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
+    return tables.failed_row(task.name, one_line(str(task.path)), one_line(" ".join(problem.split())))
 
 
 def write_parquet(path: Path, rows: Sequence[dict[str, Any]]) -> str:
@@ -279,12 +230,11 @@ def find_bags(paths: Sequence[Path], depth: int = 2) -> list[Path]:
     found: dict[Path, Path] = {}
     for path in paths:
         bags = _bags(path, depth)
-        if not bags:
-            endings = " or ".join(STORAGE_SUFFIXES)
-            folder = f"holds no bags ({endings}), nor do the folders in it"
-            raise BagError(path, folder if path.is_dir() else "is no bag")
         for bag in bags:
             found.setdefault(bag.resolve(), bag)
+        if not bags:
+            endings = " or ".join(STORAGE_SUFFIXES)
+            raise BagError(path, f"holds no bags ({endings}), nor do the folders in it")
     return list(found.values())
 
 
@@ -299,23 +249,16 @@ def _bags(path: Path, depth: int) -> list[Path]:
         raise
     except Exception as error:  # The file system of a URL raises whatever its library does.
         raise BagError(path, f"cannot be read: {error}") from None
-    files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     if any(file.name == METADATA_FILE for file in inside):
         return [path]
+    files = [file for file in inside if file.suffix in STORAGE_SUFFIXES and file.is_file()]
     folders = [folder for folder in inside if depth > 0 and folder.is_dir() and not folder.name.startswith(".")]
     below = [bag for folder in folders for bag in _bags(folder, depth - 1)]
-    if not below and (len(files) == 1 or (files and _is_one(path))):
-        return [path]
+    if files and not below:
+        with suppress(BagError):  # raised where the files are several bags
+            find_bag_files(path)
+            return [path]
     return files + below
-
-
-def _is_one(path: Path) -> bool:
-    """Return whether the files in a folder are parts of one bag."""
-    try:
-        find_bag_files(path)
-    except BagError:
-        return False
-    return True
 
 
 def kind_of(paths: Sequence[Path]) -> str:
@@ -341,29 +284,28 @@ def _is_reference(path: Path) -> bool:
         return False
 
 
-def _score_references(options: argparse.Namespace, progress: Progress) -> Evaluation:
-    paths = [path for folder in options.paths for path in find_references(folder)]
-    if options.pictures:
-        options.pictures.mkdir(parents=True, exist_ok=True)
-    formulation = options.formulation or "rod"
+def _score_references(options: argparse.Namespace, progress: Progress) -> reference.Evaluation:
+    paths = [path for folder in options.paths for path in reference.find_references(folder)]
+    formulation, pictures = options.formulation or "rod", options.pictures
+    if pictures:
+        pictures.mkdir(parents=True, exist_ok=True)
 
-    def keep(case: CaseResult) -> None:
-        if options.pictures:
-            name = "rig" if options.rig else formulation
-            draw_case(options.pictures / f"{case.score.name}.png", case, name)
+    def keep(case: reference.CaseResult) -> None:
+        if pictures:
+            draw_case(pictures / f"{case.score.name}.png", case, "rig" if options.rig else formulation)
 
     given: dict[str, Any] = {"segments": options.segments, "progress": progress, "keep": keep}
     if options.rig:
         return score_rig(paths, **given)
-    return score(paths, formulation=formulation, solver=options.solver or "banded", **given)
+    return reference.score(paths, formulation=formulation, solver=options.solver or "banded", **given)
 
 
 def score_rig(
     paths: Sequence[Path],
     segments: int | None = None,
     progress: Progress = lambda share: None,
-    keep: Callable[[CaseResult], None] = lambda result: None,
-) -> Evaluation:
+    keep: Callable[[reference.CaseResult], None] = lambda result: None,
+) -> reference.Evaluation:
     """Move the rig's needle along reference trajectories and score its thread, nothing tuned for a case.
 
     Of the scores, `max_residual` is in units of the drag across the whole thread at the case's greatest speed, and
@@ -383,33 +325,33 @@ def score_rig(
     # Of a needle whose motion is given, the body does not matter.
     body = NeedleBody(length=7e-3, diameter=4e-4, curvature=0.0, magnetisation=0.0, viscosity=1.0)
 
-    def score_case(reference: ReferenceTrajectory, path: Path, share: Progress) -> CaseResult:
-        thread = _rig_thread(reference, path, count)
-        first, length = reference.threads[0], thread.length
-        if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - reference.tails[0]) > 0.1 * length / count:
+    def score_case(trajectory: reference.ReferenceTrajectory, path: Path, share: Progress) -> reference.CaseResult:
+        thread = _rig_thread(trajectory, path, count)
+        first, length = trajectory.threads[0], thread.length
+        if np.ptp(first, axis=0).max() == 0.0 or np.linalg.norm(first[0] - trajectory.tails[0]) > 0.1 * length / count:
             raise BagError(path, "has a first thread of one point, or one that does not begin at the needle's tail")
         if thread.diameter >= length:
             raise BagError(path, f"has a thread of {thread.diameter:g} m in diameter, expected less than its length")
-        surface, heading = Surface(discs=reference.discs), float(reference.headings[0])
-        rig = RigDynamics(body, thread, surface, None, reference.tails[0], heading, first)
-        speed = np.linalg.norm(np.diff(reference.tails, axis=0), axis=1) / np.diff(reference.times)
+        surface, heading = Surface(discs=trajectory.discs), float(trajectory.headings[0])
+        rig = RigDynamics(body, thread, surface, None, trajectory.tails[0], heading, first)
+        speed = np.linalg.norm(np.diff(trajectory.tails, axis=0), axis=1) / np.diff(trajectory.times)
         force = thread.drag_across * length * max(float(speed.max()), 1e-6)
 
         def step(index: int) -> RigDynamics:
-            interval = reference.times[index] - reference.times[index - 1]
-            rig.drive(reference.tails[index], float(reference.headings[index]), interval)
+            interval = trajectory.times[index] - trajectory.times[index - 1]
+            rig.drive(trajectory.tails[index], float(trajectory.headings[index]), interval)
             return rig
 
-        def figures(rig: RigDynamics) -> StepFigures:
+        def figures(rig: RigDynamics) -> reference.StepFigures:
             strain = max(0.0, float(rig.tension.max()) / thread.stretching_stiffness)
-            return StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
+            return reference.StepFigures(rig.thread, strain, rig.residual / force, rig.halvings)
 
-        return run_case(reference, rig.thread, length, thread.diameter, step, figures, share)
+        return reference.run_case(trajectory, rig.thread, length, thread.diameter, step, figures, share)
 
-    return Evaluation("rig", "newton", score_each(paths, score_case, progress, keep))
+    return reference.Evaluation("rig", "newton", reference.score_each(paths, score_case, progress, keep))
 
 
-def _rig_thread(reference: ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
+def _rig_thread(trajectory: reference.ReferenceTrajectory, path: Path, segments: int) -> ThreadProperties:
     """Return the thread that a trajectory's metadata describes.
 
     Raises:
@@ -417,10 +359,10 @@ def _rig_thread(reference: ReferenceTrajectory, path: Path, segments: int) -> Th
     """
     names = ("L_m", "EI_Nm2", "EA_N", "zeta_perp_Pa_s", "zeta_par_Pa_s", "diameter_m")
     try:
-        given = reference.metadata["material"]
+        given = trajectory.metadata["material"]
         length, bending, stretching, across, along, diameter = values = [float(given[name]) for name in names]
-        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[reference.metadata["boundary"]]
-    except NOT_ONE as error:
+        attachment = {"pinned": NeedleJoint.PINNED, "clamped": NeedleJoint.CLAMPED}[trajectory.metadata["boundary"]]
+    except reference.NOT_ONE as error:
         raise BagError(path, f"has no thread in its metadata: {type(error).__name__} {error}") from None
     if not all(math.isfinite(value) and value > 0.0 for value in values):
         raise BagError(path, f"has a thread with one of {', '.join(names)} not positive")
@@ -446,7 +388,7 @@ class EvaluationTask:
     name: str
     against: str
     formulation: str
-    selection: BagSelection
+    selection: recorded.BagSelection
 
 
 def evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Row, str]:
@@ -463,19 +405,22 @@ def evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Ro
         BagError: the bag cannot be used, what is compared with is not in it, or nothing in it was predicted.
         ConfigurationError: the setup cannot be used.
     """
-    with open_bag(task.path, log, **task.selection) as given:
+    with recorded.open_bag(task.path, log, **task.selection) as given:
         recording, span = given.recording, (given.start, given.duration)
         model = replace(given.setup.model, formulation=task.formulation or given.setup.model.formulation)
         is_recorded = bool(recording.counts.get(interface.PREDICTED_THREAD.recorded))
         targets = _targets(given, task.against)
         metrics = RunMetrics(model.thread_length, recording.start, targets, recorded=is_recorded)
         seen = given.observations(lambda share: progress(0.95 * share))
-        recorded, refused = RecordedPredictions(recording, *span), Counter[str]()
-        for step in predictions(seen, model, given.setup.scene, metrics.observe):
-            own = recorded.of(step.observation.stamp) if step.result.prediction is not None else None
-            measure_step(step, metrics, refused, own)
+        held, refused = RecordedPredictions(recording, *span), Counter[str]()
+        for step in recorded.predictions(seen, model, given.setup.scene, metrics.observe):
+            own = held.of(step.observation.stamp) if step.result.prediction is not None else None
+            recorded.measure_step(step, metrics, refused, own)
         figures = Figures.of(metrics, live_figures(recording, *span), (given.start, given.start + given.duration))
-        refused += Counter({why: count for why, count in seen.refused.items() if why != NOT_FOUND}) + recording.refused
+        refused += (
+            Counter({why: count for why, count in seen.refused.items() if why != recorded.NOT_FOUND})
+            + recording.refused
+        )
         if not figures.predicted:
             counts = Counter(metrics.reasons) + refused
             why = "; ".join(f"{count} times {reason}" for reason, count in counts.most_common(3)) or WAITING
@@ -484,40 +429,32 @@ def evaluate_bag(task: EvaluationTask, log: Log, progress: Progress) -> tuple[Ro
         about = _about(given, task.name, model, refused, seen.thread_problem())
         worst = metrics.worst_frames()
         photos = find_photos(given, {each.frame.stamp for each in worst})
-        pictures = [
-            draw_worst_frame(
-                each,
-                photos.get(each.frame.stamp),
-                target=metrics.target,
-                length=model.thread_length,
-                dish_diameter=given.setup.scene.dish.diameter,
-                simulated=bool(about.simulated),
-            )
-            for each in worst
-        ]
+        shown: dict[str, Any] = {"target": metrics.target, "length": model.thread_length}
+        shown |= {"dish_diameter": about.dish_diameter, "simulated": bool(about.simulated)}
+        pictures = [draw_worst_frame(each, photos.get(each.frame.stamp), **shown) for each in worst]
     page = write_page(about, metrics, figures, pictures)
     progress(1.0)
-    return row_of(about, figures), page
+    return tables.row_of(about, figures), page
 
 
-def _targets(given: BagInput, against: str) -> list[str]:
+def _targets(given: recorded.BagInput, against: str) -> list[str]:
     """Return what the predictions are compared with.
 
     Raises:
         BagError: the bag does not hold it.
     """
-    counts = given.recording.counts
-    there = {
-        "truth": bool(counts.get(interface.GROUND_TRUTH_THREAD.recorded)),
-        "seen": given.source == "camera" or bool(counts.get(interface.MEASURED_THREAD.recorded)),
-    }
-    if against != "auto" and not there[against]:
-        topic = interface.GROUND_TRUTH_THREAD if against == "truth" else interface.MEASURED_THREAD
-        raise BagError(given.recording.path, f"has no messages on {topic.recorded} ({topic.type_name})")
-    return [target for target, is_there in there.items() if is_there and against in ("auto", target)]
+    counts, targets = given.recording.counts, []
+    for target, channel in (("truth", interface.GROUND_TRUTH_THREAD), ("seen", interface.MEASURED_THREAD)):
+        if counts.get(channel.recorded) or (target == "seen" and given.source == "camera"):
+            targets.append(target)
+        elif against == target:
+            raise BagError(given.recording.path, f"has no messages on {channel.recorded} ({channel.type_name})")
+    return [target for target in targets if against in ("auto", target)]
 
 
-def _about(given: BagInput, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str) -> BagDetails:
+def _about(
+    given: recorded.BagInput, name: str, model: ThreadModelSettings, refused: Counter[str], problem: str
+) -> BagDetails:
     recording, setup = given.recording, given.setup
     return BagDetails(
         name=name,
@@ -542,7 +479,7 @@ def _about(given: BagInput, name: str, model: ThreadModelSettings, refused: Coun
         },
         settings=(*_settings(model), *_settings(setup.vision)),
         remarks=(problem,) if problem else (),
-        software=(*_versions(), ("Python", platform.python_version())),
+        software=_versions(),
     )
 
 
@@ -553,12 +490,12 @@ def _settings(settings: Configuration) -> Iterator[tuple[str, str, str]]:
         yield f"{field.group}.{field.name}", shown, field.quantity.unit
 
 
-def _versions() -> Iterator[tuple[str, str]]:
+def _versions() -> tuple[tuple[str, str], ...]:
+    found = []
     for name in ("magnetosuture_thread", "numpy", "numba", "opencv-python-headless"):
-        try:
-            yield name, version(name)
-        except PackageNotFoundError:  # as where Ubuntu's python3-opencv is in its place
-            continue
+        with suppress(PackageNotFoundError):  # as where Ubuntu's python3-opencv is in its place
+            found.append((name, version(name)))
+    return *found, ("Python", platform.python_version())
 
 
 def live_figures(recording: Recording, start: float, duration: float | None) -> LiveFigures:
@@ -614,11 +551,10 @@ class RecordedPredictions:
     """
 
     def __init__(self, recording: Recording, start: float, duration: float | None) -> None:
-        there = bool(recording.counts.get(interface.PREDICTED_THREAD.recorded))
+        there = recording.counts.get(interface.PREDICTED_THREAD.recorded)
         channels = [interface.PREDICTED_THREAD] if there else []
-        self._records: Iterator[RecordedMessage] = recording.records(channels, start=start, duration=duration)
+        self._records = recording.records(channels, start=start, duration=duration)
         self._held: dict[int, RecordedMessage] = {}
-        self._latest = -1
 
     def of(self, stamp: int) -> Points | None:
         """Return the recorded prediction of a frame, shape (n + 1, 2) [m]; None if there is none.
@@ -626,14 +562,12 @@ class RecordedPredictions:
         Args:
             stamp: of the frame [ns], not before those asked for until now.
         """
-        while self._latest < stamp and len(self._held) < 600:
+        while len(self._held) < 600 and max(self._held, default=-1) < stamp:
             record = next(self._records, None)
             if record is None:
                 break
-            self._latest = max(self._latest, at := stamp_of(record))
-            if at >= stamp:  # those before were of frames that nobody asked for
-                self._held[at] = record
-        found = self._held.pop(stamp, None)
+            self._held[stamp_of(record)] = record
+        found = self._held.get(stamp)
         self._held = {at: record for at, record in self._held.items() if at > stamp}
         if found is None:
             return None

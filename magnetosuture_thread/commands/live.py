@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,9 +15,8 @@ import yaml
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands import recorded, replay
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import CHANGING, BagInput, BagSelection, open_bag
-from magnetosuture_thread.commands.replay import replay_summary, write_results
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
@@ -38,15 +38,22 @@ POLL_PERIOD = 0.02  # s between two looks at the nodes
 
 # Arguments for the nodes, after `--ros-args`. Where two cores carry the whole graph and a recording besides, the bridge
 # leaves them more of it. Whatever a setup says for a launch, nobody would activate the nodes of a command.
-OWN = (
-    "-p",
-    "coil_bridge:rate:=100.0",
-    *(p for name in interface.STANDBY_NODES for p in ("-p", f"{name}:autostart:=active")),
-)
+OWN = ["-p", "coil_bridge:rate:=100.0"]
+for _name in interface.STANDBY_NODES:
+    OWN += ["-p", f"{_name}:autostart:=active"]
 # Ahead in s, and between two forecasts: what page and recording show, without poses that come late for it.
 FORECAST = ("-p", "thread_model:forecast_horizon:=3.0", "-p", "thread_model:forecast_period:=0.2")
-# A replayed bag never moves a needle, so its bridge may arm itself.
-NOTHING_MOVES = ("-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed")
+
+
+@contextmanager
+def own_domain() -> Iterator[int]:
+    """Yield a ROS domain that nobody else uses; this process has the environment for it meanwhile.
+
+    Raises:
+        GraphError: all domains are in use.
+    """
+    with reserved_domain() as domain, environment_of(graph_environment(domain)):
+        yield domain
 
 
 @dataclass(frozen=True)
@@ -69,41 +76,6 @@ class OwnGraph:
         self.nodes.check()
 
 
-@dataclass(frozen=True)
-class Place:
-    """Where nodes run.
-
-    Attributes:
-        domain: ROS domain.
-        environment: for the nodes.
-        logs: folder for what each node prints.
-    """
-
-    domain: int
-    environment: dict[str, str]
-    logs: Path
-
-    def nodes(self, processes: Sequence[str], arguments: Sequence[str]) -> NodeProcesses:
-        """Return nodes that are not started yet."""
-        return NodeProcesses(processes, arguments, self.environment, self.logs)
-
-
-@contextmanager
-def own_place(logs: Path) -> Iterator[Place]:
-    """Yield a ROS domain that nobody else uses, with the environment for it, which this process has meanwhile.
-
-    Args:
-        logs: folder for what each node prints.
-
-    Raises:
-        GraphError: all domains are in use.
-    """
-    with reserved_domain() as domain:
-        environment = graph_environment(domain)
-        with environment_of(environment):
-            yield Place(domain, environment, logs)
-
-
 @contextmanager
 def own_graph(
     processes: Sequence[str], arguments: Sequence[str], logs: Path, what: str, log: Log
@@ -120,10 +92,10 @@ def own_graph(
     Raises:
         GraphError: all domains are in use.
     """
-    with own_place(logs) as place:
-        log(f"starting {what} (ROS domain {place.domain}, this machine only)")
-        with place.nodes(processes, arguments) as nodes:
-            yield OwnGraph(place.domain, nodes, Interruption())
+    with own_domain() as domain:
+        log(f"starting {what} (ROS domain {domain}, this machine only)")
+        with NodeProcesses(processes, arguments, dict(os.environ), logs) as nodes:
+            yield OwnGraph(domain, nodes, Interruption())
 
 
 def log_compiling(texts: Mapping[str, str], logged: set[str], log: Log) -> None:
@@ -154,22 +126,17 @@ class GraphInput:
         channels: that are played.
     """
 
-    def __init__(self, given: BagInput) -> None:
+    def __init__(self, given: recorded.BagInput) -> None:
         self.given = given
         camera = given.recording.camera if given.source == "camera" else None
         self.transport = next((transport for transport, channel in interface.CAMERA.items() if channel == camera), "")
         self.nodes = tuple(name for name in interface.NODES if self.transport or name != "vision_tracker")
         self.processes = interface.PROCESSES if self.transport else self.nodes
-        source = (
-            (camera, interface.CAMERA_INFO)
-            if camera is not None
-            else (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
-        )
+        poses = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
+        source = (camera, interface.CAMERA_INFO) if camera is not None else poses
         possible = (*source, interface.NEEDLE_COMMAND, interface.MATERIAL)
-        self.channels: list[interface.Channel] = [
-            interface.SCENE,
-            *(c for c in possible if given.recording.counts.get(c.recorded)),
-        ]
+        counts = given.recording.counts
+        self.channels = [interface.SCENE, *(channel for channel in possible if counts.get(channel.recorded))]
 
     def arguments(self, qos: Path) -> list[str]:
         """Return the nodes' arguments.
@@ -182,7 +149,9 @@ class GraphInput:
         # Nodes begin in the scene that is played, also where the setup's file names one of another machine.
         scene = qos.with_name("scene.yaml")
         write_scene(self.given.setup.scene, scene)
-        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *NOTHING_MOVES, *OWN]
+        arguments = [*files, "-p", f"scene:={scene.resolve()}", "-p", "use_sim_time:=true", *OWN]
+        # A replayed bag never moves a needle, so its bridge may arm itself.
+        arguments += ["-p", "coil_bridge:driver:=recording", "-p", "coil_bridge:autostart:=armed"]
         if self.transport:
             arguments += ["-p", f"vision_tracker:image_transport:={self.transport}"]
         return arguments
@@ -194,7 +163,7 @@ class GraphInput:
         data = packed_scene(given.begin, given.setup.scene)
         yield RecordedMessage(interface.SCENE.recorded, interface.SCENE.type_name, given.begin, data)
         if given.start > 0.0:  # what came before about the thread is in force
-            earlier = [channel for channel in CHANGING if channel != interface.SCENE]
+            earlier = [channel for channel in recorded.CHANGING if channel != interface.SCENE]
             for record in given.recording.records(earlier, duration=given.start):
                 yield replace(record, time=given.begin)
         version = given.setup.scene.version
@@ -229,7 +198,7 @@ def replay_live(
     loop: bool = False,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[recorded.BagSelection],
 ) -> ReplaySummary:
     """Play a bag through the nodes as processes of their own, and evaluate their outputs.
 
@@ -252,7 +221,7 @@ def replay_live(
         GraphError: a node ended or did not come, or nothing was predicted.
         KeyboardInterrupt: interrupted before the first pass was done.
     """
-    with open_bag(bag_path, log, **selection) as given:
+    with recorded.open_bag(bag_path, log, **selection) as given:
         if loop:
             given.check_loop()
         checked = _check_poses(given, log)
@@ -276,34 +245,27 @@ def replay_live(
                         log(f"playing {given.duration:.1f} s{speed}")
                         pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.Service.PAUSE_REPLAY}"
                         log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
-                        length = max(given.duration, 1e-9)
-                        live.play(source.records(), lambda time: progress(min(1.0, time / length)))
+                        live.play(source.records(), lambda time: progress(min(1.0, time / max(given.duration, 1e-9))))
                     log("evaluating the outputs")
                     metrics, summary = _summary(given, folder, live, **checked)
-                    write_results(folder, given, metrics, summary, log)
+                    replay.write_results(folder, given, metrics, summary, log)
                     if loop:
                         log("the first pass is recorded and evaluated; playing on until Ctrl-C")
-                        problem = _play_on(live, source, graph)
+                        try:
+                            with graph.interruption:
+                                live.play_on(source.records)
+                        except GraphError as error:
+                            problem = f"{error}; the first pass is in {output}"
+                        except KeyboardInterrupt:
+                            pass
                 finally:
                     live.close()
     if problem:
-        raise GraphError(f"{problem}; the first pass is in {output}")
+        raise GraphError(problem)
     return summary
 
 
-def _play_on(live: LiveReplay, source: GraphInput, graph: OwnGraph) -> str:
-    """Play on until Ctrl-C; return what ended it else."""
-    try:
-        with graph.interruption:
-            live.play_on(source.records)
-    except GraphError as error:
-        return str(error)
-    except KeyboardInterrupt:
-        pass
-    return ""
-
-
-def _check_poses(given: BagInput, log: Log) -> dict[str, Any]:
+def _check_poses(given: recorded.BagInput, log: Log) -> dict[str, Any]:
     """Check recorded poses and threads before any node starts; return `remark`, and what is `refused`."""
     if given.source == "camera":
         return {}
@@ -315,15 +277,17 @@ def _check_poses(given: BagInput, log: Log) -> dict[str, Any]:
     return {"remark": remark, "refused": dict(checked.refused)}
 
 
-def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> tuple[RunMetrics, ReplaySummary]:
+def _summary(
+    given: recorded.BagInput, folder: Path, live: LiveReplay, **others: Any
+) -> tuple[RunMetrics, ReplaySummary]:
     """Compare the outputs with what the bag holds."""
     collector = GraphCollector(given.setup.model.thread_length)
-    recorded, replayed = CurrentSeries(), CurrentSeries()
+    before, replayed = CurrentSeries(), CurrentSeries()
     truth = interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL
     expected = [c for c in (*truth, interface.CURRENTS) if given.recording.counts.get(c.recorded)]
     for record in given.recording.records(expected, start=given.start, duration=given.duration):
         if record.topic == interface.CURRENTS.recorded:
-            recorded.add(record.decode())
+            before.add(record.decode())
         else:
             collector.add(record.topic, record.decode())
     made = Bag(folder / "bag")
@@ -333,22 +297,15 @@ def _summary(given: BagInput, folder: Path, live: LiveReplay, **others: Any) -> 
         if record.topic == interface.CURRENTS.recorded:
             replayed.add(message)
     metrics, losses = collector.metrics(given.recording.start), live.losses
-    frames = losses.played[interface.NEEDLE_POSE.name] if given.source == "poses" else losses.frames_played
+    frames, things = losses.frames_played, "frames"
+    if given.source == "poses":
+        frames, things = losses.played[interface.NEEDLE_POSE.name], "poses"
     if not len(metrics.series):
         health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
-        things = "poses" if given.source == "poses" else "frames"
         raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
     commands = live.published.get(interface.NEEDLE_COMMAND.name, {})
-    summary = replay_summary(
-        given,
-        metrics,
-        frames=frames,
-        tracked=collector.poses,
-        commands=len(commands),
-        driven=len(collector.applied & set(commands)),
-        latency=stage_latencies(live.published, live.arrived, collector.applied),
-        currents=replayed.against(recorded),
-        dropped=losses.dropped(),
-        **others,
-    )
-    return metrics, summary
+    counts: dict[str, Any] = {"frames": frames, "tracked": collector.poses, "commands": len(commands)}
+    counts |= {"driven": len(collector.applied & set(commands)), "dropped": losses.dropped()}
+    latency = stage_latencies(live.published, live.arrived, collector.applied)
+    currents = replayed.against(before)
+    return metrics, replay.replay_summary(given, metrics, **counts, latency=latency, currents=currents, **others)

@@ -90,9 +90,11 @@ def chosen_source(recording: Recording, source: str) -> str:
     Raises:
         BagError: the bag does not hold what was asked for.
     """
-    has = {"camera": recording.camera is not None, "poses": bool(recording.counts.get(interface.NEEDLE_POSE.recorded))}
-    for name in ("camera", "poses") if source == "auto" else (source,):
-        if has[name]:
+    for name, is_there in (
+        ("camera", recording.camera is not None),
+        ("poses", recording.counts.get(interface.NEEDLE_POSE.recorded)),
+    ):
+        if is_there and source in ("auto", name):
             return name
     for channel in (*interface.CAMERA.values(), interface.NEEDLE_POSE):
         if channel.recorded in recording.unfit:
@@ -107,11 +109,7 @@ class ObservationReader(Iterator[Observation]):
     Frames are tracked as `vision_tracker` does. Only a few observations are in memory at a time.
 
     Args:
-        recording: the bag.
-        setup: what to look for, and how large the dish is.
-        source: see `chosen_source`.
-        start: seconds into the bag to begin at.
-        duration: [s]; to the bag's end if None.
+        given: the bag, and what of it is read.
         progress: called with the share done, 0 to 1.
 
     Attributes:
@@ -124,45 +122,33 @@ class ObservationReader(Iterator[Observation]):
             with each scene that is taken.
 
     Raises:
-        BagError: the bag does not hold the source; or while going through, a length is not in metres.
+        BagError: while going through, a length is not in metres.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        setup: Setup,
-        source: str = "auto",
-        start: float = 0.0,
-        duration: float | None = None,
-        progress: Progress = lambda share: None,
-    ) -> None:
-        self.source = chosen_source(recording, source)
+    def __init__(self, given: BagInput, progress: Progress = lambda share: None) -> None:
+        recording, setup = given.recording, given.setup
+        self.source = given.source
         self.count = self.found = 0
         self.refused: Counter[str] = Counter()
         self.on_frame: Callable[[int, FrameMeasurement], None] = lambda stamp, seen: None
         self.on_record: Callable[[int, RecordedMessage], None] = lambda stamp, record: None
-        self._recording, self._scene, self._length = recording, setup.scene, setup.model.thread_length
+        self._path, self._scene, self._length = recording.path, setup.scene, setup.model.thread_length
         self._measured = self._odd = 0
         self._tracker: TrackerSession | None = None
         own: tuple[Channel, ...] = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
-        if self.source == "camera":
-            assert recording.camera is not None
+        if recording.camera is not None and self.source == "camera":
             warm_up()
             self._tracker = TrackerSession(setup.vision, setup.scene)
             own = (recording.camera, interface.CAMERA_INFO)
-        given = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, *CHANGING, *own)
-        channels = [channel for channel in given if recording.counts.get(channel.recorded)]
-        begin = recording.start + round(start * 1e9)
-        earlier = recording.records(CHANGING, duration=start) if start > 0.0 else ()
-        self._changes = [record for record in earlier if record.time < begin]
+        possible = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, *CHANGING, *own)
+        channels = [channel for channel in possible if recording.counts.get(channel.recorded)]
+        earlier = recording.records(CHANGING, duration=given.start) if given.start > 0.0 else ()
+        self._changes = [record for record in earlier if record.time < given.begin]
         for record in self._changes:
             self._follow(record)
         # What belongs to a frame, by topic and stamp.
         self._parts: dict[str, dict[int, Any]] = {c.recorded: {} for c in channels if c.recorded in _READERS}
-        left = max(recording.duration - start, 1e-9)
-        span = left if duration is None else max(min(duration, left), 1e-9)
-        records = recording.records(channels, start=start, duration=duration)
-        self._going = self._go(_with_progress(records, begin, span, progress))
+        self._going = self._go(recording.records(channels, start=given.start, duration=given.duration), given, progress)
 
     def __next__(self) -> Observation:
         """Return the next observation.
@@ -189,20 +175,26 @@ class ObservationReader(Iterator[Observation]):
             f"shorter than {MIN_LENGTH_RATIO:g} times the setup's {self._length:g} m: is it another thread?"
         )
 
-    def _go(self, records: Iterator[RecordedMessage]) -> Iterator[Observation]:
+    def _go(self, records: Iterator[RecordedMessage], given: BagInput, progress: Progress) -> Iterator[Observation]:
         """Give an observation once what belongs to it has come, or cannot be expected any more."""
         changing = {channel.recorded for channel in CHANGING}
         waiting: deque[Observation | RecordedMessage] = deque()
+        span, reported = max(given.duration, 1e-9), given.begin
         for record in records:
+            if record.time >= reported:  # a thousand times at the most: showing it takes longer than a step
+                progress(min(1.0, (record.time - given.begin) * 1e-9 / span))
+                reported = record.time + max(round(span * 1e6), 1)
             if record.topic in self._parts:
                 self._keep(record)
             elif record.topic in changing:
                 self._follow(record)
                 waiting.append(record)
+            elif self._tracker is None:
+                waiting.append(self._pose(record))
             elif record.topic == interface.CAMERA_INFO.recorded:
-                self._take_lens(record)
+                self._take_lens(record, self._tracker)
             else:
-                waiting.append(self._pose(record) if self._tracker is None else self._frame(record, self._tracker))
+                waiting.append(self._frame(record, self._tracker))
             while waiting and (len(waiting) > MAX_WAITING_POSES or self._complete(waiting[0])):
                 yield from self._next(waiting.popleft())
         while waiting:
@@ -216,13 +208,12 @@ class ObservationReader(Iterator[Observation]):
         if isinstance(head, RecordedMessage):
             self._changes.append(head)
             return
-        found = {topic: known[head.stamp] for topic, known in self._parts.items() if head.stamp in known}
-        observation = replace(head, ground_truth=found.get(_TRUE, _NOTHING), true_pull=found.get(_PULL, _NO_FORCE))
+        found = {topic: known.get(head.stamp, _READERS[topic][1]) for topic, known in self._parts.items()}
+        head = replace(head, ground_truth=found.get(_TRUE, _NOTHING), true_pull=found.get(_PULL, _NO_FORCE))
         if self.source == "poses":
             # As live, the centreline alone tells nothing where observations come.
-            observed = found.get(_OBSERVED, ThreadObservation()) if _OBSERVED in self._parts else None
-            observation = replace(observation, measured=found.get(_SEEN, _NOTHING), observation=observed)
-        yield observation
+            head = replace(head, measured=found.get(_SEEN, _NOTHING), observation=found.get(_OBSERVED))
+        yield head
 
     def _follow(self, record: RecordedMessage) -> None:
         """Look for the needle in a recorded scene from here on, as `vision_tracker` does."""
@@ -236,34 +227,35 @@ class ObservationReader(Iterator[Observation]):
             return  # counted and reported where the model takes it
         self._scene = scene
 
-    def _take_lens(self, record: RecordedMessage) -> None:
+    def _take_lens(self, record: RecordedMessage, tracker: TrackerSession) -> None:
         """Undo the distortion of a recorded lens from here on, as `vision_tracker` does."""
-        assert self._tracker is not None
+        lens = None
         try:
             lens = lens_of(record.decode())
         except MagnetosutureError as error:
             self.refused[f"{record.topic}: {error}"] += 1
-            lens = None
-        self._tracker.set_lens(lens)
+        tracker.set_lens(lens)
 
     def _keep(self, record: RecordedMessage) -> None:
         """Keep what belongs to a frame; nothing where it isn't valid."""
         stamp, topic, known = stamp_of(record), record.topic, self._parts[record.topic]
         if topic in (_SEEN, _OBSERVED):
             self.on_record(stamp, record)
-        read, nothing = _READERS[topic]
+        read, part = _READERS[topic]
         try:
-            known[stamp] = part = read(record)
+            part = read(record)
         except InvalidInputError as error:
             self.refused[f"{topic}: {error}"] += 1
-            known[stamp] = part = nothing
-        if topic in (_SEEN, _OBSERVED):
-            for points in [piece.points for piece in part.pieces] if topic == _OBSERVED else [part]:
-                self._check_place(topic, points)
-        if topic == _SEEN and len(part) and np.isfinite(part).all():
-            length = float(arc_lengths(part)[-1]) / self._length
-            self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
-            self._measured += 1
+        known[stamp] = part
+        if topic == _OBSERVED:
+            for piece in part.pieces:
+                self._check_place(topic, piece.points)
+        if topic == _SEEN:
+            self._check_place(topic, part)
+            if len(part) and np.isfinite(part).all():
+                length = float(arc_lengths(part)[-1]) / self._length
+                self._odd += not MIN_LENGTH_RATIO <= length <= MAX_LENGTH_RATIO
+                self._measured += 1
         if len(known) > 2 * MAX_WAITING_POSES:  # of a frame that never came
             del known[next(iter(known))]
 
@@ -318,19 +310,7 @@ class ObservationReader(Iterator[Observation]):
         if far.max(initial=0.0) > width:
             worst = points.reshape(-1, 2)[far.reshape(-1, 2).max(axis=1).argmax()]
             where = f"a point at ({worst[0]:g}, {worst[1]:g}) m, but the dish is {width:g} m wide"
-            raise BagError(self._recording.path, f"{topic} has {where}; are these millimetres, or another setup's?")
-
-
-def _with_progress(
-    records: Iterator[RecordedMessage], begin: int, span: float, progress: Progress
-) -> Iterator[RecordedMessage]:
-    """Go through records and report progress, a thousand times at the most: showing it takes longer than a step."""
-    following = begin
-    for record in records:
-        if record.time >= following:
-            progress(min(1.0, (record.time - begin) * 1e-9 / span))
-            following = record.time + max(round(span * 1e6), 1)
-        yield record
+            raise BagError(self._path, f"{topic} has {where}; are these millimetres, or another setup's?")
 
 
 @dataclass(frozen=True)
@@ -455,7 +435,6 @@ def measure_step(step: Step, metrics: RunMetrics, refused: Counter[str], recorde
 
 DEFAULT_SETUP = "petri_35mm_polyamide"
 SETUP_NOTE = "scenario"  # of a bag, which holds the setup's text
-MIN_LOOP_DURATION = 1.5  # s; nodes take a jump back of a second and less for messages that come late
 
 
 class BagSelection(TypedDict, total=False):
@@ -509,12 +488,12 @@ class BagInput:
 
     def observations(self, progress: Progress = lambda share: None) -> ObservationReader:
         """Return the observations; `progress` is called with the share done, 0 to 1."""
-        return ObservationReader(self.recording, self.setup, self.source, self.start, self.duration, progress)
+        return ObservationReader(self, progress)
 
     def check_loop(self) -> None:
         """Raise `BagError` if the bag is too short to be played in a loop."""
-        if self.duration < MIN_LOOP_DURATION:
-            problem = f"gives {self.duration:.2f} s to play over and over; expected {MIN_LOOP_DURATION:g} s or more"
+        if self.duration < 1.5:  # s; nodes take a jump back of a second and less for messages that come late
+            problem = f"gives {self.duration:.2f} s to play over and over; expected 1.5 s or more"
             raise BagError(self.recording.path, problem)
 
 

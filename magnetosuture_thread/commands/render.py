@@ -6,31 +6,19 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
 from magnetosuture_thread import Attachment, ConfigurationError, Disc, interface
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    number_argument,
-    runs,
-    whole_number,
-)
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory, read_reference
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.messages.packing import (
-    packed_camera_info,
-    packed_compressed_image,
-    packed_path,
-    packed_pose,
-    packed_pose_stamped,
-    packed_twist,
-)
+from magnetosuture_thread.messages import packing
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, encode_jpeg
 from magnetosuture_thread.setups import Setup, read_setup
@@ -41,23 +29,30 @@ EPOCH = 1.0  # s; the bag's time at the trajectory's time 0, as time 0 means "no
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_render)
+    command.runs(parser, run_render)
     option = parser.add_argument
     option("reference", type=Path, metavar="REFERENCE", help="a reference trajectory (.npz)")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     option("--setup", required=True, metavar="NAME", help="a setup's name or YAML file")
-    option("--start", type=number_argument(0.0, 1e6), default=0.0, help="time in the trajectory to begin at [s]")
-    option("--duration", type=number_argument(1e-3, 1e6), help="[s] (default: to the trajectory's end)")
-    option("--rate", type=number_argument(1.0, 240.0), default=30.0, help="frames, or poses, a second (default: 30)")
+    option(
+        "--start", type=command.number_argument(0.0, 1e6), default=0.0, help="time in the trajectory to begin at [s]"
+    )
+    option("--duration", type=command.number_argument(1e-3, 1e6), help="[s] (default: to the trajectory's end)")
+    option(
+        "--rate",
+        type=command.number_argument(1.0, 240.0),
+        default=30.0,
+        help="frames, or poses, a second (default: 30)",
+    )
     quality = "of the JPEG frames (default: 85)"
     option("--quality", type=int, choices=range(1, 101), default=85, metavar="1..100", help=quality)
-    option("--seed", type=whole_number, default=0, help="of dust and noise (default: 0)")
+    option("--seed", type=command.whole_number, default=0, help="of dust and noise (default: 0)")
     option("--poses", action="store_true", help="write poses and measured threads instead of frames")
     noise = "of these, standard deviation; of the heading, this over the needle's length (default: 0)"
-    option("--noise", type=number_argument(0.0, 1e-2), default=0.0, metavar="METRES", help=noise)
+    option("--noise", type=command.number_argument(0.0, 1e-2), default=0.0, metavar="METRES", help=noise)
 
 
-def run_render(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_render(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Write a bag of simulated camera frames, or poses.
 
     A reference trajectory is rendered as the overhead camera would see it, and written as a bag: JPEG frames,
@@ -67,13 +62,13 @@ def run_render(options: argparse.Namespace, terminal: Terminal) -> int:
     """
     if options.noise and not options.poses:
         raise ConfigurationError("--noise", options.noise, "none without --poses")
-    given = {name: getattr(options, name) for name in ("start", "duration", "rate", "quality", "seed")}
+    given = command.given(options, "start", "duration", "rate", "quality", "seed")
     given["pose_noise"] = options.noise if options.poses else None
     setup, reference = read_setup(options.setup), read_reference(options.reference)
     with terminal.progress("render") as advance:
         frames = render_bag(reference, setup, options.output, progress=advance, **given)
     terminal.log(f"{frames} simulated {'poses' if options.poses else 'frames'} in {options.output}")
-    return DONE
+    return command.DONE
 
 
 def render_bag(
@@ -122,12 +117,14 @@ def render_bag(
     _check_setup(reference, setup)
     what = "camera frames and needle motion, rendered" if pose_noise is None else "needle poses and seen thread"
     notes = {"setup": setup.name, "simulated": f"{what} from the reference trajectory {reference.name}"}
-    source: _FrameTopics | _PoseTopics = (
-        _FrameTopics(setup, reference, quality, seed) if pose_noise is None else _PoseTopics(setup, pose_noise, seed)
-    )
+    source: tuple[interface.Channel, ...] = (interface.NEEDLE_POSE, interface.MEASURED_THREAD)
+    if pose_noise is None:
+        source, messages = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO), _frames(setup, reference, quality, seed)
+    else:
+        messages = _poses(setup, pose_noise, seed)
+    motion = (interface.NEEDLE_COMMAND, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD)
+    channels = (*source, *motion)
     with whole_folder(output) as folder, BagWriter(folder, notes, name=output.name) as bag:
-        motion = (interface.NEEDLE_COMMAND, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD)
-        channels = (*source.channels, *motion)
         for channel in (interface.SCENE, *channels):
             bag.add_topic(channel.recorded, channel.type_name)
         begin = round((start + EPOCH) * 1e9)
@@ -138,10 +135,10 @@ def render_bag(
             velocity = (reference.at(after)[0] - reference.at(before)[0]) / (after - before)
             stamp, (tail, heading, thread) = round((time + EPOCH) * 1e9), reference.at(time)
             instant = (
-                *source.messages(stamp, tail, heading, thread),
-                packed_twist(stamp, velocity),
-                packed_pose_stamped(stamp, tail, heading),
-                packed_path(stamp, _resampled(thread, 51)),
+                *messages(stamp, tail, heading, thread),
+                packing.packed_twist(stamp, velocity),
+                packing.packed_pose_stamped(stamp, tail, heading),
+                packing.packed_path(stamp, _resampled(thread, 51)),
             )
             for channel, message in zip(channels, instant, strict=True):
                 bag.write(channel.recorded, stamp, message)
@@ -174,49 +171,44 @@ def _check_setup(reference: ReferenceTrajectory, setup: Setup) -> None:
         raise ConfigurationError(name, found, f"{wanted}, as in {reference.name}", str(setup.path))
 
 
-class _FrameTopics:
-    """Writes camera frames."""
-
-    channels = (interface.COMPRESSED_IMAGE, interface.CAMERA_INFO)
-
-    def __init__(self, setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> None:
-        view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * SIZE[1]))
-        scene = CameraScene(
-            dish_diameter=setup.scene.dish.diameter,
-            needle_length=setup.vision.needle_length,
-            needle_width=setup.vision.needle_width,
-            thread_diameter=setup.model.thread().diameter,
-            obstacles=reference.discs,
-        )
-        self._camera, self._quality = DishCamera(scene, view, SIZE, seed), quality
-
-    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
-        """Return a message for each channel."""
-        camera = self._camera
-        data = encode_jpeg(camera.render(tail, heading, thread), self._quality)
-        information = packed_camera_info(stamp, camera.size, camera.view, 0.3)  # m above the dish
-        return packed_compressed_image(stamp, data), information
+Messages: TypeAlias = "Callable[[int, Points, float, Points], tuple[bytes, bytes]]"  # of stamp, tail, heading, thread
 
 
-class _PoseTopics:
-    """Writes poses and measured threads, as a tracker would measure them in the frames."""
+def _frames(setup: Setup, reference: ReferenceTrajectory, quality: int, seed: int) -> Messages:
+    """Return what makes a camera frame and its camera_info."""
+    view = DishView((322.0, 238.0), setup.scene.dish.diameter / (0.9115 * SIZE[1]))
+    scene = CameraScene(
+        dish_diameter=setup.scene.dish.diameter,
+        needle_length=setup.vision.needle_length,
+        needle_width=setup.vision.needle_width,
+        thread_diameter=setup.model.thread().diameter,
+        obstacles=reference.discs,
+    )
+    camera = DishCamera(scene, view, SIZE, seed)
 
-    channels = (interface.NEEDLE_POSE, interface.MEASURED_THREAD)
+    def messages(stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
+        data = encode_jpeg(camera.render(tail, heading, thread), quality)
+        information = packing.packed_camera_info(stamp, camera.size, camera.view, 0.3)  # m above the dish
+        return packing.packed_compressed_image(stamp, data), information
 
-    def __init__(self, setup: Setup, noise: float, seed: int) -> None:
-        self._noise = np.array([noise, noise, noise / setup.vision.needle_length])
-        self._random = np.random.default_rng(seed)
+    return messages
 
-    def messages(self, stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
-        """Return a message for each channel."""
-        offset = self._noise * self._random.standard_normal(3)
+
+def _poses(setup: Setup, noise: float, seed: int) -> Messages:
+    """Return what makes a pose and a measured thread, as a tracker would measure them in the frames."""
+    deviations, random = np.array([noise, noise, noise / setup.vision.needle_length]), np.random.default_rng(seed)
+
+    def messages(stamp: int, tail: Points, heading: float, thread: Points) -> tuple[bytes, bytes]:
+        offset = deviations * random.standard_normal(3)
         angle = heading + offset[2]
         direction = np.array([np.cos(angle), np.sin(angle)])
-        pose = packed_pose(stamp, tail + offset[:2], direction, np.diag(self._noise**2))
+        pose = packing.packed_pose(stamp, tail + offset[:2], direction, np.diag(deviations**2))
         measured = _resampled(thread, 64)
-        measured[1:] += self._noise[:2] * self._random.standard_normal(measured[1:].shape)
+        measured[1:] += noise * random.standard_normal(measured[1:].shape)
         measured[0] = tail + offset[:2]  # a measured thread begins at the measured tail
-        return pose, packed_path(stamp, measured)
+        return pose, packing.packed_path(stamp, measured)
+
+    return messages
 
 
 def _resampled(thread: Points, count: int) -> Points:

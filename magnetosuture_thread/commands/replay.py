@@ -13,39 +13,13 @@ from typing import TYPE_CHECKING, Any
 from magnetosuture_thread import ConfigurationError, InvalidInputError, interface
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    add_source,
-    add_span,
-    bag_location,
-    bag_selection,
-    number_argument,
-    runs,
-)
+from magnetosuture_thread.commands import command, recorded
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.commands.recorded import (
-    BagInput,
-    BagSelection,
-    ObservationReader,
-    Step,
-    measure_step,
-    open_bag,
-    predictions,
-    read_image,
-)
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
 from magnetosuture_thread.evaluation.metrics import RunMetrics, compare_errors, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
-from magnetosuture_thread.messages.packing import (
-    Outputs,
-    estimate_outputs,
-    packed_tracker_state,
-    pose_outputs,
-    prediction_outputs,
-    thread_outputs,
-)
+from magnetosuture_thread.messages import packing
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.thread_model.session import WAITING
@@ -60,18 +34,18 @@ if TYPE_CHECKING:
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_replay)
+    command.runs(parser, run_replay)
     option = parser.add_argument
-    option("bag", type=bag_location, metavar="BAG", help="an mcap file, or the folder of a bag, or its URL")
+    option("bag", type=command.bag_location, metavar="BAG", help="an mcap file, or the folder of a bag, or its URL")
     option("--output", type=Path, required=True, metavar="DIR", help="folder to make")
     option("--offline", action="store_true", help="without a graph, as fast as the machine can")
-    option("--rate", type=number_argument(0.05, 20.0), help="how much faster than recorded (default: 1)")
+    option("--rate", type=command.number_argument(0.05, 20.0), help="how much faster than recorded (default: 1)")
     option("--loop", action="store_true", help="play over and over, until Ctrl-C")
-    add_span(parser)
-    add_source(parser)
+    command.add_span(parser)
+    command.add_source(parser)
 
 
-def run_replay(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_replay(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Play a recorded bag through the live graph, or offline.
 
     vision_tracker, thread_model and coil_bridge run as processes of their own, on a ROS domain that nobody else
@@ -96,7 +70,7 @@ def run_replay(options: argparse.Namespace, terminal: Terminal) -> int:
         if options.offline and getattr(options, name):
             raise ConfigurationError(f"--{name}", getattr(options, name), "none with --offline, which knows no time")
     with terminal.progress("replay") as advance:
-        given = {**bag_selection(options), "log": terminal.log, "progress": advance}
+        given = {**command.bag_selection(options), "log": terminal.log, "progress": advance}
         if options.offline:
             summary = replay_offline(options.bag, options.output, **given)
         else:
@@ -105,7 +79,7 @@ def run_replay(options: argparse.Namespace, terminal: Terminal) -> int:
             summary = replay_live(options.bag, options.output, rate=options.rate or 1.0, loop=options.loop, **given)
     terminal.print(summary_table(summary))
     terminal.log(f"results: {options.output}")
-    return DONE
+    return command.DONE
 
 
 def replay_offline(
@@ -114,7 +88,7 @@ def replay_offline(
     *,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[recorded.BagSelection],
 ) -> ReplaySummary:
     """Put a bag through tracker and model without a graph, and evaluate the predictions.
 
@@ -134,38 +108,29 @@ def replay_offline(
         BagError: the bag cannot be used, nothing in it was predicted, or the output exists or cannot be written.
         ConfigurationError: the setup cannot be used.
     """
-    with open_bag(bag_path, log, **selection) as given, whole_folder(output) as folder:
-        what = "camera frames" if given.source == "camera" else "recorded poses"
-        log(f"predicting by the {what} of {given.duration:.1f} s")
+    with recorded.open_bag(bag_path, log, **selection) as given, whole_folder(output) as folder:
+        things = "frames" if given.source == "camera" else "poses"
+        log(f"predicting by the {'camera' if things == 'frames' else 'recorded'} {things} of {given.duration:.1f} s")
         seen = given.observations(progress)
         metrics = RunMetrics(given.setup.model.thread_length, given.recording.start)
         refused = Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
             made = _Output(bag, seen, given)
-            steps = predictions(seen, given.setup.model, given.setup.scene)
+            steps = recorded.predictions(seen, given.setup.model, given.setup.scene)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
-                measure_step(step, metrics, refused)
+                recorded.measure_step(step, metrics, refused)
             speed = given.duration / (time.perf_counter() - began)
         log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")
-        refused = refused + seen.refused + given.recording.refused
+        reasons = (refused + seen.refused + given.recording.refused).most_common()
         if not len(metrics.series):
-            words = "; ".join(f"{count} times {why}" for why, count in refused.most_common()) or WAITING
-            found = f"{seen.found} of {seen.count} {'frames' if given.source == 'camera' else 'poses'} had a needle"
+            words = "; ".join(f"{count} times {why}" for why, count in reasons) or WAITING
+            found = f"{seen.found} of {seen.count} {things} had a needle"
             raise BagError(given.recording.path, f"gave no prediction: {found}; {words}")
-        summary = replay_summary(
-            given,
-            metrics,
-            frames=seen.count,
-            tracked=seen.found,
-            commands=0,
-            driven=0,
-            latency={},
-            speed=speed,
-            refused=dict(refused.most_common()),
-            remark=seen.thread_problem(),
-        )
+        counts: dict[str, Any] = {"frames": seen.count, "tracked": seen.found, "commands": 0, "driven": 0}
+        others = {"latency": {}, "speed": speed, "refused": dict(reasons), "remark": seen.thread_problem()}
+        summary = replay_summary(given, metrics, **counts, **others)
         if summary.remark:
             log(summary.remark)
         write_results(folder, given, metrics, summary, log)
@@ -181,39 +146,34 @@ class _Output:
         given: the bag that is replayed.
     """
 
-    def __init__(self, bag: BagWriter, seen: ObservationReader, given: BagInput) -> None:
+    def __init__(self, bag: BagWriter, seen: recorded.ObservationReader, given: recorded.BagInput) -> None:
         self._bag, self._version = bag, given.setup.scene.version
         bag.add_topic(interface.SCENE.recorded, interface.SCENE.type_name)
         bag.write(interface.SCENE.recorded, given.begin, packed_scene(given.begin, given.setup.scene))
-        by_tracker = [interface.TRACKER_STATE, interface.THREAD_OBSERVATION] if seen.source == "camera" else []
-        if seen.source == "poses" and given.recording.counts.get(interface.THREAD_OBSERVATION.recorded):
-            by_tracker = [interface.THREAD_OBSERVATION]
-        for channel in (
-            interface.NEEDLE_POSE,
-            *by_tracker,
-            interface.MEASURED_THREAD,
-            interface.PREDICTED_THREAD,
-            interface.ESTIMATED_THREAD,
-            interface.MARGINS,
-        ):
+        is_observed = given.recording.counts.get(interface.THREAD_OBSERVATION.recorded)
+        channels = [interface.TRACKER_STATE] if seen.source == "camera" else []
+        channels += [interface.THREAD_OBSERVATION] if seen.source == "camera" or is_observed else []
+        channels += [interface.NEEDLE_POSE, interface.MEASURED_THREAD]
+        channels += [interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS]
+        for channel in channels:
             bag.add_topic(channel.recorded, channel.type_name)
         seen.on_frame, seen.on_record = self._frame, self._record
 
-    def write(self, step: Step) -> None:
+    def write(self, step: recorded.Step) -> None:
         """Write prediction, estimate and margins of an observation."""
         result = step.result
-        self._write(result.stamp, prediction_outputs(result, step.settings.material))
+        self._write(result.stamp, packing.prediction_outputs(result, step.settings.material))
         if result.refused is None and not result.late:  # as live: a pose that is refused gets no answer
-            self._write(result.stamp, estimate_outputs(result))
+            self._write(result.stamp, packing.estimate_outputs(result))
 
     def _frame(self, stamp: int, seen: FrameMeasurement) -> None:
         track = seen.track
         if seen.tracked:
-            self._write(stamp, pose_outputs(stamp, track.tail, track.heading, track.covariance))
-            self._write(stamp, thread_outputs(stamp, track.observation, seen.centreline))
-        self._bag.write(interface.TRACKER_STATE.recorded, max(stamp, 0), packed_tracker_state(stamp, track))
+            self._write(stamp, packing.pose_outputs(stamp, track.tail, track.heading, track.covariance))
+            self._write(stamp, packing.thread_outputs(stamp, track.observation, seen.centreline))
+        self._bag.write(interface.TRACKER_STATE.recorded, max(stamp, 0), packing.packed_tracker_state(stamp, track))
 
-    def _write(self, stamp: int, outputs: Outputs) -> None:
+    def _write(self, stamp: int, outputs: packing.Outputs) -> None:
         for channel, data in outputs:
             self._bag.write(channel.recorded, max(stamp, 0), data)
 
@@ -226,7 +186,7 @@ class _Output:
         self._bag.write(record.topic, max(stamp, 0), record.data)
 
 
-def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> ReplaySummary:
+def replay_summary(given: recorded.BagInput, metrics: RunMetrics, **others: Any) -> ReplaySummary:
     """Return the figures of a replay.
 
     Args:
@@ -260,7 +220,9 @@ def replay_summary(given: BagInput, metrics: RunMetrics, **others: Any) -> Repla
     )
 
 
-def write_results(folder: Path, given: BagInput, metrics: RunMetrics, summary: ReplaySummary, log: Log) -> None:
+def write_results(
+    folder: Path, given: recorded.BagInput, metrics: RunMetrics, summary: ReplaySummary, log: Log
+) -> None:
     """Write summary.json and summary.png.
 
     Args:
@@ -286,7 +248,7 @@ def write_results(folder: Path, given: BagInput, metrics: RunMetrics, summary: R
     draw_summary(folder / "summary.png", photo or draw_plan(scene.dish.diameter), shown, at, summary)
 
 
-def find_photos(given: BagInput, stamps: set[int]) -> dict[int, Photo]:
+def find_photos(given: recorded.BagInput, stamps: set[int]) -> dict[int, Photo]:
     """Return the camera images of some stamps, each with the view of the dish, of another frame where it has none."""
     from magnetosuture_thread.evaluation.plots import Photo  # late, as it imports matplotlib
 
@@ -301,7 +263,7 @@ def find_photos(given: BagInput, stamps: set[int]) -> dict[int, Photo]:
         if views and not is_wanted:
             continue
         try:
-            image = read_image(record)
+            image = recorded.read_image(record)
         except (BagError, InvalidInputError):
             continue
         if is_wanted:

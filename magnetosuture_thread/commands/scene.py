@@ -7,19 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from rich.text import Text
 
 from magnetosuture_thread import ConfigurationError, Disc, SceneShape, read_scene
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    add_actions,
-    number_argument,
-    output_file,
-    write_json,
-)
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.scene.checks import scene_warnings
 
@@ -34,17 +25,19 @@ docs/how_to/scenes.md.
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    check, draw = add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, draw=run_draw)
+    check, draw = command.add_actions(parser, DESCRIPTION, "what to do", "ACTION", check=run_check, draw=run_draw)
     for action in (check, draw):
         action.add_argument("file", metavar="FILE", help="a scene's file or name")
     width = "gaps narrower than this are reported [m] (default: %(default)s)"
-    check.add_argument("--needle-width", type=number_argument(0.0, 0.1), default=4e-4, metavar="W", help=width)
-    check.add_argument("--json", type=output_file, metavar="FILE", help="write what was found to a file")
-    picture = "the picture to write, .png or .svg"
-    draw.add_argument("--output", type=output_file, required=True, metavar="FILE", help=picture)
+    check.add_argument("--needle-width", type=command.number_argument(0.0, 0.1), default=4e-4, metavar="W", help=width)
+    check.add_argument("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
+    output = draw.add_argument
+    output(
+        "--output", type=command.output_file, required=True, metavar="FILE", help="the picture to write, .png or .svg"
+    )
 
 
-def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Show what a scene holds, with warnings.
 
     A scene file is read, and its dish, its version and its shapes are shown. What is allowed and yet is often a slip is
@@ -68,11 +61,11 @@ def run_check(options: argparse.Namespace, terminal: Terminal) -> int:
     for warning in warnings:
         terminal.print("warning:", style="bold yellow", end=" ")
         terminal.log(warning.text)
-    write_json(options.json, report)
-    return DONE
+    command.write_json(options.json, report)
+    return command.DONE
 
 
-def run_draw(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_draw(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Draw a scene file from above, with names and scale, as PNG or SVG."""
     if options.output.suffix not in (".png", ".svg"):
         raise ConfigurationError("--output", str(options.output), "a file that ends in .png or .svg")
@@ -83,36 +76,19 @@ def run_draw(options: argparse.Namespace, terminal: Terminal) -> int:
     with whole_file(options.output) as partial:
         plot_scene(partial, scene, Path(options.file).stem)
     terminal.log(f"{options.output}: {len(scene.shapes)} shapes, version {scene.version}")
-    return DONE
+    return command.DONE
 
 
 def _table(report: dict[str, Any]) -> Table:
     """Return a row for each shape."""
-    dish = report["dish"]
-    table = Table(
-        box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        title=f"dish of {1e3 * dish['diameter']:g} mm, {1e3 * dish['depth']:g} mm deep",
-    )
-    table.caption = f"version {report['version']}; minimum and maximum x, y in mm, area in mm^2"
-    table.add_column("", justify="right")
-    table.add_column("name", overflow="fold", min_width=12)
-    for name in ("kind", "shape"):
-        table.add_column(name, no_wrap=True)
-    for name in ("from", "to", "area"):
-        table.add_column(name, justify="right", no_wrap=True)
+    dish, rows = report["dish"], []
     for index, shape in enumerate(report["shapes"]):
         left, bottom, right, top = (1e3 * value for value in shape["bounds_m"])
-        table.add_row(
-            str(index),
-            Text(shape["name"]),
-            shape["kind"],
-            shape["type"],
-            f"{left:.2f}, {bottom:.2f}",
-            f"{right:.2f}, {top:.2f}",
-            f"{1e6 * shape['area_m2']:.2f}",
-        )
-    return table
+        places = (f"{left:.2f}, {bottom:.2f}", f"{right:.2f}, {top:.2f}", f"{1e6 * shape['area_m2']:.2f}")
+        rows.append((shape["name"], str(index), shape["kind"], shape["type"], *places))
+    title = f"dish of {1e3 * dish['diameter']:g} mm, {1e3 * dish['depth']:g} mm deep"
+    caption = f"version {report['version']}; minimum and maximum x, y in mm, area in mm^2"
+    return command.make_table(title, ("name", "", "kind", "shape", "from", "to", "area"), rows, caption)
 
 
 def _shape(shape: SceneShape) -> dict[str, Any]:

@@ -17,23 +17,7 @@ import numpy as np
 from magnetosuture_thread import ConfigurationError, interface
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    number_argument,
-    output_file,
-    runs,
-    write_json,
-)
-from magnetosuture_thread.commands.live import (
-    FORECAST,
-    OWN,
-    POLL_PERIOD,
-    START_TIMEOUT,
-    OwnGraph,
-    log_compiling,
-    own_graph,
-)
+from magnetosuture_thread.commands import command, live
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.errors import GraphError
@@ -41,17 +25,13 @@ from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSum
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.evaluation.tables import loop_table
 from magnetosuture_thread.geometry.polyline import arc_lengths
-from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.clients import DONE as PROCEDURE_DONE
-from magnetosuture_thread.nodes.clients import CoilClient, ProcedureClient, Recorder
+from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.rig.power import board_addresses
 from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
 from magnetosuture_thread.workers import Log, Progress
 
-# Published while nodes start, for the bag's beginning.
-ONCE = (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded)
 # Topics on which nothing may come before the run begins.
 OPTIONAL = (
     *(topics.NEEDLE_COMMAND, topics.OPERATOR_COMMAND, topics.TIP_SETPOINT, topics.FAULT_REQUEST, topics.MATERIAL),
@@ -59,29 +39,27 @@ OPTIONAL = (
 )
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
-# A run along a path that never ends is ended after this many times its own duration, and so many s of simulated time.
-TIMEOUT_FACTOR, EXTRA_TIME = 3.0, 20.0
-MAX_PROCEDURE_TIME = 600.0  # s of simulated time, as in a campaign
+EXTRA_TIME = 20.0  # s of simulated time
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_simulate)
+    command.runs(parser, run_simulate)
     option = parser.add_argument
     option("setup", metavar="SETUP", help="a setup's name or YAML file")
     option("--output", type=Path, required=True, metavar="BAG", help="folder of the bag to make")
     duration = "end after this many seconds (default: at the end of the path or procedure)"
-    option("--duration", type=number_argument(0.1, 1e5), help=duration)
+    option("--duration", type=command.number_argument(0.1, 1e5), help=duration)
     option("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
     clock = parser.add_mutually_exclusive_group()
     rate = "run with a simulated clock, this much faster than real time (default: in real time)"
-    clock.add_argument("--rate", type=number_argument(0.5, 5.0), help=rate)
+    clock.add_argument("--rate", type=command.number_argument(0.5, 5.0), help=rate)
     boards = "drive simulated RoboClaw boards, by the driver for real ones"
     clock.add_argument("--boards", action="store_true", help=boards)
-    option("--json", type=output_file, metavar="FILE", help="write the figures to a file")
+    option("--json", type=command.output_file, metavar="FILE", help="write the figures to a file")
 
 
-def run_simulate(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Run the whole graph around a simulated rig.
 
     No robot is needed: rig_simulator stands in for coils, dish, needle, thread and camera; vision_tracker,
@@ -97,7 +75,7 @@ def run_simulate(options: argparse.Namespace, terminal: Terminal) -> int:
     and what was recorded stays. The first run on a machine compiles for a minute before it begins.
     """
     new = not options.output.exists()
-    given = {name: getattr(options, name) for name in ("duration", "rate", "boards", "procedure")}
+    given = command.given(options, "duration", "rate", "boards", "procedure")
     try:
         with terminal.progress("simulate") as advance:
             summary = simulate(options.setup, options.output, log=terminal.log, progress=advance, **given)
@@ -107,8 +85,8 @@ def run_simulate(options: argparse.Namespace, terminal: Terminal) -> int:
         raise
     terminal.print(loop_table(summary))
     terminal.log(f"bag: {options.output}")
-    write_json(options.json, summary.to_json())
-    return DONE
+    command.write_json(options.json, summary.to_json())
+    return command.DONE
 
 
 def simulate(
@@ -150,28 +128,29 @@ def simulate(
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
-    steering = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
+    task = _Procedure(procedure, setup) if procedure else _Path(setup, duration)
     if setup.vision.image_transport != "compressed":
         name, expectation = "vision_tracker.image_transport", "compressed: the bag must hold what the tracker saw"
         raise ConfigurationError(name, setup.vision.image_transport, expectation, str(setup.path))
     with whole_folder(output, is_recording=True) as folder:
-        problem = _Run(setup, steering, duration, rate, boards, log, progress).record(folder, output.name)
+        problem = _Run(setup, task, duration, rate, boards, log, progress).record(folder, output.name)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
-    if problem and steering.result is None:
-        raise GraphError(f"{problem}; what was recorded is in {output}")
+    recorded_in = f"{problem}; what was recorded is in {output}"
+    if problem and task.result is None:
+        raise GraphError(recorded_in)
     log("evaluating the run")
-    figures = {"setup": setup.name, "procedure": steering.result}
+    figures = {"setup": setup.name, "procedure": task.result}
     try:
-        summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=steering.result)
+        summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=task.result)
         figures = summary.to_json()
     except GraphError as error:
         raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
     finally:
-        if steering.result is not None:
+        if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
     if problem:
-        raise GraphError(f"{problem}; what was recorded is in {output}")
+        raise GraphError(recorded_in)
     return summary
 
 
@@ -186,12 +165,13 @@ def measure_loop(bag: Bag, setup: Setup) -> LoopCollector:
     return collector
 
 
-class _Steering:
-    """What the run does: a path that is followed, or a procedure that is executed.
+class _Path:
+    """The setup's path, along which the path follower steers.
 
     Attributes:
         node: that steers.
         arguments: for all nodes.
+        recorded: topics that are recorded besides.
         time_limit: of the whole run [s of simulated time].
         stage: 0 before the node is there, 1 before the needle moves, 2 from then on.
         share: that is done, 0 to 1.
@@ -200,36 +180,22 @@ class _Steering:
         client: in the graph while the run goes on.
     """
 
-    node: str
+    node = "path_follower"
     arguments: tuple[str, ...] = ()
-    time_limit = MAX_PROCEDURE_TIME
+    recorded: tuple[topics.Topic, ...] = ()
     stage, share, ended = 0, 0.0, False
     result: dict[str, Any] | None = None
     client: Any = nullcontext()
-
-    def poll(self, recorder: Recorder) -> str:
-        """Take what is new; return what went wrong."""
-        raise NotImplementedError
-
-    def problem(self, elapsed: float, recorder: Recorder) -> str:
-        """Return what to report of a run that does not end."""
-        raise NotImplementedError
-
-
-class _Path(_Steering):
-    """The setup's path, along which the path follower steers."""
-
-    node = "path_follower"
 
     def __init__(self, setup: Setup, duration: float | None) -> None:
         if not setup.follower.waypoints:
             raise ConfigurationError("path_follower.waypoints", [], "where the needle shall go", str(setup.path))
         points = np.reshape((*setup.rig.needle_start[:2], *setup.follower.waypoints), (-1, 2))
-        path_time = float(arc_lengths(points)[-1]) / setup.follower.speed
-        self.time_limit = TIMEOUT_FACTOR * path_time + EXTRA_TIME + (duration or 0.0)
+        # One that never ends is ended after three times its own duration, and 20 s.
+        self.time_limit = 3.0 * float(arc_lengths(points)[-1]) / setup.follower.speed + EXTRA_TIME + (duration or 0.0)
         self._duration = duration
 
-    def poll(self, recorder: Recorder) -> str:
+    def poll(self, recorder: clients.Recorder) -> str:
         """Take what is new; return what went wrong."""
         state, values = recorder.status_texts.get(self.node, ("", {}))
         self.stage = 2 if recorder.taken[interface.TIP_SETPOINT.recorded] else int(self.node in recorder.status_texts)
@@ -238,14 +204,14 @@ class _Path(_Steering):
         bridge = recorder.status_texts.get("coil_bridge", ("", {}))[0]
         return f"coil_bridge: {bridge}" if bridge.startswith("fault: ") else ""
 
-    def problem(self, elapsed: float, recorder: Recorder) -> str:
+    def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
         """Return what to report of a run that does not end."""
         states = "; ".join(f"{node}: {text}" for node, (text, _) in sorted(recorder.status_texts.items()))
         return f"after {elapsed:.0f} s only {self.share:.0%} of the path is done; {states}"
 
 
-class _Procedure(_Steering):
-    """A procedure that the needle planner executes.
+class _Procedure:
+    """A procedure that the needle planner executes; attributes as of `_Path`.
 
     Attributes:
         result: name, state, reason, goals met, goals and minimum clearance of the needle's axis by its measured poses
@@ -256,18 +222,20 @@ class _Procedure(_Steering):
     """
 
     node = interface.PLANNER
-    result: dict[str, Any]
+    recorded = topics.PROCEDURES
+    time_limit = 600.0  # s of simulated time, as in a campaign
+    stage, share, ended = 0, 0.0, False
 
     def __init__(self, name: str, setup: Setup) -> None:
         procedure = read_procedure(name)
         setup.planner.planner(setup.scene).check(procedure)
         scene = ("-p", f"scene:={find_scene_file(procedure.scene).resolve()}") if procedure.scene else ()
-        self.arguments = (*scene, *FORECAST)
-        self.result = {"procedure": procedure.name, "state": "not begun", "reason": "", "goals_met": 0}
+        self.arguments = (*scene, *live.FORECAST)
+        self.result: dict[str, Any] = {"procedure": procedure.name, "state": "not begun", "reason": "", "goals_met": 0}
         self.result |= {"goals": len(procedure.goals), "min_clearance_m": None}
-        self.client = ProcedureClient(str(find_procedure_file(name).resolve()))
+        self.client = clients.ProcedureClient(str(find_procedure_file(name).resolve()))
 
-    def poll(self, recorder: Recorder) -> str:
+    def poll(self, recorder: clients.Recorder) -> str:
         """Take what is new; return what went wrong."""
         self.client.poll()
         status, result = self.client.status, self.client.result
@@ -279,9 +247,9 @@ class _Procedure(_Steering):
             if report is not None:
                 self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
         self.ended = result is not None
-        return self._state() if self.ended and result.state != PROCEDURE_DONE else ""
+        return self._state() if result is not None and result.state != clients.DONE else ""
 
-    def problem(self, elapsed: float, recorder: Recorder) -> str:
+    def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
         """Return what to report of a run that does not end."""
         if self.stage == 0:
             self.result["reason"] = self.client.refusal or "no needle planner"
@@ -289,9 +257,8 @@ class _Procedure(_Steering):
         return f"after {elapsed:.0f} s {self._state()}"
 
     def _state(self) -> str:
-        result = self.result
-        met = f"{result['goals_met']} of {result['goals']} goals met"
-        return f"the procedure {result['procedure']} is {result['state']}, {met}: {result['reason']}"
+        met = "{goals_met} of {goals} goals met: {reason}".format(**self.result)
+        return f"the procedure {self.result['procedure']} is {self.result['state']}, {met}"
 
 
 @dataclass
@@ -299,7 +266,7 @@ class _Run:
     """One run of the graph; see `simulate`."""
 
     setup: Setup
-    steering: _Steering
+    task: _Path | _Procedure
     duration: float | None
     rate: float | None
     boards: bool
@@ -308,33 +275,30 @@ class _Run:
 
     def record(self, folder: Path, name: str) -> str:
         """Run the graph and record it; return what went wrong, so that the bag stays."""
-        setup, arguments = self.setup, ["--params-file", str(self.setup.path.resolve()), *OWN, *self.steering.arguments]
+        setup, task = self.setup, self.task
+        arguments = ["--params-file", str(setup.path.resolve()), *live.OWN, *task.arguments]
         if self.rate is not None:
             arguments += ["-p", "use_sim_time:=true", "-p", f"rig_simulator:rate:={float(self.rate)}"]
-        notes = {
-            "setup": setup.name,
-            SETUP_NOTE: setup.path.read_text(encoding="utf-8"),
-            "simulated": f"the whole rig, closed loop, setup {setup.name}",
-        }
-        procedures = () if self.steering.result is None else topics.PROCEDURES
-        every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *procedures)
+        text, what = setup.path.read_text(encoding="utf-8"), f"the whole rig, closed loop, setup {setup.name}"
+        notes = {"setup": setup.name, SETUP_NOTE: text, "simulated": what}
+        every = (*topics.INPUTS, *topics.OUTPUTS, *topics.SIMULATED, *topics.SETTINGS, *task.recorded)
         recorded = [topic for topic in every if topic is not topics.IMAGE]
-        what = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
+        nodes = f"{interface.SCENE_SERVER}, rig_simulator, {', '.join(interface.NODES)}"
         processes = (interface.SCENE_SERVER, "rig_simulator", *interface.PROCESSES)
         with BagWriter(folder, notes, name=name) as bag, TemporaryDirectory() as ports:
             simulated = ("-p", "coil_bridge:driver:=simulated", "-p", "coil_bridge:autostart:=armed")
             arguments += _wired(ports, len(setup.coils.coil_angles)) if self.boards else simulated
             for topic in recorded:
                 bag.add_topic(topic.channel.recorded, topic.channel.type_name)
-            with own_graph(processes, arguments, folder / "logs", what, self.log) as graph:
-                sink = _Sink(bag)
-                recorder = Recorder(graph.domain, recorded, simulated_clock=self.rate is not None, receive=sink.receive)
+            with live.own_graph(processes, arguments, folder / "logs", nodes, self.log) as graph:
+                sink, clock = _Sink(bag), self.rate is not None
+                recorder = clients.Recorder(graph.domain, recorded, simulated_clock=clock, receive=sink.receive)
                 try:
                     return self._run(graph, recorder, sink)
                 finally:
                     recorder.close()
 
-    def _run(self, graph: OwnGraph, recorder: Recorder, sink: _Sink) -> str:
+    def _run(self, graph: live.OwnGraph, recorder: clients.Recorder, sink: _Sink) -> str:
         with graph.interruption:
             _wait(recorder, graph.check, self.log)
         if self.boards:
@@ -344,35 +308,32 @@ class _Run:
         try:
             # For bridge and recorder: on a busy machine the recorder finds who steers up to 3 s after the bridge does,
             # and the bag would lack the start.
-            audience = f"{self.steering.node}:audience:=2"
-            graph.nodes.start(self.steering.node, arguments=("-p", audience))
-            with graph.interruption, self.steering.client:
+            graph.nodes.start(self.task.node, arguments=("-p", f"{self.task.node}:audience:=2"))
+            with graph.interruption, self.task.client:
                 return self._steer(recorder, graph.check)
         except KeyboardInterrupt:
             return INTERRUPTED  # passed on once the bag is whole
 
-    def _steer(self, recorder: Recorder, check: Callable[[], None]) -> str:
+    def _steer(self, recorder: clients.Recorder, check: Callable[[], None]) -> str:
         """Record until the path or procedure is done, or the time is over; return what went wrong."""
-        steering, rate = self.steering, self.rate or 1.0
+        task, rate, duration = self.task, self.rate or 1.0, self.duration
         stage, began = 0, time.monotonic()
         while True:
             check()
-            recorder.spin(POLL_PERIOD)
-            problem = steering.poll(recorder)
-            if steering.stage > stage:
-                stage, began = steering.stage, time.monotonic()
+            recorder.spin(live.POLL_PERIOD)
+            problem = task.poll(recorder)
+            if task.stage > stage:
+                stage, began = task.stage, time.monotonic()
             elapsed = (time.monotonic() - began) * (rate if stage else 1.0)
-            timed = 0.0 if self.duration is None or not stage else min(1.0, elapsed / self.duration)
-            self.progress(steering.share if self.duration is None else timed)
-            if steering.ended:
+            self.progress(task.share if duration is None else min(1.0, elapsed / duration) * bool(stage))
+            if task.ended:
                 recorder.spin(0.5 / rate)
-            if problem or steering.ended:
+            if problem or task.ended:
                 return problem
-            wanted = None if self.duration is None else self.duration + (EXTRA_TIME if stage == 1 else 0.0)
-            if wanted is not None and stage and elapsed > wanted:
+            if duration is not None and stage and elapsed > duration + (EXTRA_TIME if stage == 1 else 0.0):
                 return ""
-            if elapsed > (steering.time_limit if stage else START_TIMEOUT):
-                return steering.problem(elapsed, recorder)
+            if elapsed > (task.time_limit if stage else live.START_TIMEOUT):
+                return task.problem(elapsed, recorder)
 
 
 class _Sink:
@@ -387,7 +348,7 @@ class _Sink:
     def receive(self, topic: str, arrival: int, data: bytes) -> None:
         """Take a message."""
         if not self.running:
-            if topic in ONCE:
+            if topic in (interface.SCENE.recorded, interface.SCENE_MARKERS.recorded):
                 self._early[topic] = data
             return
         if self._begin is None:
@@ -403,7 +364,7 @@ def _arm() -> None:
     deadline = time.monotonic() + 15.0
     while True:
         try:
-            with CoilClient() as client:
+            with clients.CoilClient() as client:
                 client.execute("arm")
                 return
         except GraphError as error:
@@ -414,33 +375,36 @@ def _arm() -> None:
 def _wired(folder: str, coils: int) -> list[str]:
     """Return the arguments under which bridge and rig meet at simulated boards, of two coils each."""
     ports = json.dumps([f"{folder}/board_{index}" for index in range(coils // 2)])
-    boards = {"roboclaw_ports": ports, "roboclaw_addresses": json.dumps(board_addresses(coils // 2))}
-    # Simulated boards share the processor with the graph, where real ones have their own. One that got no processor
-    # for 75 ms, as happens with two busy cores, would be taken for dead.
-    boards |= {"roboclaw_answer_timeout": "0.2", "driver_timeout": "0.5"}
-    parameters: dict[str, dict[str, object]] = {
-        "coil_bridge": {"driver": "roboclaw", "autostart": "active", **boards},
-        "rig_simulator": {"power_stage": "roboclaw", "power_stage_ports": ports},
+    values = {
+        "coil_bridge:driver": "roboclaw",
+        "coil_bridge:autostart": "active",
+        "coil_bridge:roboclaw_ports": ports,
+        "coil_bridge:roboclaw_addresses": json.dumps(board_addresses(coils // 2)),
+        # Simulated boards share the processor with the graph, where real ones have their own. One that got no
+        # processor for 75 ms, as happens with two busy cores, would be taken for dead.
+        "coil_bridge:roboclaw_answer_timeout": "0.2",
+        "coil_bridge:driver_timeout": "0.5",
+        "rig_simulator:power_stage": "roboclaw",
+        "rig_simulator:power_stage_ports": ports,
     }
-    given = [f"{node}:{name}:={value}" for node, values in parameters.items() for name, value in values.items()]
-    return [part for each in given for part in ("-p", each)]
+    return [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
 
 
-def _wait(recorder: Recorder, check: Callable[[], None], log: Log) -> None:
+def _wait(recorder: clients.Recorder, check: Callable[[], None], log: Log) -> None:
     """Wait until every topic has a publisher, except those in `OPTIONAL`, and for the first prediction.
 
     On a busy machine the first frames take tracker and model a second or more; a run that had begun would lack them.
     """
     optional = {topic.name for topic in OPTIONAL}
-    deadline, logged = time.monotonic() + START_TIMEOUT, set[str]()
+    deadline, logged = time.monotonic() + live.START_TIMEOUT, set[str]()
     while missing := [name for name in recorder.silent() if name not in optional]:
         check()
-        log_compiling({name: text for name, (text, _) in recorder.status_texts.items()}, logged, log)
+        live.log_compiling({name: text for name, (text, _) in recorder.status_texts.items()}, logged, log)
         if time.monotonic() > deadline:
-            raise GraphError(f"after {START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
-        recorder.spin(POLL_PERIOD)
+            raise GraphError(f"after {live.START_TIMEOUT:g} s nobody is at {', '.join(missing)}")
+        recorder.spin(live.POLL_PERIOD)
     deadline = time.monotonic() + 10.0  # where the needle cannot be tracked, there is none
     while not recorder.taken[interface.PREDICTED_THREAD.recorded] and time.monotonic() < deadline:
         check()
-        recorder.spin(POLL_PERIOD)
+        recorder.spin(live.POLL_PERIOD)
     recorder.spin(1.0)  # for all nodes to have found each other

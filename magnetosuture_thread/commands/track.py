@@ -20,20 +20,12 @@ from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
-from magnetosuture_thread.commands.command import (
-    DONE,
-    Terminal,
-    add_frames,
-    number_argument,
-    output_file,
-    runs,
-    write_json,
-)
+from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES, Channel
+from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.thread_observation import ThreadPiece
@@ -49,22 +41,22 @@ PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    runs(parser, run_track)
+    command.runs(parser, run_track)
     option = parser.add_argument
-    add_frames(parser)
+    command.add_frames(parser)
     setup = "a setup's name or YAML file (default: %(default)s)"
     option("--setup", default="petri_35mm_polyamide", metavar="NAME", help=setup)
     option("--scene", default="", metavar="NAME", help="a scene's name or file (default: the setup's)")
     scale = "the scale (default: the setup's, or from the dish's diameter)"
-    option("--metres-per-pixel", type=number_argument(1e-7, 1e-2), metavar="S", help=scale)
+    option("--metres-per-pixel", type=command.number_argument(1e-7, 1e-2), metavar="S", help=scale)
     centre = "the dish's centre [px] (default: the setup's, or found)"
-    option("--centre", type=number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
-    option("--json", type=output_file, metavar="FILE", help="write what was found to a file")
+    option("--centre", type=command.number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
+    option("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
     overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
     option("--overlay", type=Path, metavar="PATH", help=overlay)
 
 
-def run_track(options: argparse.Namespace, terminal: Terminal) -> int:
+def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find needle and thread in camera frames, without a graph.
 
     FRAMES are pictures, a folder of them, or a bag. Pictures are searched one by one; a bag's frames are followed
@@ -116,8 +108,8 @@ def run_track(options: argparse.Namespace, terminal: Terminal) -> int:
         counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
         median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
         terminal.log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
-    write_json(options.json, rows)
-    return DONE
+    command.write_json(options.json, rows)
+    return command.DONE
 
 
 @dataclass(frozen=True)
@@ -161,58 +153,41 @@ class FrameSource:
     def __init__(self, paths: Sequence[Path], remap: Mapping[str, str] | None, log: Log) -> None:
         self._files: list[Path] = []
         self._recording: Recording | None = None
-        self._channel: Channel = CAMERA["raw"]
         self._lens_problems: Counter[str] = Counter()
-        self.unverified = ""
+        self.count, self.unverified = 0, ""
         for path in paths:
-            self._add(path, remap, log, alone=len(paths) == 1)
+            inside = _files_at(path)
+            if not any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
+                self._files += inside
+                self.count = len(self._files)
+            elif len(paths) > 1:
+                raise BagError(path, "is a bag; expected it alone, without other frames")
+            else:
+                self._open(Bag(path, remap=remap), log)
         self.is_sequence = self._recording is not None
-        if remap and self._recording is None:
+        if remap and not self.is_sequence:
             raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
         names = [file.name for file in self._files]
         unique = len(set(names)) == len(names)
         self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
-        recording = self._recording
-        self.count = recording.counts[self._channel.recorded] if recording is not None else len(self._files)
 
-    def _add(self, path: Path, remap: Mapping[str, str] | None, log: Log, alone: bool) -> None:
-        try:
-            path.stat()
-            is_folder = path.is_dir()
-            inside = sorted(path.iterdir()) if is_folder else []
-        except FileNotFoundError:
-            raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
-        except (OSError, ValueError) as error:
-            raise BagError(path, f"cannot be read: {error}") from None
-        if any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
-            if not alone:
-                raise BagError(path, "is a bag; expected it alone, without other frames")
-            self._open(path, remap, log)
-        elif is_folder:
-            pictures = [file for file in inside if file.suffix.lower() in PICTURES and file.is_file()]
-            if not pictures:
-                raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
-            self._files += pictures
-        else:
-            self._files.append(path)
-
-    def _open(self, path: Path, remap: Mapping[str, str] | None, log: Log) -> None:
-        bag = Bag(path, remap=remap)
-        self._recording, self.unverified = Recording(bag), bag.unverified
+    def _open(self, bag: Bag, log: Log) -> None:
+        recording = self._recording = Recording(bag)
+        self.unverified = bag.unverified
         doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
         for line in (str(bag.damage or ""), doubt, *bag.remarks):
             if line:
-                log(f"{path} {line}")
-        if self._recording.camera is None:
+                log(f"{recording.path} {line}")
+        if recording.camera is None:
             topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
-            raise BagError(path, f"holds no camera frames; expected some on {topics}; its topics: {present}")
-        self._channel = self._recording.camera
+            problem = f"holds no camera frames; expected some on {topics}; its topics: {present}"
+            raise BagError(recording.path, problem)
+        self.count = recording.counts[recording.camera.recorded]
 
     def __iter__(self) -> Iterator[FrameFile]:
         """Go through the frames."""
         if self._recording is not None:
             yield from self._recorded(self._recording)
-            return
         for name, file in zip(self.names, self._files, strict=True):
             try:
                 yield FrameFile(name, decode_image(read_regular(file, MAX_FILE_BYTES)))
@@ -224,8 +199,8 @@ class FrameSource:
     def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
         lens: Lens | None = None
         recording.refused.clear()  # counted by `rate` too
-        wanted = [channel for channel in (CAMERA_INFO, self._channel) if recording.counts.get(channel.recorded)]
-        for record in recording.records(wanted):
+        wanted = [channel for channel in (CAMERA_INFO, recording.camera) if channel is not None]
+        for record in recording.records([channel for channel in wanted if recording.counts.get(channel.recorded)]):
             if record.topic == CAMERA_INFO.recorded:
                 try:
                     lens = lens_of(record.decode())
@@ -249,14 +224,32 @@ class FrameSource:
 
     def rate(self) -> float:
         """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
-        if self._recording is None:
+        if self._recording is None or self._recording.camera is None:
             return 30.0
-        stamps = [stamp_of(record) for record in islice(self._recording.records([self._channel]), 300)]
+        stamps = [stamp_of(record) for record in islice(self._recording.records([self._recording.camera]), 300)]
         intervals = np.diff(stamps) * 1e-9
         if not np.any(intervals > 0.0):
             return 30.0
         # To 0.01 frames/s: the time base of MPEG-4 has no room for more. Video players show 0.1 to 240.
         return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
+
+
+def _files_at(path: Path) -> list[Path]:
+    """Return a file itself, or what may be frames in a folder: pictures, or the files of a bag."""
+    try:
+        path.stat()
+        if not path.is_dir():
+            return [path]
+        inside = sorted(path.iterdir())
+    except FileNotFoundError:
+        raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
+    except (OSError, ValueError) as error:
+        raise BagError(path, f"cannot be read: {error}") from None
+    endings = (*PICTURES, *STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)
+    found = [file for file in inside if file.name.lower().endswith(endings) and file.is_file()]
+    if not found:
+        raise BagError(path, f"holds no pictures; expected files that end in {', '.join(PICTURES)}, or a bag")
+    return found
 
 
 def numbered(names: Sequence[str], form: str) -> list[str]:
@@ -297,25 +290,21 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         duration: processor time that looking took, on one core, decoding not included; other work on the
             machine does not show in it [s].
     """
-    pose = dict[str, Any]()
-    if not track.reason:
-        thread = track.centreline
-        pose = {
-            "tail_m": _numbers(track.tail),
-            "heading_rad": finite_or_none(math.atan2(track.heading[1], track.heading[0])),
-            "tip_m": _numbers(track.tip),
-            "curvature_per_m": finite_or_none(float(track.curvature)),
-            "thread_m": thread.tolist() if np.isfinite(thread).all() else None,
-            "pieces": [_piece(piece) for piece in track.observation.pieces],
-        }
     names = ("tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m", "pieces")
+    pose: dict[str, Any] = dict.fromkeys(names)
+    if not track.reason:
+        thread, angle = track.centreline, math.atan2(track.heading[1], track.heading[0])
+        pose["tail_m"], pose["heading_rad"] = _numbers(track.tail), finite_or_none(angle)
+        pose["tip_m"], pose["curvature_per_m"] = _numbers(track.tip), finite_or_none(float(track.curvature))
+        pose["thread_m"] = thread.tolist() if np.isfinite(thread).all() else None
+        pose["pieces"] = [_piece(piece) for piece in track.observation.pieces]
     length = track.needle_length
     return {
         "file": frame.name,
         "status": track.state.value,
         "reason": track.reason or None,
         "warning": track.warning or None,
-        **{name: pose.get(name) for name in names},
+        **pose,
         "needle_length_m": None if length is None else finite_or_none(float(length)),
         "complete": track.observation.complete,
         "confidence": finite_or_none(float(track.confidence)),
@@ -343,19 +332,10 @@ def _piece(piece: ThreadPiece) -> dict[str, Any]:
 
 def _table(rows: Sequence[dict[str, Any]]) -> Table:
     """Return a row for each of the first frames, as `_row` gives them."""
-    table = Table(title=f"{len(rows)} frames")
-    table.caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
-    table.add_column("frame", overflow="fold", min_width=12)
-    table.add_column("status")
-    for name in ("tail", "heading", "thread", "sure", "ms"):
-        table.add_column(name, justify="right", no_wrap=True)
-    began = rows[0]["stamp_s"] if rows else None
+    began, lines = rows[0]["stamp_s"] if rows else None, []
     for row in rows[:20]:
-        name, status = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s", row["status"]
-        cells = [""] * 4
-        if row["reason"]:
-            status = f"{status}: {row['reason']}"
-        else:
+        cells = ["", "", "", ""]
+        if not row["reason"]:
             length = np.linalg.norm(np.diff(np.reshape(row["thread_m"] or [], (-1, 2)), axis=0), axis=1).sum()
             cells = [
                 ", ".join(f"{1e3 * value:.2f}" for value in row["tail_m"] or []),
@@ -363,7 +343,11 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
                 "" if row["thread_m"] is None else f"{1e3 * length:.1f}",
                 "" if row["confidence"] is None else f"{row['confidence']:.2f}",
             ]
-        table.add_row(name, status, *cells, f"{row['time_s'] * 1e3:.1f}")
+        name = row["file"] if began is None else f"at {row['stamp_s'] - began:.3f} s"
+        status = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
+        lines.append((name, status, *cells, f"{row['time_s'] * 1e3:.1f}"))
     if len(rows) > 20:
-        table.add_row(f"and {len(rows) - 20} more", "", "", "", "", "", "")
-    return table
+        lines.append((f"and {len(rows) - 20} more", "", "", "", "", "", ""))
+    caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
+    columns = ("frame", "status", "tail", "heading", "thread", "sure", "ms")
+    return command.make_table(f"{len(rows)} frames", columns, lines, caption, left=2)

@@ -1,4 +1,4 @@
-"""Connection of one page: executes its messages and requests, and sends replies, states and camera frames."""
+"""Connection of one page: its messages, validated field by field, their execution, and what is sent to it."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ import json
 import math
 import struct
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any, NoReturn, Protocol
 
 from aiohttp import WSMsgType, web
 
-from magnetosuture_thread.console.access import same_token
-from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
-from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController, Velocity
+from magnetosuture_thread.configuration import Quantity
+from magnetosuture_thread.console.access import RateCounter, same_token
+from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import InvalidInputError, MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 
+MAX_MESSAGE_CHARS = 4096
 HELLO_TIMEOUT = 5.0  # after the connection [s]
 MAX_MESSAGE_RATE = 400  # per second; beyond, only an emergency stop is accepted
 MAX_WATCHER_RATE = 20  # per second, besides receipts; beyond, a page without the token is disconnected
@@ -29,6 +31,122 @@ UNLEASED = ("stop", "disarm", "pause procedure", "abort procedure")
 
 Message = str | bytes
 Reply = Callable[[str, str], None]
+
+
+Field = tuple[type, Quantity]
+_TEXT, _SWITCH, _NUMBER = (str, Quantity("")), (bool, Quantity("")), (float, Quantity(""))
+
+
+def _one_of(*choices: str) -> Field:
+    return str, Quantity("", choices=choices)
+
+
+# What each type of message holds. `sent` is the time of sending by the page's clock [s]. In a greeting, `token` is
+# empty for a page that only watches, and `automated` tells whether a script drives the browser, null for no browser.
+# `hold` is sent while the page is held so that a procedure may go on; `acknowledge` is the receipt of a state or frame.
+FIELDS: dict[str, dict[str, Field]] = {
+    "hello": {"token": _TEXT, "automated": _SWITCH},
+    "jog": {
+        "speed": (float, Quantity("", "m/s", minimum=0.0)),
+        "direction": (tuple, Quantity("", multiple=2)),
+        "sent": _NUMBER,
+    },
+    "end_jog": {},
+    "acknowledge": {"kind": _one_of("state", "frame")},
+    "visibility": {"visible": _SWITCH},
+    "acquire_control": {},
+    "release_control": {},
+    "bridge_action": {"action": _one_of("arm", "disarm", "stop", "reset")},
+    "select_setup": {"setup": _TEXT},
+    "pause": {"paused": _SWITCH},
+    "record": {"recording": _SWITCH},
+    "procedure": {
+        "action": _one_of("plan", "resume", "pause", "abort"),
+        "procedure": _TEXT,
+        "hold_to_run": _SWITCH,
+    },
+    "hold": {"sent": _NUMBER},
+}
+
+
+@dataclass(frozen=True)
+class ClientMessage:
+    """A valid message.
+
+    Attributes:
+        type: one of `FIELDS`.
+        values: of its fields by name; of a jog, `velocity` [m/s] in place of direction and speed.
+    """
+
+    type: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def request(self) -> str:
+        """Name under which the answer is reported."""
+        if self.type == "procedure":
+            return f"{self.values['action']} procedure"
+        return str(self.values["action"]) if self.type == "bridge_action" else self.type
+
+
+def parse_client_message(text: str, max_speed: float) -> ClientMessage:
+    """Parse and validate a message of a page.
+
+        velocity = direction / max(1, |direction|) * min(speed, max_speed)
+
+    Args:
+        text: a JSON object with `type` and that type's fields.
+        max_speed: maximum speed of a jog [m/s].
+
+    Raises:
+        InvalidInputError: the message is invalid, or a number is not finite.
+    """
+    fields = _object(text)
+    kind = fields.pop("type", None)
+    if not isinstance(kind, str) or kind not in FIELDS:
+        raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
+    values = {name: _checked(name, fields.get(name), *about) for name, about in FIELDS[kind].items()}
+    if kind == "jog":
+        direction, speed = values.pop("direction"), values.pop("speed")
+        if len(direction) != 2:
+            raise _refusal("direction", list(direction), "a list of two numbers")
+        largest = max(abs(direction[0]), abs(direction[1]), 1.0)  # avoids overflow of the squares
+        x, y = direction[0] / largest, direction[1] / largest
+        factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
+        values["velocity"] = (x * factor, y * factor)
+    return ClientMessage(kind, values)
+
+
+def _checked(name: str, value: Any, kind: type, about: Quantity) -> Any:
+    if name == "automated" and value is None:
+        return None
+    try:
+        return about.checked(name, value, kind)
+    except ConfigurationError as error:
+        raise _refusal(name, value, error.expectation) from None
+
+
+def _refusal(name: str, value: object, expectation: str) -> InvalidInputError:
+    """Return the error of a value, shown in ASCII and shortened: a whole number may have thousands of digits."""
+    shown = value if isinstance(value, str) else type(value).__name__ if isinstance(value, int) else repr(value)
+    shown = shown if len(shown) <= 60 else shown[:60] + "…"
+    return InvalidInputError(f"message.{name}", shown.encode("ascii", "backslashreplace").decode(), expectation)
+
+
+def _object(text: str) -> dict[str, Any]:
+    if len(text) > MAX_MESSAGE_CHARS:
+        raise InvalidInputError("message", f"{len(text)} characters", f"at most {MAX_MESSAGE_CHARS}")
+
+    def not_finite(name: str) -> NoReturn:
+        raise InvalidInputError("message", name, "finite numbers")
+
+    try:
+        content = json.loads(text, parse_constant=not_finite)
+    except (ValueError, RecursionError):
+        raise InvalidInputError("message", "no JSON", "a JSON object") from None
+    if not isinstance(content, dict):
+        raise InvalidInputError("message", f"a {type(content).__name__}", "a JSON object")
+    return content
 
 
 class Graph(Protocol):
@@ -287,16 +405,12 @@ class Client:
         hold: Callable[[], None],
     ) -> None:
         self.number, self.address, self.has_token = number, request.remote or "", False
-        self.is_script = True
-        self._socket, self._request = socket, request
-        self._settings, self._token = settings, token
+        self.is_script, self._can_command = True, False
+        self._socket, self._request, self._settings, self._token = socket, request, settings, token
         self._jog, self._requests, self._hold = jog, requests, hold
-        self._outbox = Outbox()
-        self._wake = asyncio.Event()
-        self._can_command = False
-        self._delay = DelayEstimator()
-        self._last_in_time = 0.0  # arrival of the last message that was not late
-        self._second, self._message_count, self._excess = 0, 0, 0
+        self._outbox, self._wake = Outbox(), asyncio.Event()
+        self._delay, self._last_in_time = DelayEstimator(), 0.0  # arrival of the last message that was not late
+        self._rate, self._message_count, self._excess = RateCounter(), 0, 0
 
     def send_latest(self, kind: str, message: Message) -> None:
         """Send the latest `state` or `frame` when the page can receive it."""
@@ -342,15 +456,9 @@ class Client:
         self._can_command = self.has_token = same_token(token := parsed.values["token"], self._token)
         # Programs other than browsers name no origin.
         self.is_script = parsed.values["automated"] is not False or not self._request.headers.get("Origin")
-        settings = self._settings
-        self._reply(
-            "welcome",
-            client=self.number,
-            can_command=self._can_command,
-            refusal="the token is wrong" if token and not self._can_command else "",
-            speed=settings.speed,
-            max_speed=settings.max_speed,
-        )
+        refusal = "the token is wrong" if token and not self._can_command else ""
+        speeds = {"speed": self._settings.speed, "max_speed": self._settings.max_speed}
+        self._reply("welcome", client=self.number, can_command=self._can_command, refusal=refusal, **speeds)
         return True
 
     def _read(self, kind: WSMsgType, data: Any) -> ClientMessage:
@@ -402,34 +510,26 @@ class Client:
     async def _dispatch(self, message: ClientMessage, now: float) -> None:
         values = message.values
         if message.type == "jog":
-            await self._on_jog(values["velocity"], values["sent"], now)
+            if not self._in_time(values["sent"], now):
+                self._jog.interrupt(self.number)
+                if now - self._last_in_time > 1.0:  # s; it must reconnect
+                    await self._socket.close(code=1008, message=b"all messages are late")
+            elif not self._jog.jog(self.number, values["velocity"]):
+                self._reply("error", text="jog: this page does not have control; take control first")
         elif message.type == "hold":
             if self._in_time(values["sent"], now) and self._jog.holder == self.number:
                 self._hold()
         elif message.type == "end_jog":
             self._jog.end_jog(self.number)
         elif message.type == "acquire_control":
-            self._reply("result", request=message.type, refusal=self._jog.acquire_control(self.number))
+            self._report(message.type, self._jog.acquire_control(self.number))
         elif message.type == "release_control":
             self._jog.release_control(self.number)
         elif message.type == "visibility":
             self._jog.set_visible(self.number, values["visible"])
         elif message.type != "hello":
-            self._requests.start(
-                self.number,
-                message,
-                "a script" if self.is_script else "an operator",
-                lambda name, refusal: self._reply("result", request=name, refusal=refusal),
-            )
-
-    async def _on_jog(self, velocity: Velocity, sent: float, now: float) -> None:
-        if self._in_time(sent, now):
-            if not self._jog.jog(self.number, velocity):
-                self._reply("error", text="jog: this page does not have control; take control first")
-            return
-        self._jog.interrupt(self.number)
-        if now - self._last_in_time > 1.0:  # s; it must reconnect
-            await self._socket.close(code=1008, message=b"all messages are late")
+            operator = "a script" if self.is_script else "an operator"
+            self._requests.start(self.number, message, operator, self._report)
 
     def _in_time(self, sent: float, now: float) -> bool:
         """Return whether a message of a hold is not late; report it else."""
@@ -443,11 +543,13 @@ class Client:
 
     def _count_message(self, now: float) -> bool:
         """Count a message; return whether it exceeds the maximum rate."""
-        second = int(now)
-        self._second, self._message_count = second, self._message_count + 1 if second == self._second else 1
+        self._message_count = self._rate.count(self.address, now)
         exceeded = self._message_count > MAX_MESSAGE_RATE
         self._excess += exceeded
         return exceeded
+
+    def _report(self, request: str, refusal: str) -> None:
+        self._reply("result", request=request, refusal=refusal)
 
     def _reply(self, kind: str, **fields: Any) -> None:
         self._outbox.reply(json.dumps({"type": kind, **fields}))
@@ -459,7 +561,9 @@ class Client:
                 await self._wake.wait()
                 self._wake.clear()
                 while (message := self._outbox.next()) is not None:
-                    await asyncio.wait_for(self._send(message), 2.0)  # s; else it does not receive
+                    socket = self._socket
+                    sent = socket.send_str(message) if isinstance(message, str) else socket.send_bytes(message)
+                    await asyncio.wait_for(sent, 2.0)  # s; else it does not receive
         except (asyncio.TimeoutError, ConnectionError):
             self._abort()
 
@@ -467,9 +571,3 @@ class Client:
         transport = self._request.transport
         if transport is not None:
             transport.abort()
-
-    async def _send(self, message: Message) -> None:
-        if isinstance(message, str):
-            await self._socket.send_str(message)
-        else:
-            await self._socket.send_bytes(message)

@@ -25,36 +25,31 @@ class ControlLease:
 
     Attributes:
         holder: number of the client that has control, None if there is none.
+        hidden: whether the holder's page is hidden.
     """
 
     def __init__(self, timeout: float) -> None:
         self.holder: int | None = None
-        self._timeout = timeout
-        self._last_message = -math.inf
-        self._hidden = False
+        self.hidden = False
+        self._timeout, self._last_message = timeout, -math.inf
 
     def available(self, now: float) -> bool:
         """Return whether another client may acquire control."""
-        return self.holder is None or self._hidden or now - self._last_message > self._timeout
+        return self.holder is None or self.hidden or now - self._last_message > self._timeout
 
     def acquire(self, client: int, now: float) -> str:
         """Give control to a client; return an empty text, or the reason of a refusal."""
         if client != self.holder and not self.available(now):
             return f"page {self.holder} has control and must release it first"
-        self.holder, self._last_message, self._hidden = client, now, False
+        self.holder, self._last_message, self.hidden = client, now, False
         return ""
 
     def release(self, client: int) -> bool:
         """Release control if this client holds it; return whether it did."""
         if client != self.holder:
             return False
-        self.holder, self._hidden = None, False
+        self.holder, self.hidden = None, False
         return True
-
-    @property
-    def hidden(self) -> bool:
-        """Whether the holder's page is hidden."""
-        return self._hidden
 
     def keep_alive(self, client: int, now: float) -> None:
         """Register a message of a client."""
@@ -64,7 +59,7 @@ class ControlLease:
     def set_hidden(self, client: int, hidden: bool) -> None:
         """Register whether a client's page is hidden."""
         if client == self.holder:
-            self._hidden = hidden
+            self.hidden = hidden
 
 
 class DeadManSwitch:
@@ -72,24 +67,21 @@ class DeadManSwitch:
 
     Args:
         timeout: a jog message is fresh for this long [s].
+
+    Attributes:
+        latched: whether nothing is sent until a release.
     """
 
     def __init__(self, timeout: float) -> None:
-        self._timeout = timeout
+        self.latched = False
+        self._timeout, self._arrival = timeout, -math.inf
         self._velocity: Velocity | None = None
-        self._arrival = -math.inf
         self._pressed = False  # by the last message, even if that is stale
-        self._latched = False
 
     @property
     def moving(self) -> bool:
         """Whether a command is active that a zero must end."""
         return self._velocity is not None
-
-    @property
-    def latched(self) -> bool:
-        """Whether nothing is sent until a release."""
-        return self._latched
 
     @property
     def deadline(self) -> float:
@@ -104,7 +96,7 @@ class DeadManSwitch:
         if velocity == ZERO_VELOCITY:
             return self.release()
         self._pressed = True
-        if self._latched:
+        if self.latched:
             return None
         changed = velocity != self._velocity
         self._velocity, self._arrival = velocity, now
@@ -112,27 +104,24 @@ class DeadManSwitch:
 
     def release(self) -> Velocity | None:
         """Register a release; return the zero to send at once, if any."""
-        self._pressed = self._latched = False
-        return self._end()
+        self._pressed = self.latched = False
+        return self.interrupt()
 
     def interrupt(self) -> Velocity | None:
         """End the motion without a release; return the zero to send at once, if any."""
-        return self._end()
+        moving, self._velocity = self.moving, None
+        return ZERO_VELOCITY if moving else None
 
     def stop(self) -> Velocity | None:
         """End the motion and require a release if a jog was active; return the zero to send at once, if any."""
-        self._latched = self._latched or self._pressed
-        return self._end()
+        self.latched = self.latched or self._pressed
+        return self.interrupt()
 
     def due(self, now: float) -> Velocity | None:
         """Return the command of this period: the jogged velocity, one zero when it is stale, then None."""
         if self._velocity is None:
             return None
-        return self._velocity if now < self.deadline else self._end()
-
-    def _end(self) -> Velocity | None:
-        moving, self._velocity = self.moving, None
-        return ZERO_VELOCITY if moving else None
+        return self._velocity if now < self.deadline else self.interrupt()
 
 
 class DelayEstimator:
@@ -166,72 +155,69 @@ class JogController:
         publish: publishes a velocity [m/s].
         rate: of the commands during a jog [Hz].
         timeout: of the dead man's switch [s].
+
+    Attributes:
+        lease: who has control.
+        switch: what is sent.
     """
 
     def __init__(self, publish: Callable[[Velocity], None], rate: float, timeout: float) -> None:
-        self._publish = publish
-        self._period = 1.0 / rate
-        self._lease = ControlLease(CLIENT_TIMEOUT)
-        self._switch = DeadManSwitch(timeout)
+        self.lease, self.switch = ControlLease(CLIENT_TIMEOUT), DeadManSwitch(timeout)
+        self._publish, self._period = publish, 1.0 / rate
         self._timer: asyncio.TimerHandle | None = None
         self._armed = False
 
     @property
     def holder(self) -> int | None:
         """Number of the client that has control, None if there is none."""
-        return self._lease.holder
+        return self.lease.holder
 
     @property
     def available(self) -> bool:
         """Whether another client may acquire control now."""
-        return self._lease.available(_now())
-
-    @property
-    def must_release(self) -> bool:
-        """Whether the present jog was stopped, and must be released before the next."""
-        return self._switch.latched
+        return self.lease.available(_now())
 
     def acquire_control(self, client: int) -> str:
         """Give control to a client; return an empty text, or the reason of a refusal."""
         before = self.holder
-        refusal = self._lease.acquire(client, _now())
+        refusal = self.lease.acquire(client, _now())
         if not refusal and before != client:
-            self._send(self._switch.release())
+            self._send(self.switch.release())
         return refusal
 
     def release_control(self, client: int) -> None:
         """Release control if this client has it, on request or after it disconnected."""
-        if self._lease.release(client):
-            self._send(self._switch.release())
+        if self.lease.release(client):
+            self._send(self.switch.release())
 
     def keep_alive(self, client: int) -> None:
         """Register a message of a client."""
-        self._lease.keep_alive(client, _now())
+        self.lease.keep_alive(client, _now())
 
     def set_visible(self, client: int, visible: bool) -> None:
         """Register whether a client's page is visible; a hidden one cannot jog."""
-        self._lease.set_hidden(client, not visible)
+        self.lease.set_hidden(client, not visible)
         if not visible and client == self.holder:
             self.stop()
 
     def jog(self, client: int, velocity: Velocity) -> bool:
         """Register a jog message; return whether the client has control and its page is visible."""
-        if client != self.holder or self._lease.hidden:
+        if client != self.holder or self.lease.hidden:
             return False
-        self._send(self._switch.press(velocity, _now()))
-        if self._switch.moving and self._timer is None:
+        self._send(self.switch.press(velocity, _now()))
+        if self.switch.moving and self._timer is None:
             self._schedule(_now() + self._period)
         return True
 
     def end_jog(self, client: int) -> None:
         """Register the end of a client's jog."""
         if client == self.holder:
-            self._send(self._switch.release())
+            self._send(self.switch.release())
 
     def interrupt(self, client: int) -> None:
         """End the motion of a client after an invalid message; a stop stays latched."""
         if client == self.holder:
-            self._send(self._switch.interrupt())
+            self._send(self.switch.interrupt())
 
     def set_armed(self, armed: bool) -> None:
         """Register whether the bridge is armed; when it is disarmed, a jog must be released first."""
@@ -241,24 +227,24 @@ class JogController:
 
     def stop(self) -> None:
         """Stop the needle until the present jog is released."""
-        self._send(self._switch.stop())
+        self._send(self.switch.stop())
 
     def _send(self, velocity: Velocity | None) -> None:
         if velocity is not None:
             self._publish(velocity)
-        if not self._switch.moving and self._timer is not None:
+        if not self.switch.moving and self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def _schedule(self, at: float) -> None:
-        at = min(at, self._switch.deadline)
+        at = min(at, self.switch.deadline)
         self._timer = asyncio.get_running_loop().call_at(at, self._tick, at)
 
     def _tick(self, planned: float) -> None:
         self._timer = None
         now = _now()
-        self._send(self._switch.due(max(now, planned)))
-        if self._switch.moving:
+        self._send(self.switch.due(max(now, planned)))
+        if self.switch.moving:
             self._schedule(max(now, planned + self._period))
 
 

@@ -9,20 +9,13 @@ import ssl
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from importlib.resources import files
+from pathlib import Path
+from typing import Any
 from weakref import WeakSet
 
 from aiohttp import web
 
-from magnetosuture_thread.console.access import (
-    RateCounter,
-    host_refusal,
-    is_any,
-    new_token,
-    origin_refusal,
-    page_url,
-    same_token,
-    server_origin,
-)
+from magnetosuture_thread.console import access
 from magnetosuture_thread.console.client import Client, Graph, Host, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
@@ -55,17 +48,14 @@ class ConsoleServer:
     """
 
     def __init__(self, settings: ConsoleSettings, graph: Graph, host: Host) -> None:
-        self._settings = settings
-        self._graph = graph
-        self._host = host
-        self._token = settings.token or new_token()
+        self._settings, self._graph, self._host = settings, graph, host
+        self._token = settings.token or access.new_token()
         self._files = page_files()
         self._jog = JogController(graph.publish_velocity, settings.rate, settings.hold_timeout)
         self._requests = RequestHandler(graph, host, self._jog)
         self._clients: dict[int, Client] = {}
-        self._new_watchers, self._request_rate = RateCounter(), RateCounter()
-        self._count = 0
-        self._port = 0
+        self._new_watchers, self._request_rate = access.RateCounter(), access.RateCounter()
+        self._count = self._port = 0
         self._scheme = "https" if settings.certificate else "http"
         self._frame_number, self._frame = -1, b""
         self._transports: WeakSet[asyncio.Transport] = WeakSet()
@@ -81,25 +71,21 @@ class ConsoleServer:
         context = server_context(self._settings)
         runner = web.ServerRunner(_Server(self._respond, self._transports), shutdown_timeout=1.0)
         await runner.setup()
-        address = self._settings.address
+        address, port = self._settings.address, self._settings.port
         try:
-            site = web.TCPSite(
-                runner, "127.0.0.1" if address == "localhost" else address, self._settings.port, ssl_context=context
-            )
-            await site.start()
+            bound = "127.0.0.1" if address == "localhost" else address
+            await web.TCPSite(runner, bound, port, ssl_context=context).start()
         except OSError as error:
             await runner.cleanup()
-            reason = error.strerror or str(error)
-            raise ConfigurationError(
-                f"{ConsoleSettings.GROUP}.port", self._settings.port, f"a free port of {address} ({reason})"
-            ) from None
+            expected = f"a free port of {address} ({error.strerror or error})"
+            raise ConfigurationError(f"{ConsoleSettings.GROUP}.port", port, expected) from None
         self._runner, self._port = runner, runner.addresses[0][1]
         self._broadcast_task = asyncio.create_task(self._broadcast())
         # Excludes loaded objects from garbage collection, which would take tens of milliseconds each time.
         gc.collect()
         gc.freeze()
-        bound = server_origin("127.0.0.1" if is_any(address) else address, self._port, self._scheme)
-        return page_url(self._settings.origin or bound, self._token)
+        own = access.server_origin("127.0.0.1" if access.is_any(address) else address, self._port, self._scheme)
+        return access.page_url(self._settings.origin or own, self._token)
 
     async def stop(self) -> None:
         """Stop the needle, then close all connections; raise the error that ended the broadcast, if any."""
@@ -121,12 +107,12 @@ class ConsoleServer:
             task.result()
 
     async def _respond(self, request: web.BaseRequest) -> web.StreamResponse:
-        if not same_token(request.query.get("token"), self._token):
+        if not access.same_token(request.query.get("token"), self._token):
             now = asyncio.get_running_loop().time()
             if self._request_rate.count(request.remote or "", now) > 100:  # those beyond wait for the next second
                 await asyncio.sleep(1.0 - now % 1.0)
         settings, host = self._settings, request.headers.get("Host", "")
-        refusal = host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
+        refusal = access.host_refusal(host, settings.address, self._port, scheme=self._scheme, origin=settings.origin)
         if refusal:
             return _answer(403, refusal)
         if request.method not in ("GET", "HEAD"):
@@ -136,19 +122,18 @@ class ConsoleServer:
                 return await self._connect(request)
             except web.HTTPBadRequest as error:  # no WebSocket
                 return _answer(error.status, error.text or "")
-        found = self._files.get(request.path)
-        if found is None:
+        if request.path not in self._files:
             return _answer(404, "there is no such file")
-        content_type, body = found
+        content_type, body = self._files[request.path]
         return web.Response(body=body, content_type=content_type, charset="utf-8", headers=HEADERS)
 
     async def _connect(self, request: web.BaseRequest) -> web.StreamResponse:
         origin, host = (request.headers.get(name, "") for name in ("Origin", "Host"))
-        refusal = origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin)
+        refusal = access.origin_refusal(origin, host, scheme=self._scheme, allowed=self._settings.origin)
         if refusal:
             return _answer(403, refusal)
         # Only for a place: commands need the token of the greeting.
-        has_token = same_token(request.query.get("token"), self._token)
+        has_token = access.same_token(request.query.get("token"), self._token)
         full = self._no_place(has_token, request.remote or "")
         if full:
             return _answer(503, full)
@@ -157,11 +142,9 @@ class ConsoleServer:
         socket.headers.update(HEADERS)
         self._count += 1
         number = self._count
-        client = Client(
-            number, socket, request, self._settings, self._token, self._jog, self._requests, self._graph.publish_hold
-        )
+        shared = self._settings, self._token, self._jog, self._requests, self._graph.publish_hold
+        client = self._clients[number] = Client(number, socket, request, *shared)
         client.has_token = has_token
-        self._clients[number] = client
         if self._frame:
             client.send_latest("frame", self._frame)
         try:
@@ -205,7 +188,7 @@ class ConsoleServer:
         lease = {
             "holder": self._jog.holder,
             "available": self._jog.available,
-            "release_first": self._jog.must_release,
+            "release_first": self._jog.switch.latched,
             "pages": len(self._clients),
         }
         graph = self._graph.state()
@@ -260,15 +243,11 @@ class _Connection(web.RequestHandler):
         super().connection_made(transport)
 
     def handle_error(
-        self,
-        request: web.BaseRequest,
-        status: int = 500,
-        exc: BaseException | None = None,
-        message: str | None = None,
+        self, request: web.BaseRequest, status: int = 500, *given: Any, **named: Any
     ) -> web.StreamResponse:
         """Return the response to a request that cannot be handled; it closes the connection."""
-        malformed = status < 500
-        response = _answer(status, "malformed request") if malformed else super().handle_error(request, status, exc)
+        malformed = _answer(status, "malformed request") if status < 500 else None
+        response = malformed or super().handle_error(request, status, *given, **named)
         response.headers.update(HEADERS)
         response.force_close()
         return response
@@ -292,13 +271,9 @@ class _Server(web.Server):
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Return MIME type and content of the page's files by the path of their URL; `/` is the page itself."""
     types = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
-    result = {}
-    for entry in files("magnetosuture_thread.console").joinpath("page").iterdir():
-        kind = types.get(entry.name[entry.name.rfind(".") :])
-        if kind is not None:
-            result[f"/{entry.name}"] = kind, entry.read_bytes()
-    result["/"] = result.pop("/index.html")
-    return result
+    entries = [Path(str(entry)) for entry in files("magnetosuture_thread.console").joinpath("page").iterdir()]
+    found = {f"/{path.name}": (types[path.suffix], path.read_bytes()) for path in entries if path.suffix in types}
+    return {"/": found.pop("/index.html"), **found}
 
 
 def server_context(settings: ConsoleSettings) -> ssl.SSLContext | None:
@@ -315,10 +290,7 @@ def server_context(settings: ConsoleSettings) -> ssl.SSLContext | None:
         # Without this password OpenSSL would ask at the terminal.
         context.load_cert_chain(settings.certificate, settings.private_key or None, password=lambda: b"")
     except (OSError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigurationError(
-            f"{ConsoleSettings.GROUP}.certificate",
-            settings.certificate,
-            f"a PEM file with a certificate, and its key without a password in it or in private_key ({reason})",
-        ) from None
+        expected = "a PEM file with a certificate, and its key without a password in it or in private_key"
+        name, reason = f"{ConsoleSettings.GROUP}.certificate", " ".join(str(error).split())
+        raise ConfigurationError(name, settings.certificate, f"{expected} ({reason})") from None
     return context

@@ -47,31 +47,19 @@ class ConsoleSettings(Configuration):
         a short timeout, and a coiled needle.
         """
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
-        if not self.address:
-            raise ConfigurationError(
-                f"{self.GROUP}.address", self.address, "an address, 0.0.0.0 for all of this machine"
-            )
-        if not is_loopback(self.address) and not self.token:
-            raise ConfigurationError(
-                f"{self.GROUP}.token", self.token, f"a token, as {self.address} can be reached from other machines"
-            )
-        plain = self.token.isascii() and self.token.isprintable() and " " not in self.token
-        if self.token and not (plain and len(self.token) >= 16):
-            raise ConfigurationError(
-                f"{self.GROUP}.token",
-                "…",
-                "at least 16 printable ASCII characters without a space, or none",
-            )
-        if self.private_key and not self.certificate:
-            raise ConfigurationError(f"{self.GROUP}.private_key", self.private_key, "none without a certificate")
-        if self.origin and not is_origin(self.origin):
-            expectation = "scheme and name, and a port if it is another than the scheme's, as https://rig.example"
-            raise ConfigurationError(f"{self.GROUP}.origin", self.origin, expectation)
-        if self.speed > self.max_speed:
-            raise ConfigurationError(f"{self.GROUP}.speed", self.speed, f"at most max_speed, {self.max_speed:g} m/s")
-        if self.rate * self.hold_timeout < 2.0:
-            raise ConfigurationError(
-                f"{self.GROUP}.rate",
-                self.rate,
-                f"at least {2.0 / self.hold_timeout:g} Hz, 2 commands in a hold_timeout",
-            )
+        is_token = len(self.token) >= 16 and self.token.isascii() and self.token.isprintable() and " " not in self.token
+        exposed = f"a token, as {self.address} can be reached from other machines"
+        origin = "scheme and name, and a port if it is another than the scheme's, as https://rig.example"
+        least = 2.0 / self.hold_timeout
+        for is_wrong, name, expectation in (
+            (not self.address, "address", "an address, 0.0.0.0 for all of this machine"),
+            (not is_loopback(self.address) and not self.token, "token", exposed),
+            (self.token and not is_token, "token", "at least 16 printable ASCII characters without a space, or none"),
+            (self.private_key and not self.certificate, "private_key", "none without a certificate"),
+            (self.origin and not is_origin(self.origin), "origin", origin),
+            (self.speed > self.max_speed, "speed", f"at most max_speed, {self.max_speed:g} m/s"),
+            (self.rate < least, "rate", f"at least {least:g} Hz, 2 commands in a hold_timeout"),
+        ):
+            if is_wrong:
+                value = "…" if name == "token" and self.token else getattr(self, name)  # no token is shown
+                raise ConfigurationError(f"{self.GROUP}.{name}", value, expectation)

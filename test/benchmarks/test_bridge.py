@@ -17,7 +17,7 @@ def test_whatever_falls_silent_or_is_killed_the_boards_go_to_zero_and_work_again
     assert [each["count"] > 0 for each in figures["delays"]] == [True] * 4
     assert max(each["greatest"] for each in figures["delays"]) < 5.0
     assert 0.0 < figures["greatest_current"] <= figures["max_current"]
-    assert bridge_table(figures).row_count == 7
+    assert bridge_table(figures).row_count == 6
 
 
 def test_delays_beyond_their_bound_are_counted():

@@ -7,8 +7,8 @@ import socket
 import threading
 from queue import Queue
 
-from benchmarks.network.cable import Cable
 from benchmarks.network.command import CutReport, network_table
+from benchmarks.network.hosts import carry
 
 
 def test_frames_pass_late_and_in_their_order_and_none_while_the_cable_is_pulled():
@@ -18,13 +18,13 @@ def test_frames_pass_late_and_in_their_order_and_none_while_the_cable_is_pulled(
         each.setblocking(False)
     answers, carrier = Queue[str](), list[bool]()
     reading, writing = os.pipe()
-    cable = Cable((ends[0].fileno(), ends[1].fileno()), carrier.append)
-    thread = threading.Thread(target=cable.run, args=(reading, answers.put))
+    given = (ends[0].fileno(), ends[1].fileno()), reading, carrier.append, answers.put
+    thread = threading.Thread(target=carry, args=given)
     thread.start()
 
-    def execute(command: str) -> str:
+    def execute(command: str) -> None:
         os.write(writing, f"{command}\n".encode())
-        return answers.get(timeout=10.0)
+        answers.get(timeout=10.0)
 
     hosts[0].settimeout(10.0)
     try:
@@ -32,14 +32,14 @@ def test_frames_pass_late_and_in_their_order_and_none_while_the_cable_is_pulled(
         assert hosts[1].recv(2048) == b"a" * 100
         execute("pull")
         hosts[0].send(b"lost")
-        assert execute("count") == "100 0"
         execute("plug")
+        hosts[0].send(b"next")
+        assert hosts[1].recv(2048) == b"next"
         assert carrier == [False, True]
         execute("impair 0.2 0.0")
         for number in range(3):
             hosts[1].send(bytes([number]))
         assert [hosts[0].recv(10) for _ in range(3)] == [b"\0", b"\1", b"\2"]
-        assert execute("count") == "100 3"
     finally:
         os.close(writing)
         thread.join()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
@@ -17,28 +16,7 @@ from magnetosuture_thread.planning.executor import ThreadCondition
 from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.setups import read_setup
 
-VOID = {"meta", "br", "link", "img"}
 GOOD = RunFigures(80.0, 75.0, 0.0003, 0.0, 0.4, 365.0, 1.5e-5, 12, -4.85e-4, -9988)
-
-
-class _Tags(HTMLParser):
-    """Collects the tags of a page, and checks that each is closed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.found: list[tuple[str, dict[str, str | None]]] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
 
 
 def instant(time: float, clearance: float = 0.004, reason: str = "") -> RunInstant:
@@ -61,20 +39,11 @@ def page_of(*runs: RunResult) -> str:
     return write_page(CampaignResult(read_procedure("hernia"), read_setup("hernia_ring"), False, list(runs), {}, bags))
 
 
-def tags_of(page: str) -> list[tuple[str, dict[str, str | None]]]:
-    """Return the tags of a page, all of them closed."""
-    parser = _Tags()
-    parser.feed(page)
-    assert parser.open == []
-    return parser.found
-
-
 def test_each_failed_run_has_a_strip_of_its_last_seconds_and_of_its_closest_instant():
     close = failed(3, replace(GOOD, min_needle_clearance_m=0.0002), "too <close>", instant(20.0, 0.0002, "wall"))
     slow = failed(4, replace(GOOD, time_s=200.0), "too slow", instant(20.0, 0.0003))
     page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0), close, slow)
-    tags = tags_of(page)
-    assert [attrs["id"] for tag, attrs in tags if tag == "article"] == ["seed-3", "seed-4"]
+    assert re.findall(r'<article [^>]*id="([^"]+)"', page) == ["seed-3", "seed-4"]
     strips = page.split('<article class="run"')[1:]
     # The dish, six instants of the last seconds, in one of which the closest instant stands where it came earlier.
     assert [strip.count("<figure") for strip in strips] == [7, 7]
@@ -116,9 +85,7 @@ def test_a_figure_beyond_its_limit_is_named_with_what_is_allowed(name: str, chan
 
 def test_the_page_loads_and_runs_nothing():
     page = page_of(RunResult(2, True, "", True, 5, GOOD, 81.0))
-    tags = tags_of(page)
-    assert {tag for tag, _ in tags} & {"script", "img", "link", "iframe", "object"} == set()
-    links = [attrs[name] for _, attrs in tags for name in ("href", "src") if name in attrs]
-    assert all(link is not None and link.startswith("#") for link in links)
+    assert not re.search(r"<(script|img|link|iframe|object)", page)
+    assert all(link.startswith("#") for link in re.findall(r'(?:href|src)="([^"]*)"', page))
     assert "default-src 'none'" in page
     assert "Simulated:" in page

@@ -15,7 +15,7 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
-from magnetosuture_thread.commands.calibrate import FitOptions, calibrate_bags, material_named
+from magnetosuture_thread.commands.calibrate import calibrate_bags, material_named, thread_settings
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
@@ -164,6 +164,6 @@ def test_a_material_is_told_by_how_it_begins():
 def test_another_material_comes_with_its_own_numbers():
     setup = read_setup("petri_35mm_polyamide")
     own = replace(setup, model=replace(setup.model, elastic_modulus=3e9, diameter=7e-5))
-    assert FitOptions("polyamide").settings_of(own) == own.model
-    silk = FitOptions("silk", "paper").settings_of(own)
+    assert thread_settings(own, "polyamide") == own.model
+    silk = thread_settings(own, "silk", "paper")
     assert (silk.material, silk.elastic_modulus, silk.diameter, silk.formulation) == ("silk_6_0", 0.0, 0.0, "paper")

@@ -3,17 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -22,6 +15,7 @@ import rclpy
 from magnetosuture_msgs.msg import CoilCurrents
 from rclpy.context import Context
 
+from benchmarks.page import running_console
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
 from magnetosuture_thread.nodes import topics
@@ -34,44 +28,7 @@ OTHER = "petri_35mm_polyamide_post"
 WAIT = 300.0  # s; the first start on a machine compiles
 
 
-@dataclass
-class Console:
-    """The command, running; what it prints goes to a file."""
-
-    process: subprocess.Popen[bytes]
-    output: Path
-
-    def find(self, pattern: str) -> str:
-        """Wait for a line of its output, and return what the pattern's group holds."""
-        deadline = time.monotonic() + WAIT
-        while not (found := re.search(pattern, self.output.read_text(), re.MULTILINE)):
-            assert self.process.poll() is None, self.output.read_text()
-            assert time.monotonic() < deadline, f"no {pattern} in {self.output.read_text()}"
-            time.sleep(0.02)
-        return found[1]
-
-    def end(self) -> int:
-        """Press Ctrl-C, and return its exit code."""
-        self.process.send_signal(signal.SIGINT)
-        return self.process.wait(60.0)
-
-
-@contextmanager
-def running(*arguments: str, **environment: str) -> Iterator[Console]:
-    """Run the command on a free port; end it at the end if it has not."""
-    command = [sys.executable, "-u", "-m", "magnetosuture_thread.cli", "console", *arguments, "--port", "0"]
-    own = {**os.environ, "MAGNETOSUTURE_TOKEN": "only-for-this-test-0123", **environment}
-    with (
-        TemporaryDirectory() as folder,
-        (Path(folder) / "output").open("wb") as file,
-        subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=own) as process,
-    ):
-        console = Console(process, Path(file.name))
-        try:
-            yield console
-        finally:
-            if process.poll() is None:
-                console.end()
+running = partial(running_console, MAGNETOSUTURE_TOKEN="only-for-this-test-0123")
 
 
 @contextmanager
@@ -237,14 +194,3 @@ def test_what_cannot_be_served_is_refused_in_one_line(capsys: pytest.CaptureFixt
         errors = capsys.readouterr().err
         assert words in errors
         assert errors.count("\n") == 1
-
-
-def test_without_ros_the_page_says_what_is_missing(monkeypatch, capsys: pytest.CaptureFixture[str]):
-    for name in [name for name in sys.modules if name.startswith("magnetosuture_thread.nodes")]:
-        monkeypatch.delitem(sys.modules, name)
-    jobs = {f"magnetosuture_thread.commands.{name}" for name in ("console", "live", "simulate")}
-    for name in [name for name in sys.modules if name in jobs or name.split(".")[0] == "rclpy"]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "rclpy", None)
-    assert main(["console", "--port", "0"]) == 1
-    assert "nodes and the live graph need ROS 2 Jazzy" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import pytest
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags, kind_of
+from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.interface import NEEDLE_POSE, PREDICTED_THREAD
@@ -123,14 +123,6 @@ def test_bags_are_found_two_folders_down_each_once(tmp_path: Path):
     touched(tmp_path / "s" / "s_0.mcap", tmp_path / "s" / "s_1.mcap", tmp_path / ".hidden" / "h.mcap")
     found = [str(path.relative_to(tmp_path)) for path in find_bags([tmp_path / "b", tmp_path])]
     assert found == ["b", "c/d", "c/e/x.mcap", "c/e/y.mcap", "s"]
-
-
-def test_trajectories_and_bags_are_not_mixed(tmp_path: Path):
-    touched(tmp_path / "r" / "a.npz", tmp_path / "b" / "b.mcap")
-    assert kind_of([tmp_path / "r"]) == kind_of([tmp_path / "r" / "a.npz"]) == "references"
-    assert kind_of([tmp_path / "b"]) == "bags"
-    with pytest.raises(ConfigurationError, match="bags alone, or reference trajectories alone"):
-        kind_of([tmp_path / "r", tmp_path / "b"])
 
 
 @pytest.mark.parametrize(

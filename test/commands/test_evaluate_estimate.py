@@ -11,16 +11,14 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import MEASURED_THREAD, THREAD_OBSERVATION
-from magnetosuture_thread.messages.packing import packed_observation, packed_path
+from magnetosuture_thread.interface import MEASURED_THREAD
+from magnetosuture_thread.messages.packing import packed_path
 from magnetosuture_thread.messages.reading import path_points, stamp_of
 from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.bags.bags import changed
 from test.conftest import arc
 
@@ -118,34 +116,3 @@ def test_without_a_measurement_the_estimate_is_the_prediction_and_says_so(tmp_pa
     assert (row["corrected_frames"], row["all_hidden_time_share"], row["disturbances"]) == (0, 1.0, 0)
     assert row["consistency"]["normalised_innovation_squared_mean"] is None
     assert "The estimate is a prediction only:" in page
-
-
-def test_pieces_are_used_where_a_bag_has_them(tmp_path: Path, pushed_bag: Path):
-    """The middle of the thread is hidden; the centreline in the bag is another one, which nobody may take."""
-    source = Bag(pushed_bag)
-    with BagWriter(tmp_path / "pieces", source.notes) as writer:
-        for topic, type_name in (*source.topics.items(), (THREAD_OBSERVATION.recorded, THREAD_OBSERVATION.type_name)):
-            writer.add_topic(topic, type_name)
-        for number, record in enumerate(source.records(set(source.topics))):
-            if record.topic != MEASURED_THREAD.recorded:
-                writer.write(record.topic, record.time, record.data)
-                continue
-            stamp, points = stamp_of(record), path_points(record.decode(), record.topic)
-            first = number < 20
-            pieces = (piece(points, 0, 64),) if first else (piece(points, 0, 20), piece(points, 45, 64))
-            observation = ThreadObservation(pieces, complete=first)
-            writer.write(THREAD_OBSERVATION.recorded, record.time, packed_observation(stamp, observation))
-            writer.write(MEASURED_THREAD.recorded, record.time, packed_path(stamp, points + np.array([0.0, 2e-3])))
-    row, _ = evaluated(tmp_path / "pieces", tmp_path / "out")
-    assert (
-        row["estimate"]["error_ground_truth_mean_percent"] < 0.5 * row["prediction"]["error_ground_truth_mean_percent"]
-    )
-    assert row["hidden_length_share"] == pytest.approx(26 / 63, abs=0.05)
-    assert row["all_hidden_time_share"] == 0.0
-
-
-def piece(points: np.ndarray, first: int, last: int) -> ThreadPiece:
-    """Return the piece of some points of a whole thread."""
-    start = 0.019 * first / 63
-    ends = PieceEnd.TAIL if first == 0 else PieceEnd.COVERED, PieceEnd.FREE if last == 64 else PieceEnd.COVERED
-    return ThreadPiece(points[first:last], np.full(last - first, 1e-5), *ends, (start, start))

@@ -22,13 +22,12 @@ from magnetosuture_thread.bags.message_types import make, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.commands.recorded import ObservationReader, predictions
+from magnetosuture_thread.commands.recorded import BagInput, ObservationReader, chosen_source, predictions
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages.packing import packed_pose, packed_wrench
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.scene import Scene, SceneShape
@@ -50,9 +49,13 @@ def pose_bag(tmp_path_factory: pytest.TempPathFactory, straight_pull: ReferenceT
     return path
 
 
-def observed(bag: Path, **selection: Any) -> ObservationReader:
+def observed(
+    bag: Path, start: float = 0.0, duration: float = 100.0, progress: Callable[[float], None] = lambda share: None
+) -> ObservationReader:
     """Return what is observed in a bag."""
-    return ObservationReader(Recording(Bag(bag)), SETUP, **selection)
+    recording = Recording(Bag(bag))
+    left = min(duration, recording.duration - start)
+    return BagInput(recording, SETUP, chosen_source(recording, "auto"), start, left).observations(progress)
 
 
 def without(bag: Path, folder: Path, *topics: str) -> Path:
@@ -110,18 +113,6 @@ def test_observations_of_poses_hold_what_was_recorded(pose_bag: Path, straight_p
         assert observation.ground_truth.shape == (51, 2)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-
-
-def test_observations_of_frames_hold_what_the_tracker_sees(short_bag: Path, straight_pull: ReferenceTrajectory):
-    found = observed(short_bag)
-    seen = list(found)
-    assert (found.source, found.count, found.found) == ("camera", 30, 28)
-    assert found.refused == {"no needle for sure": 2}
-    assert [bool(each.reason) for each in seen] == [True] * 2 + [False] * 28
-    for k, observation in enumerate(seen[2:], 2):
-        assert np.linalg.norm(observation.tail - straight_pull.at(k / 30.0)[0]) < 1e-4
-        assert (observation.measured.shape, observation.ground_truth.shape) == ((64, 2), (51, 2))
-        assert observation.processing > 0.0
 
 
 def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_path: Path):
@@ -265,22 +256,3 @@ def test_scene_and_material_count_from_when_they_were_said(pose_bag: Path, tmp_p
     replay_offline(bag, tmp_path / "again")
     said = [record.decode().version for record in Bag(tmp_path / "again" / "bag").records({SCENE.recorded})]
     assert said[:2] == [SETUP.scene.version, scene.version]  # so that what comes of it can be replayed in its turn
-
-
-def test_the_true_pull_comes_with_the_pose_of_its_stamp(tmp_path: Path):
-    """Of the second the pull is not finite, the third's is of another frame, and the fourth has none."""
-    pull = interface.GROUND_TRUTH_PULL
-    with BagWriter(tmp_path / "bag", {}) as bag:
-        for channel in (interface.NEEDLE_POSE, pull):
-            bag.add_topic(channel.recorded, channel.type_name)
-        for k in range(4):
-            stamp = (k + 1) * 10**8
-            bag.write(POSE, stamp, packed_pose(stamp, np.zeros(2), np.array([1.0, 0.0])))
-            force = packed_wrench(stamp, np.array([1e-6 * k, np.nan if k == 1 else -2e-6]), 3e-9)
-            if k < 3:
-                bag.write(pull.recorded, stamp, force.replace(b"dish", b"else") if k == 2 else force)
-    reader = observed(tmp_path / "bag")
-    first, *others = reader
-    assert first.true_pull == pytest.approx([0.0, -2e-6])
-    assert [len(each.true_pull) for each in others] == [0, 0, 0]
-    assert any("thread_pull" in why for why in reader.refused)

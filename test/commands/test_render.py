@@ -75,22 +75,16 @@ def test_poses_take_the_place_of_frames(tmp_path: Path, straight_pull: Reference
     bag = bags["one"]
     assert bag.counts == {SCENE: 1, **dict.fromkeys((POSE, MEASURED, *MOTION), 120)}
     assert bag.notes["simulated"] == "needle poses and seen thread from the reference trajectory straight_pull"
-    off, turned, seen = list[float](), list[float](), list[float]()
-    for index, record in enumerate(bag.records({POSE, MEASURED})):
-        message = record.decode()
-        if record.topic == POSE:
-            tail, _, _ = straight_pull.at(index // 2 / 60.0)
-            position = message.pose.pose.position
-            off += [position.x - tail[0], position.y - tail[1]]
-            turned.append(2.0 * np.arctan2(message.pose.pose.orientation.z, message.pose.pose.orientation.w))
-            assert message.pose.covariance[0] == pytest.approx(1e-8)
-        else:
-            points = np.array([[pose.pose.position.x, pose.pose.position.y] for pose in message.poses])
-            assert points.shape == (64, 2)
-            assert points[0].tolist() == [position.x, position.y]
-            seen += (points[1:, 1] - 0.002).tolist()
-    assert np.std(off) == pytest.approx(1e-4, rel=0.2)
-    assert np.std(seen) == pytest.approx(1e-4, rel=0.1)
-    assert np.std(turned) == pytest.approx(1e-4 / SETUP.vision.needle_length, rel=0.3)
+    poses, threads = (list(bag.records({topic})) for topic in (POSE, MEASURED))
+    tails = np.array([(each.decode().pose.pose.position.x, each.decode().pose.pose.position.y) for each in poses])
+    truth = np.array([straight_pull.at(index / 60.0)[0] for index in range(120)])
+    assert np.std(tails - truth) == pytest.approx(1e-4, rel=0.2)
+    assert poses[0].decode().pose.covariance[0] == pytest.approx(1e-8)
+    measured = np.array(
+        [[(each.pose.position.x, each.pose.position.y) for each in record.decode().poses] for record in threads]
+    )
+    assert measured.shape == (120, 64, 2)
+    assert np.array_equal(measured[:, 0], tails)  # a measured thread begins at the measured tail
+    assert np.std(measured[:, 1:, 1]) == pytest.approx(1e-4, rel=0.1)
     stored = {name: [record.data for record in made.records({POSE})] for name, made in bags.items()}
     assert stored["one"] == stored["same"] != stored["other"]

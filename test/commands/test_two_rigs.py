@@ -97,6 +97,15 @@ def is_disarmed(page: Page) -> bool:
     return not page.graph["bridge"]["armed"]
 
 
+async def at_rest(page: Page) -> None:
+    """Wait until the thread no longer draws the needle: by 50 um in half a second of the rig's time."""
+    moved = np.inf
+    while moved > 5e-5:
+        before, until = tail(page), page.graph["time"] + 0.5
+        await wait(page, lambda until=until: page.graph["time"] > until, "half a second")
+        moved = np.linalg.norm(tail(page) - before)
+
+
 async def jog(page: Page) -> None:
     """Arm, and move the needle to the right by a millimetre; the key stays down."""
     assert await page.ask(type="bridge_action", action="arm") == ""
@@ -114,6 +123,7 @@ def test_commands_of_one_page_reach_its_own_rig_alone_also_on_a_remapped_topic(r
             await ready(left)
             await ready(right)
             for page, other, space, other_space in ((left, right, LEFT, RIGHT), (right, left, RIGHT, LEFT)):
+                await at_rest(other)
                 for received in rigs.currents.values():
                     received.clear()
                 still = tail(other)

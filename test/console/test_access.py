@@ -32,28 +32,23 @@ def test_an_address_that_others_reach_needs_a_token(address: str):
     assert ConsoleSettings(address=address, token=TOKEN).token == TOKEN
 
 
+ORIGINS = ("rig.example", "https://rig.example/page", "ftp://rig.example", "https://", "https://u@rig.example")
+
+
 @pytest.mark.parametrize(
     ("values", "named"),
     [
-        ({"token": "short"}, "console.token"),
-        ({"token": "a token with spaces in it"}, "console.token"),
-        ({"token": "ein-schönes-geheimnis"}, "console.token"),
+        *(
+            ({"token": token}, "console.token")
+            for token in ("short", "a token with spaces in it", "ein-schönes-geheimnis")
+        ),
+        *(({"origin": origin}, "console.origin") for origin in ORIGINS),
         ({"address": ""}, "console.address"),
         ({"speed": 0.02, "max_speed": 0.01}, "console.speed"),
         ({"rate": 10.0, "hold_timeout": 0.1}, "console.rate"),
         ({"needle_curvature": 900.0}, "console.needle_curvature"),
         ({"port": 70000}, "console.port"),
         ({"private_key": "key.pem"}, "console.private_key"),
-        *(
-            ({"origin": origin}, "console.origin")
-            for origin in (
-                "rig.example",
-                "https://rig.example/page",
-                "ftp://rig.example",
-                "https://",
-                "https://u@rig.example",
-            )
-        ),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(values: dict, named: str):
@@ -75,59 +70,61 @@ def test_every_start_has_a_token_of_its_own_and_it_is_in_the_fragment_alone():
     assert page_url(server_origin("::1", 80, "https"), "t").startswith("https://[::1]:80/#")
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:8090", "localhost:8090", "LOCALHOST:8090", "[::1]:8090"])
-def test_this_machines_own_names_are_good(host: str):
-    assert host_refusal(host, "127.0.0.1", 8090) == ""
+LOCAL, RIG = "127.0.0.1", "https://rig.example"
+HOSTS: dict[str, list[tuple[str, dict[str, str]]]] = {  # by the bound address: what is accepted
+    LOCAL: [(host, {}) for host in ("127.0.0.1:8090", "localhost:8090", "LOCALHOST:8090", "[::1]:8090")]
+    + [(host, {"origin": RIG}) for host in ("rig.example", "RIG.example", "127.0.0.1:8090")],
+    "0.0.0.0": [("192.168.1.5:8090", {})],
+    "::": [("[fd00::5]:8090", {})],
+    "rig.example": [("Rig.example:8090", {})],
+}
+# A name of somebody else's that points here is how a page of another site would get in.
+OTHERS: dict[str, list[tuple[str, dict[str, str]]]] = {
+    LOCAL: [(host, {}) for host in ("", "evil.example:8090", "localhost.evil.example:8090", "127.0.0.1", "127.0.0.1:1")]
+    + [
+        (host, {})
+        for host in ("user@127.0.0.1:8090", "127.0.0.1:8090/x", "[::1:8090", "127.0.0.1:port", "10.0.0.5:8090")
+    ]
+    + [(host, {"origin": RIG}) for host in ("rig.example:8090", "evil.example", "rig.example.evil.example")],
+    "0.0.0.0": [("evil.example:8090", {})],
+    "192.168.1.5": [(host, {}) for host in ("127.0.0.1:8090", "localhost:8090", "192.168.1.6:8090")],
+}
+
+
+@pytest.mark.parametrize("address", HOSTS)
+def test_own_names_and_those_of_a_certificate_or_a_proxy_are_accepted(address: str):
+    for host, options in HOSTS[address]:
+        assert host_refusal(host, address, 8090, **options) == ""
+
+
+@pytest.mark.parametrize("address", OTHERS)
+def test_other_names_are_refused(address: str):
+    for host, options in OTHERS[address]:
+        assert "Host" in host_refusal(host, address, 8090, **options)
+
+
+def test_over_tls_a_host_without_a_port_is_the_default_one():
+    assert host_refusal("rig.example", "rig.example", 443, scheme="https") == ""
+    assert host_refusal("rig.example", "rig.example", 443) != ""
 
 
 @pytest.mark.parametrize(
-    "host",
-    ["", "evil.example:8090", "localhost.evil.example:8090", "127.0.0.1", "127.0.0.1:1", "user@127.0.0.1:8090",
-     "127.0.0.1:8090/x", "[::1:8090", "127.0.0.1:port", "10.0.0.5:8090"],
-)  # fmt: skip
-def test_other_names_are_refused(host: str):
-    """A name of somebody else's that points here is how a page of another site would get in."""
-    assert "Host" in host_refusal(host, "127.0.0.1", 8090)
-
-
-def test_where_every_address_is_bound_only_figures_are_good():
-    assert host_refusal("192.168.1.5:8090", "0.0.0.0", 8090) == ""
-    assert host_refusal("evil.example:8090", "0.0.0.0", 8090) != ""
-    assert host_refusal("[fd00::5]:8090", "::", 8090) == ""
-    assert host_refusal("Rig.example:8090", "rig.example", 8090) == ""
-    for host in ("127.0.0.1:8090", "localhost:8090", "192.168.1.6:8090"):
-        assert host_refusal(host, "192.168.1.5", 8090) != ""
-
-
-def test_the_name_of_a_certificate_or_a_proxy_is_good_besides():
-    origin = "https://rig.example"
-    for host in ("rig.example", "RIG.example", "127.0.0.1:8090"):
-        assert host_refusal(host, "127.0.0.1", 8090, origin=origin) == ""
-        assert origin_refusal("https://rig.example", host, allowed=origin) == ""
-    for host in ("rig.example:8090", "evil.example", "rig.example.evil.example"):
-        assert host_refusal(host, "127.0.0.1", 8090, origin=origin) != ""
-    for other in ("http://rig.example", "https://rig.example:8090", "https://evil.example"):
-        assert "expected https://rig.example" in origin_refusal(other, "rig.example", allowed=origin)
-
-
-def test_over_tls_only_pages_that_came_over_tls_open_the_socket():
-    assert host_refusal("rig.example", "rig.example", 443, scheme="https") == ""
-    assert host_refusal("rig.example", "rig.example", 443) != ""
-    assert origin_refusal("https://127.0.0.1:8090", "127.0.0.1:8090", scheme="https") == ""
-    assert origin_refusal("http://127.0.0.1:8090", "127.0.0.1:8090", scheme="https") != ""
-
-
-def test_only_our_own_page_opens_the_socket_in_a_browser():
-    assert origin_refusal("", "127.0.0.1:8090") == ""
-    assert origin_refusal("http://127.0.0.1:8090", "127.0.0.1:8090") == ""
-    for origin in (
-        "http://evil.example",
-        "null",
-        "https://127.0.0.1:8090",
-        "http://127.0.0.1:80",
-        "http://localhost:8090",
-    ):
-        assert "Origin" in origin_refusal(origin, "127.0.0.1:8090")
+    ("origin", "host", "options", "is_ours"),
+    [
+        ("", "127.0.0.1:8090", {}, True),
+        ("http://127.0.0.1:8090", "127.0.0.1:8090", {}, True),
+        *((origin, "127.0.0.1:8090", {}, False) for origin in ("http://evil.example", "null", "http://127.0.0.1:80")),
+        *((origin, "127.0.0.1:8090", {}, False) for origin in ("https://127.0.0.1:8090", "http://localhost:8090")),
+        ("https://127.0.0.1:8090", "127.0.0.1:8090", {"scheme": "https"}, True),
+        ("http://127.0.0.1:8090", "127.0.0.1:8090", {"scheme": "https"}, False),
+        *((RIG, host, {"allowed": RIG}, True) for host in ("rig.example", "RIG.example", "127.0.0.1:8090")),
+        ("http://rig.example", "rig.example", {"allowed": RIG}, False),
+        ("https://rig.example:8090", "rig.example", {"allowed": RIG}, False),
+        ("https://evil.example", "rig.example", {"allowed": RIG}, False),
+    ],
+)
+def test_only_our_own_page_opens_the_socket(origin: str, host: str, options: dict[str, str], is_ours: bool):
+    assert ("Origin" not in origin_refusal(origin, host, **options)) == is_ours
 
 
 def test_a_page_that_is_behind_gets_the_newest_only():

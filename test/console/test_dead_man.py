@@ -3,66 +3,44 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.console.jog_controller import ZERO_VELOCITY, DeadManSwitch, DelayEstimator
 
 EAST = (0.003, 0.0)
-NORTH = (0.0, 0.003)
 
 
-def test_jog_is_sent_at_once_and_repeated_while_fresh():
+REST = ZERO_VELOCITY
+JOG = ("press", EAST, 0.0, EAST)
+SEQUENCES: dict[str, list[tuple[Any, ...]]] = {  # call, its arguments, and what is sent then
+    "a jog is sent at once and repeated while fresh": [JOG, *(("due", now, EAST) for now in (0.02, 0.1, 0.149))],
+    "a timeout sends one zero": [JOG, ("due", 0.15, REST), ("due", 0.17, None), ("due", 5.0, None)],
+    "a release sends one zero": [JOG, ("release", REST), ("release", None), ("due", 0.01, None)],
+    "a stop requires a release": [
+        *(JOG, ("stop", REST), ("press", EAST, 0.01, None), ("due", 0.02, None)),
+        *(("release", None), ("press", EAST, 0.03, EAST)),
+    ],
+    # The network held the words up, and the key is still down as they come again.
+    "a stop after a timeout requires a release": [
+        *(JOG, ("due", 0.2, REST), ("stop", None), ("press", EAST, 0.3, None)),
+        *(("release", None), ("press", EAST, 0.4, EAST)),
+    ],
+    "an interruption ends the motion and clears no stop": [
+        *(JOG, ("interrupt", REST), ("press", EAST, 0.01, EAST)),
+        *(("stop", REST), ("interrupt", None), ("press", EAST, 0.02, None)),
+    ],
+}
+
+
+@pytest.mark.parametrize("sequence", SEQUENCES.values(), ids=SEQUENCES)
+def test_what_is_sent(sequence: list[tuple[Any, ...]]):
     switch = DeadManSwitch(0.15)
-    assert switch.press(EAST, 0.0) == EAST
-    assert [switch.due(t) for t in (0.02, 0.1, 0.149)] == [EAST] * 3
-
-
-def test_timeout_sends_one_zero():
-    switch = DeadManSwitch(0.15)
-    switch.press(EAST, 0.0)
-    assert [switch.due(t) for t in (0.15, 0.17, 5.0)] == [ZERO_VELOCITY, None, None]
-    assert not switch.moving
-
-
-def test_release_sends_one_zero():
-    switch = DeadManSwitch(0.15)
-    switch.press(EAST, 0.0)
-    assert switch.release() == ZERO_VELOCITY
-    assert switch.release() is None
-    assert switch.due(0.01) is None
-
-
-def test_stop_requires_a_release():
-    switch = DeadManSwitch(0.15)
-    switch.press(EAST, 0.0)
-    assert switch.stop() == ZERO_VELOCITY
-    assert switch.press(EAST, 0.01) is None
-    assert switch.due(0.02) is None
-    assert switch.release() is None
-    assert switch.press(EAST, 0.03) == EAST
-
-
-def test_stop_after_a_timeout_requires_a_release():
-    """The network held the words up, and the key is still down as they come again."""
-    switch = DeadManSwitch(0.15)
-    switch.press(EAST, 0.0)
-    assert switch.due(0.2) == ZERO_VELOCITY
-    assert switch.stop() is None
-    assert switch.press(EAST, 0.3) is None
-    switch.release()
-    assert switch.press(EAST, 0.4) == EAST
-
-
-def test_interruption_ends_the_motion_and_clears_no_stop():
-    switch = DeadManSwitch(0.15)
-    switch.press(EAST, 0.0)
-    assert switch.interrupt() == ZERO_VELOCITY
-    assert switch.press(EAST, 0.01) == EAST
-    switch.stop()
-    assert switch.interrupt() is None
-    assert switch.press(EAST, 0.02) is None
+    for call, *arguments, expected in sequence:
+        assert getattr(switch, call)(*arguments) == expected
 
 
 words = st.lists(

@@ -10,7 +10,7 @@ import math
 import aiohttp
 import pytest
 
-from magnetosuture_thread.console.client_messages import ClientMessage, parse_client_message
+from magnetosuture_thread.console.client import ClientMessage, parse_client_message
 from magnetosuture_thread.console.server import HEADERS, ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import ConfigurationError

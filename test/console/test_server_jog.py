@@ -7,8 +7,7 @@ import contextlib
 
 import pytest
 
-from magnetosuture_thread.console.client import RequestHandler
-from magnetosuture_thread.console.client_messages import ClientMessage
+from magnetosuture_thread.console.client import ClientMessage, RequestHandler
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.errors import InvalidInputError
 from test.console.scene import RecordingGraph, RecordingHost
@@ -209,23 +208,3 @@ def test_a_page_without_control_ends_what_moves_and_requests_nothing_else(messag
         await requests.close()
 
     asyncio.run(test())
-
-
-def test_jog_sends_commands_until_its_end():
-    async def test(here: Console) -> None:
-        page = await here.page()
-        await page.acquire_control()
-        await page.jog(0, 1)
-        await until(lambda: len(here.graph.commands) >= 4)
-        await page.jog(1, 0, speed=99.0)
-        await until(lambda: here.graph.last == (here.settings.max_speed, 0.0))
-        await page.send(type="end_jog")
-        await until(lambda: here.graph.last == REST)
-        assert here.graph.velocities[0] == NORTH
-        assert here.graph.velocities.count(REST) == 1
-        count = len(here.graph.commands)
-        states = len(page.received)
-        await until(lambda: len(page.received) > states + 3)
-        assert len(here.graph.commands) == count
-
-    run(test, max_speed=0.02)
