@@ -23,7 +23,7 @@ import numpy as np
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     BEFORE,
@@ -31,7 +31,6 @@ from magnetosuture_thread.thread.program import (
     NO_SHAPE,
     SPAN,
     START,
-    ContactBuffers,
     GripBuffers,
     Mask,
     RodBuffers,
@@ -42,16 +41,6 @@ from magnetosuture_thread.thread.program import (
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
 FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver
-
-
-@compiled_inline
-def _chord_part(contacts: ContactBuffers) -> ChordContacts:
-    return ChordContacts(contacts.node, contacts.obstacle, contacts.distance, contacts.normal, contacts.place)
-
-
-@compiled_inline
-def _node_contacts(points: Points, workspace: WorkspaceData, to: ContactBuffers) -> int:
-    return find_contacts(points, workspace, to.node, to.obstacle, to.distance, to.normal, to.nearest)
 
 
 @compiled_uncounted
@@ -93,14 +82,13 @@ def contact_rows(
         minimum[i, 0] = minimum[i, 1] = np.inf
         for a in range(dimension):
             points[i, a] = about[i, a] * unit
-    found = _node_contacts(points, workspace, contacts)
+    found = find_contacts(points, workspace, contacts)
     buffers.clearance[:] = workspace.reach
     for c in range(found):
         contacts.place[c] = 0.0
         buffers.clearance[contacts.node[c]] = min(buffers.clearance[contacts.node[c]], contacts.distance[c])
     if found > 0 and chords:
-        to = _chord_part(contacts)
-        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, to)
+        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, contacts)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
     kept, depth = 0, 0.0
@@ -175,13 +163,13 @@ def stays_clear(
             square += (about[i, a] - before[i, a]) ** 2
         clearance[i] -= unit * math.sqrt(square)
         if not (clearance[i] >= minimum or known[i]):
-            found = _node_contacts(points[i : i + 1], workspace, to)
+            found = find_contacts(points[i : i + 1], workspace, to)
             clearance[i] = workspace.reach
             for c in range(found):
                 clearance[i] = min(clearance[i], to.distance[c])
             if found < 0 or not clearance[i] >= minimum:
                 return False
-    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), _chord_part(to))
+    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), to)
     for c in range(found):
         if to.distance[c] < minimum and not (known[to.node[c]] and known[to.node[c] + 1]):
             return False

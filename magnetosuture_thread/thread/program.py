@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.geometry.obstacles import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -77,33 +78,6 @@ def no_far_rows(dimension: int) -> tuple[Indices, Table]:
     return np.zeros((0, 1), np.int64), np.zeros((0, 1, dimension))
 
 
-class ContactBuffers(NamedTuple):
-    """Where contacts are written, as by `find_contacts`.
-
-    Attributes:
-        node: shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,) [m].
-        normal: shape (c, d).
-        nearest: shape (c,).
-        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
-    """
-
-    node: Indices
-    obstacle: Indices
-    distance: Vector
-    normal: Points
-    nearest: Mask
-    place: Vector
-
-    @classmethod
-    def of(cls, nodes: int, dimension: int, shapes: int = 0) -> ContactBuffers:
-        """Return room for the contacts of a thread; more for one whose nodes may be near many shapes at once."""
-        count = (CONTACTS_PER_NODE + 2 * shapes) * nodes
-        (node, obstacle), (distance, place) = np.zeros((2, count), np.int64), np.zeros((2, count))
-        return cls(node, obstacle, distance, np.zeros((count, dimension)), np.zeros(count, np.bool_), place)
-
-
 class StepBuffers(NamedTuple):
     """Memory for the programs of a thread with n + 1 nodes, kept from step to step so that no step pays for it.
 
@@ -134,7 +108,7 @@ class StepBuffers(NamedTuple):
     multipliers: Vector
     chords: Vector
     work: Table
-    contacts: ContactBuffers
+    contacts: Contacts
     clearance: Vector
     push: Table
 
@@ -157,7 +131,7 @@ class StepBuffers(NamedTuple):
             multipliers,
             chords=np.zeros(nodes - 1),
             work=np.zeros((2, nodes, dimension)),
-            contacts=ContactBuffers.of(nodes, dimension),
+            contacts=Contacts.room(CONTACTS_PER_NODE * nodes, dimension),
             clearance=np.zeros(nodes),
             push=np.zeros((2, nodes)),
         )

@@ -69,6 +69,7 @@ from magnetosuture_thread.thread.program import (
     Solver,
     StepBuffers,
     Vector,
+    compiled_residuals,
     first_rows,
     program_view,
 )
@@ -96,7 +97,6 @@ class StepModel(NamedTuple):
     """The thread and what is around it, for compiled code.
 
     Attributes:
-        axes: 0 to d - 1.
         rod: the thread.
         workspace: obstacles and wall, with the reach of the program's rows [m].
         tolerance: the largest residual with which a solution is accepted.
@@ -104,7 +104,6 @@ class StepModel(NamedTuple):
         structured: whether the structured solver is to solve; if not, every solve is left to the caller.
     """
 
-    axes: banded.Axes
     rod: RodProperties
     workspace: WorkspaceData
     tolerance: float
@@ -394,11 +393,13 @@ def solve_step(
             break
         rows = segments + contacts
         program, multipliers = program_view(buffers.program, buffers.known, rows), buffers.program.multipliers[:rows]
-        word, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+        word, _ = banded.solve(program, u, multipliers, solver_buffers)
+        found = compiled_residuals(program, u, multipliers)
         if not max(found) <= model.tolerance:
             u[:] = 0.0
             multipliers[:] = 0.0
-            _, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+            banded.solve(program, u, multipliers, solver_buffers)
+            found = compiled_residuals(program, u, multipliers)
             if not max(found) <= model.tolerance:
                 u[:] = 0.0
                 multipliers[:] = 0.0
@@ -592,7 +593,7 @@ class RodFormulation(Formulation):
 
     def step_model(self) -> StepModel:
         """Return the thread and what is around it, for compiled code."""
-        return StepModel((0, 1, 2)[: self.dimension], self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
+        return StepModel(self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
 
     def _linearised(self, interval: float) -> AddedRows:
         motion = self._buffers.motion

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData
+from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, Contacts, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = tuple[float, float, float]
@@ -35,33 +35,13 @@ class Chord(NamedTuple):
     length: float
 
 
-class ChordContacts(NamedTuple):
-    """Arrays that contacts are written to; see `find_contacts` for the first four.
-
-    Attributes:
-        node: the first of the segment's two, shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,) [m].
-        normal: shape (c, d).
-        place: where on the segment, 0 to 1, shape (c,).
-    """
-
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    place: NDArray[np.float64]
-
-
 @compiled_inline
 def _dot(a: Vector, b: Vector) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled_inline
-def _write(
-    count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: ChordContacts
-) -> int:
+def _write(count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: Contacts) -> int:
     """Write a contact; return the new count, -1 if there is no room."""
     if count < 0 or count >= len(to.node):
         return -1
@@ -129,7 +109,7 @@ def find_chord_contacts(
     radius: float,
     clearance: NDArray[np.float64],
     count: int,
-    to: ChordContacts,
+    to: Contacts,
 ) -> int:
     """Write where the chords between nodes are closest to what sticks out of obstacles; what nodes touch is not in it.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +15,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.distances import (
     EDGE_WIDTH,
     ContactRows,
+    Contacts,
     WorkspaceData,
     add_row,
     closest_on_segment,
@@ -84,30 +84,19 @@ def _polygon_contacts(x: float, y: float, polygon: int, data: WorkspaceData, cou
 
 
 @compiled_uncounted
-def find_contacts(
-    points: Points,
-    data: WorkspaceData,
-    node: NDArray[np.int64],
-    obstacle: NDArray[np.int64],
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    nearest: NDArray[np.bool_],
-) -> int:
+def find_contacts(points: Points, data: WorkspaceData, to: Contacts) -> int:
     """Write the contacts of points into the caller's arrays; see `Workspace.near` for what they are.
 
     Args:
         points: shape (m, d) [m].
         data: `Workspace.data`.
-        node: index of the point, shape (c,), c rows of room.
-        obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
-        distance: signed distance, shape (c,) [m].
-        normal: gradient of the signed distance, shape (c, d).
-        nearest: whether the row is the nearest of its point and obstacle, shape (c,).
+        to: written, but for the place.
 
     Returns:
         The number of contacts, or -1 when there are more than the arrays have room for.
     """
-    count, rows, discs = 0, ContactRows(distance, normal), len(data.discs)
+    node, obstacle, distance, nearest = to.node, to.obstacle, to.distance, to.nearest
+    count, rows, discs = 0, ContactRows(distance, to.normal), len(data.discs)
     # Nearer to the centre than this, a point has no contact with the wall: most points pay for one comparison.
     inner = data.wall_radius - data.reach
     inner_square = inner * inner if inner > 0.0 else -1.0
@@ -138,29 +127,6 @@ def find_contacts(
             if count > start:
                 nearest[best] = True
     return count
-
-
-@dataclass(frozen=True, eq=False)
-class Contacts:
-    """Where points are near obstacles or the dish wall: k rows, in the order of nodes, then obstacles.
-
-    Attributes:
-        node: index of the point, shape (k,).
-        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
-        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
-        normal: gradient of the signed distance, unit vectors, shape (k, d).
-        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
-    """
-
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: NDArray[np.float64]
-    normal: Points
-    nearest: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return len(self.node)
 
 
 class Workspace:
@@ -231,13 +197,9 @@ class Workspace:
         room, count = 16 * (len(points) + 1), -1
         while count < 0:  # in a scene of many shapes a point may be near all of them
             room *= 2
-            node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
-            distance, normal = np.empty(room), np.empty((room, self.dimension))
-            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
-        found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
-        for array in found:
-            array.setflags(write=False)
-        return Contacts(*found)
+            contacts = Contacts.room(room, self.dimension)
+            count = find_contacts(points, self.data, contacts)
+        return Contacts(*(array[:count].copy() for array in contacts))
 
 
 def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: int, dimension: int) -> None:
@@ -362,18 +324,6 @@ def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, 
 
 
 @compiled
-def _lower(
-    points: Points,
-    data: WorkspaceData,
-    node: NDArray[np.int64],
-    obstacle: NDArray[np.int64],
-    distance: NDArray[np.float64],
-) -> None:
-    """Lower the distances of nodes to those of the half segments beside them."""
-    for row in range(len(node)):
-        distance[row] = half_segment_distance(points, node[row], obstacle[row], distance[row], data)
-
-
 def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contacts) -> NDArray[np.float64]:
     """Return the least signed distance of a node and the half segments beside it, for each contact, shape (k,) [m].
 
@@ -387,6 +337,7 @@ def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contac
         data: `Workspace.data`.
         contacts: of these nodes with it.
     """
-    distance: NDArray[np.float64] = contacts.distance.copy()
-    _lower(np.ascontiguousarray(points, dtype=np.float64), data, contacts.node, contacts.obstacle, distance)
+    distance = contacts.distance.copy()
+    for row in range(len(distance)):
+        distance[row] = half_segment_distance(points, contacts.node[row], contacts.obstacle[row], distance[row], data)
     return distance

@@ -171,6 +171,32 @@ class Nearest(NamedTuple):
     block: int
 
 
+class Contacts(NamedTuple):
+    """Where points or chords are near obstacles or the wall: k rows, in the order of nodes, then obstacles.
+
+    Attributes:
+        node: index of the point, or of the chord's first node, shape (k,).
+        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
+        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
+        normal: gradient of the signed distance, unit vectors, shape (k, d).
+        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
+        place: where on the segment from the node on, 0 at the node itself, shape (k,).
+    """
+
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: Vector
+    normal: Points
+    nearest: NDArray[np.bool_]
+    place: Vector
+
+    @classmethod
+    def room(cls, count: int, dimension: int) -> Contacts:
+        """Return arrays for a number of rows."""
+        (node, obstacle), (distance, place) = np.zeros((2, count), np.int64), np.zeros((2, count))
+        return cls(node, obstacle, distance, np.zeros((count, dimension)), np.zeros(count, np.bool_), place)
+
+
 class ContactRows(NamedTuple):
     """Arrays that contacts are written to, row by row.
 

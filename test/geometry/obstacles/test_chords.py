@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import shapely
 
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
-from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.geometry.obstacles import Contacts, Disc, Obstacle, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from magnetosuture_thread.thread.step import ThreadState
 from test.thread.scenes import DT, east, formulated, lead, silk
 
@@ -32,9 +32,7 @@ def contacts(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> list[tup
 def contacts_of(obstacle: Obstacle, points: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
     """Return the same of a chain."""
     room, dimension = 50, points.shape[1]
-    to = ChordContacts(
-        np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room), np.zeros((room, dimension)), np.zeros(room)
-    )
+    to = Contacts.room(room, dimension)
     data = Workspace((obstacle,), REACH, dimension).data
     clearance = np.full(len(points), -np.inf)
     assert find_chord_contacts(points, data, SEGMENT, 0.0, -clearance, 0, to) == 0
