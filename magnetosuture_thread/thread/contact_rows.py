@@ -77,27 +77,31 @@ def contact_rows(
         The number of rows, -1 if there is no room for them, and the greatest depth of a contact [m].
     """
     nodes, dimension = about.shape
-    points, minimum, contacts = buffers.work[0], buffers.work[1], buffers.contacts
+    points, minimum, contacts, clearances = buffers.work[0], buffers.work[1], buffers.contacts, buffers.clearance
+    # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
+    node, obstacle, place = contacts.node, contacts.obstacle, contacts.place
+    distance, normal = contacts.distance, contacts.normal
+    gradient, lower, upper, push = buffers.gradient, buffers.lower, buffers.upper, buffers.push
     for i in range(nodes):
         minimum[i, 0] = minimum[i, 1] = np.inf
         for a in range(dimension):
             points[i, a] = about[i, a] * unit
     found = find_contacts(points, workspace, contacts)
-    buffers.clearance[:] = workspace.reach
+    clearances[:] = workspace.reach
     for c in range(found):
-        contacts.place[c] = 0.0
-        buffers.clearance[contacts.node[c]] = min(buffers.clearance[contacts.node[c]], contacts.distance[c])
+        place[c] = 0.0
+        clearances[node[c]] = min(clearances[node[c]], distance[c])
     if found > 0 and chords:
-        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, contacts)
+        found = find_chord_contacts(points, workspace, unit, radius, clearances, found, contacts)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
     kept, depth = 0, 0.0
     for c in range(found):
-        i, s = contacts.node[c], contacts.place[c]
+        i, s = node[c], place[c]
         if known[i] and (s == 0.0 or known[i + 1]):
             continue
         kind = 0 if s == 0.0 else 1
-        clearance = contacts.distance[c] - radius
+        clearance = distance[c] - radius
         minimum[i, kind] = min(minimum[i, kind], clearance)
         depth = max(depth, -clearance)
         bound = -clearance / unit
@@ -105,26 +109,26 @@ def contact_rows(
         for k in range(SPAN):
             weight = 1.0 - s if begin + k == i else (s if begin + k == i + 1 else 0.0)
             for a in range(dimension):
-                buffers.gradient[here, k, a] = weight * contacts.normal[c, a]
-                bound -= buffers.gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
+                gradient[here, k, a] = weight * normal[c, a]
+                bound -= gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
             if known[begin + k]:
-                buffers.gradient[here, k] = 0.0
+                gradient[here, k] = 0.0
         buffers.first[here] = begin
-        buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
+        lower[here], upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
         # both sides of a shape: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
         buffers.limit[here] = np.inf
-        contacts.node[kept], contacts.obstacle[kept], contacts.place[kept] = i, contacts.obstacle[c], s
-        contacts.distance[kept] = contacts.distance[c]
+        node[kept], obstacle[kept], place[kept] = i, obstacle[c], s
+        distance[kept] = distance[c]
         for a in range(dimension):
-            contacts.normal[kept, a] = contacts.normal[c, a]
+            normal[kept, a] = normal[c, a]
         kept += 1
     # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
     for c in range(kept):
-        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        pushes = contacts.distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
-        buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
+        kind, i = 0 if place[c] == 0.0 else 1, node[c]
+        pushes = distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
+        buffers.multipliers[row + c] = push[kind, i] if pushes else 0.0
     return kept, depth
 
 
@@ -223,47 +227,49 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
     """
     buffers, grips, known, contacts = rod.program, rod.grips, rod.known, rod.program.contacts
     best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
+    shapes, forces, gradient, lower, upper = grips.shape, grips.force, buffers.gradient, buffers.lower, buffers.upper
+    node, obstacle, place, normal = contacts.node, contacts.obstacle, contacts.place, contacts.normal
     nodes = len(known)
     best[:] = -1
     for c in range(count):
-        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        slot = _slot_of(grips, kind, i, contacts.obstacle[c])
+        kind, i = 0 if place[c] == 0.0 else 1, node[c]
+        slot = _slot_of(grips, kind, i, obstacle[c])
         if slot >= 0:
-            force, other = grips.force[kind, i, slot], best[kind, i, slot]
-            push = contacts.normal[c, 0] * force[0] + contacts.normal[c, 1] * force[1]
-            least = contacts.normal[other, 0] * force[0] + contacts.normal[other, 1] * force[1] if other >= 0 else 0.0
+            force, other = forces[kind, i, slot], best[kind, i, slot]
+            push = normal[c, 0] * force[0] + normal[c, 1] * force[1]
+            least = normal[other, 0] * force[0] + normal[other, 1] * force[1] if other >= 0 else 0.0
             if push > least:
                 best[kind, i, slot] = c
     written, change, greatest = 0, 0.0, 0.0
     for kind in range(2):
         for i in range(nodes):
             for slot in range(GRIPS):
-                shape = grips.shape[kind, i, slot]
+                shape = shapes[kind, i, slot]
                 if shape == NO_SHAPE:
                     continue
-                grip, limit, c = grips.force[kind, i, slot], 0.0, best[kind, i, slot]
+                grip, limit, c = forces[kind, i, slot], 0.0, best[kind, i, slot]
                 if c >= 0:
                     limit = friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
                 change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
                 if limit == 0.0:
                     continue
                 at = count + written
-                if at >= len(contacts.node):
+                if at >= len(node):
                     return -1, 0.0
                 here, begin, moved = row + at, min(i, nodes - SPAN), 0.0
-                buffers.gradient[here] = 0.0
+                gradient[here] = 0.0
                 for k in range(i, i + kind + 1):
-                    share = 1.0 if kind == 0 else (1.0 - contacts.place[c] if k == i else contacts.place[c])
-                    x, y = -share * contacts.normal[c, 1], share * contacts.normal[c, 0]
+                    share = 1.0 if kind == 0 else (1.0 - place[c] if k == i else place[c])
+                    x, y = -share * normal[c, 1], share * normal[c, 0]
                     if known[k]:
                         moved += x * (start[k, 0] - before[k, 0]) + y * (start[k, 1] - before[k, 1])
                     else:
-                        buffers.gradient[here, k - begin, 0], buffers.gradient[here, k - begin, 1] = x, y
+                        gradient[here, k - begin, 0], gradient[here, k - begin, 1] = x, y
                 buffers.first[here] = begin
-                buffers.lower[here] = buffers.upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
+                lower[here] = upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
                 buffers.compliance[here], buffers.limit[here] = FRICTION_COMPLIANCE, limit
                 buffers.multipliers[here] = max(min(grip[2], limit), -limit)
-                contacts.node[at], contacts.obstacle[at], contacts.place[at] = i, shape, contacts.place[c]
+                node[at], obstacle[at], place[at] = i, shape, place[c]
                 written += 1
     return written, change / greatest if greatest > 0.0 else 0.0
 

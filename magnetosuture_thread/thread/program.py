@@ -328,25 +328,27 @@ def _residuals(
 ) -> tuple[float, float, float]:
     """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
+    blocks, couplings, linear, known = program.blocks, program.couplings, program.linear, program.known
+    compliance, limit = program.compliance, program.limit
     largest = 1.0
     for i in range(nodes):
         for k in range(dimension):
             value = 0.0
             for j in range(dimension):
-                value += program.blocks[i, k, j] * velocities[i, j]
+                value += blocks[i, k, j] * velocities[i, j]
             for apart in range(1, SPAN + 1):
                 if i >= apart:
-                    value += program.couplings[apart - 1, i - apart] * velocities[i - apart, k]
+                    value += couplings[apart - 1, i - apart] * velocities[i - apart, k]
                 if i + apart < nodes:
-                    value += program.couplings[apart - 1, i] * velocities[i + apart, k]
-            largest = max(largest, abs(value), abs(program.linear[i, k]))
-            force[i, k] = value + program.linear[i, k]
+                    value += couplings[apart - 1, i] * velocities[i + apart, k]
+            largest = max(largest, abs(value), abs(linear[i, k]))
+            force[i, k] = value + linear[i, k]
     primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
     finite = True
     for r in range(len(program.lower)):
         multiplier, scale = multipliers[r], 1.0
         image = _pull(program, r, velocities, multiplier, pulled)
-        image += program.compliance[r] * multiplier
+        image += compliance[r] * multiplier
         scale = max(scale, abs(image))
         lower, upper = program.lower[r], program.upper[r]
         if np.isfinite(lower):
@@ -354,10 +356,10 @@ def _residuals(
         if np.isfinite(upper):
             scale = max(scale, abs(upper))
         gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
-        if program.limit[r] < np.inf:
-            outside = max(outside, abs(multiplier) - program.limit[r])
+        if limit[r] < np.inf:
+            outside = max(outside, abs(multiplier) - limit[r])
             for miss, push in ((lower - image, multiplier), (image - upper, -multiplier)):
-                weight = program.limit[r] - push if miss > 0.0 else max(push, 0.0)
+                weight = limit[r] - push if miss > 0.0 else max(push, 0.0)
                 complementarity = max(complementarity, weight * min(abs(miss) / scale, 1.0))
             gap = 0.0
         else:
@@ -366,12 +368,12 @@ def _residuals(
         complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
         pushed = max(pushed, abs(multiplier))
         finite = finite and np.isfinite(image) and np.isfinite(multiplier)
-        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(program.limit[r]))
+        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(limit[r]))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
             finite = finite and np.isfinite(force[i, k])
-            if not program.known[i]:
+            if not known[i]:
                 largest = max(largest, abs(pulled[i, k]))
                 dual = max(dual, abs(force[i, k] - pulled[i, k]))
     if not finite:

@@ -14,6 +14,7 @@ from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_un
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.distances import (
     EDGE_WIDTH,
+    NO_BLOCK,
     ContactRows,
     Contacts,
     WorkspaceData,
@@ -240,13 +241,15 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
     length, edges = math.hypot(bx - ax, by - ay), data.edges
     intervals = np.empty((64, 2))  # halved depth first
     intervals[0, 0], intervals[0, 1], pending, halvings = 0.0, 1.0, 1, 0
-    best = min(nearest_edge(ax, ay, polygon, -1, data).signed, nearest_edge(bx, by, polygon, -1, data).signed)
+    best = min(
+        nearest_edge(ax, ay, polygon, NO_BLOCK, data).signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed
+    )
     lowest = best
     while pending > 0:
         pending -= 1
         low, high = intervals[pending, 0], intervals[pending, 1]
         px, py, qx, qy = ax + low * (bx - ax), ay + low * (by - ay), ax + high * (bx - ax), ay + high * (by - ay)
-        before, after = nearest_edge(px, py, polygon, -1, data), nearest_edge(qx, qy, polygon, -1, data)
+        before, after = nearest_edge(px, py, polygon, NO_BLOCK, data), nearest_edge(qx, qy, polygon, NO_BLOCK, data)
         best = min(best, before.signed, after.signed)
         bound = 0.5 * (before.signed + after.signed - (high - low) * length)
         for k in (before.edge, after.edge):
@@ -270,7 +273,7 @@ def _from_polygon(
     Outside it is that of an end, or that of a corner of the polygon from the line.
     """
     ux, uy, edges = bx - ax, by - ay, data.edges
-    least, length = min(signed, nearest_edge(bx, by, polygon, -1, data).signed), math.hypot(ux, uy)
+    least, length = min(signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed), math.hypot(ux, uy)
     for block in range(data.polygons[polygon, 0], data.polygons[polygon, 1]):
         if least <= TOLERANCE:
             break

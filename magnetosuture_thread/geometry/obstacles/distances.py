@@ -26,6 +26,7 @@ EDGE_WIDTH = 14
 pseudo-normals at start and end (2 each), and one to fill."""
 MIN_DISTANCE = 1e-12
 """At a smaller distance from a vertex or an edge, the direction away from it is lost in rounding [m]."""
+NO_BLOCK, NO_ROW = np.int64(-1), np.int64(0)  # typed: a kernel is compiled again for each number that is written out
 _SAME_POINT = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
 
 
@@ -342,14 +343,14 @@ def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceDa
     first, last = data.polygons[polygon, 0], data.polygons[polygon, 1]
     best = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0, -1)
     if first <= guess < last:
-        best = search_block(x, y, -1.0, guess, data, 0, 0, no_rows)
+        best = search_block(x, y, -1.0, guess, data, NO_ROW, NO_ROW, no_rows)
     reach = math.sqrt(best.square)
     for block in range(first, last):
         dx, dy = x - data.circles[block, 0], y - data.circles[block, 1]
         far = reach + data.circles[block, 2]
         if block == guess or dx * dx + dy * dy >= far * far:
             continue
-        found = search_block(x, y, -1.0, block, data, 0, 0, no_rows)
+        found = search_block(x, y, -1.0, block, data, NO_ROW, NO_ROW, no_rows)
         if found.square < best.square:
             best, reach = found, math.sqrt(found.square)
     return best
