@@ -118,17 +118,6 @@ def end_corrected_weights(segments: int) -> NDArray[np.float64]:
     return weights
 
 
-def rest_distances(rest_angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance of the nodes before and after each inner node at rest, delta_i, shape (n - 1,).
-
-    delta_i = 2 cos(theta_i / 2)
-
-    Args:
-        rest_angles: theta_i, angle by which the thread at rest turns at each inner node, shape (n - 1,) [rad].
-    """
-    return np.asarray(2.0 * np.cos(0.5 * rest_angles))
-
-
 def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
     """Return the bands of the bending Hessian K, shape (4, n + 1): K[i, i + k] is at [k, i].
 

@@ -249,10 +249,6 @@ class Residuals(NamedTuple):
         """The largest of the three."""
         return max(self)
 
-    def or_worse(self, other: Residuals) -> Residuals:
-        """Return the larger of each."""
-        return Residuals(max(self[0], other[0]), max(self[1], other[1]), max(self[2], other[2]))
-
 
 class Solution(NamedTuple):
     """What a solver found.

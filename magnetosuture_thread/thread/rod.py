@@ -547,7 +547,7 @@ class RodFormulation(Formulation):
             before = self.warm_start()
         while True:
             done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
-            worst, solves = worst.or_worse(Residuals(*done.residuals)), done.solves
+            worst, solves = Residuals(*map(max, worst, done.residuals)), done.solves
             status = status if status != SOLVED else banded.STATUS[done.status]
             if done.code == NO_ROOM:
                 self._refuse_contacts()
@@ -574,7 +574,7 @@ class RodFormulation(Formulation):
                     buffers.tail_load[:] += added.force(pushes, positions.shape)[0]
                 added = self._linearised(interval)
                 off = added.off
-            worst, solves = worst.or_worse(solution.residuals), solves + 1
+            worst, solves = Residuals(*map(max, worst, solution.residuals)), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
         about, before_step = buffers.motion[ABOUT], buffers.motion[BEFORE]

@@ -168,7 +168,11 @@ class Workspace:
         for i, shape in enumerate(self.shapes):
             _check(f"workspace.shapes[{i}]", shape, dimension)
         self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
-        _check_friction(self.friction, wall_friction, len(self.shapes), dimension)
+        if len(self.friction) != len(self.shapes):
+            expected = f"one for each of {len(self.shapes)} shapes"
+            raise ConfigurationError("workspace.friction", f"{len(self.friction)} values", expected)
+        if dimension != 2 and max(wall_friction, *self.friction, 0.0) > 0.0:
+            raise ConfigurationError("workspace.friction", friction, "0 in space: friction is of the plane")
         self.data = pack_obstacles(self.shapes, wall_radius, reach, (wall_friction, *self.friction))
 
     def near(self, points: Points) -> Contacts:
@@ -201,14 +205,6 @@ class Workspace:
             contacts = Contacts.room(room, self.dimension)
             count = find_contacts(points, self.data, contacts)
         return Contacts(*(array[:count].copy() for array in contacts))
-
-
-def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: int, dimension: int) -> None:
-    if len(friction) != shapes:
-        raise ConfigurationError("workspace.friction", f"{len(friction)} values", f"one for each of {shapes} shapes")
-    for name, value in (("wall_friction", wall_friction), *((f"friction[{i}]", mu) for i, mu in enumerate(friction))):
-        if value > 0.0 and dimension != 2:
-            raise ConfigurationError(f"workspace.{name}", value, "0 in space: friction is of the plane")
 
 
 def _check(name: str, shape: Obstacle, dimension: int) -> None:
