@@ -30,7 +30,7 @@ class _Decorator(Protocol):
     def __call__(self, function: _Function, /) -> _Function: ...
 
 
-def _decorator(**options: bool) -> _Decorator:
+def _decorator(**options: Any) -> _Decorator:
     """Return numba's decorator with numpy's rules for division by zero and, but for what is inlined, a cache.
 
     Options are said of every function, as numba takes them over from whatever calls one first where they are not.
@@ -62,6 +62,13 @@ nor return any, whose references nobody would have counted.
 
 compiled_inner = _decorator(cache=True, _nrt=False, no_cpython_wrapper=True)
 """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash."""
+
+compiled_within = _decorator(inline="always", _nrt=False)
+"""Compile a function as a part of the one kernel that calls it, without counting references to arrays.
+
+What is compiled apart is compiled once by itself, and then again within each kernel that leads to it. For a function
+with one caller; the same done for one with several would compile it in each.
+"""
 
 compiled_without_gil = _decorator(cache=True, _nrt=True, nogil=True)
 """Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.

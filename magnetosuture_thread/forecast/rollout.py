@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted_without_gil
+from magnetosuture_thread.compiled import compiled, compiled_uncounted_without_gil, compiled_within
 from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
@@ -203,7 +203,7 @@ class RolloutRecord(NamedTuple):
         )
 
 
-@compiled_inner
+@compiled_within
 def divide_motion(model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float) -> int:
     """Write where prescribed nodes begin and end; return into how many steps `ThreadPredictor` divides the motion."""
     pose, offset, nodes, begin, end = state.pose, model.offset, model.prescribed, buffers.ends[0], buffers.ends[1]
@@ -217,7 +217,7 @@ def divide_motion(model: RolloutModel, buffers: RolloutBuffers, state: RolloutSt
     return int(min(float(model.max_substeps), math.ceil(wanted - 1e-9)))
 
 
-@compiled_inner
+@compiled_within
 def move_lead(buffers: RolloutBuffers, pose: Vector, part: float) -> None:
     """Write prescribed nodes and heading at a part of the way from the needle's pose before the step to a pose."""
     begin, end, ends, before = buffers.ends[0], buffers.ends[1], buffers.ends[2], buffers.pose
@@ -229,7 +229,7 @@ def move_lead(buffers: RolloutBuffers, pose: Vector, part: float) -> None:
     before[4], before[5] = (x / size, y / size) if size > 1e-6 else (pose[2], pose[3])
 
 
-@compiled_inner
+@compiled_within
 def take_step(motion: Table, unit: float, duration: float, state: RolloutState) -> None:
     """Take positions and velocities over from a step of the thread."""
     for i in range(len(state.positions)):
@@ -239,7 +239,7 @@ def take_step(motion: Table, unit: float, duration: float, state: RolloutState) 
     state.last[2] = duration
 
 
-@compiled_inner
+@compiled_within
 def record_margins(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -291,7 +291,7 @@ def record_margins(
     return True
 
 
-@compiled_inner
+@compiled_within
 def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) -> float:
     """Return the factor on the needle's speed of the friction law at an instant."""
     count, fastest = 0, 0.0
@@ -302,7 +302,7 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
     return float(model.friction.beta**count) if count > 0 and fastest > model.friction.stuck_speed else 1.0
 
 
-@compiled_inner
+@compiled_within
 def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded: float, pull: Vector) -> None:
     """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
 
@@ -332,7 +332,7 @@ def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded
         added[k] = max(-limit, min(limit, added[k]))
 
 
-@compiled_inner
+@compiled_within
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:

@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.barrier import Barrier
-from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
@@ -141,7 +141,7 @@ def copy_points(given: Points, written: Points) -> None:
             written[i, a] = given[i, a]
 
 
-@compiled_inner
+@compiled_within
 def assemble_step(
     solves: int, model: StepModel, buffers: RodBuffers, given: StepInput, elsewhere: float, last_contacts: int
 ) -> tuple[int, float, bool]:
@@ -177,7 +177,7 @@ def assemble_step(
     return contacts, off if solves > 0 else np.inf, rubs
 
 
-@compiled_inner
+@compiled_within
 def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
@@ -232,7 +232,7 @@ def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> Non
     _taut(program, about, start, interval)
 
 
-@compiled_inner
+@compiled_within
 def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
@@ -285,7 +285,7 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask
     return strain
 
 
-@compiled_inner
+@compiled_within
 def init_step(buffers: RodBuffers, given: StepInput, unit: float) -> None:
     """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
@@ -371,14 +371,20 @@ def solve_step(
     # Numbers of a type of their own: a function is compiled again for each number that is written out.
     first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
     last_off, contacts, code, u = np.inf, unknown, UNSOLVED, buffers.motion[VELOCITIES]
+    off, rubs, halved = np.inf, False, False
     while True:
-        contacts, off, rubs = assemble_step(solves, model, buffers, given, elsewhere, contacts)
-        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
-            # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
-            for i in range(len(about)):
-                for a in range(about.shape[1]):
-                    about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
-            contacts, _, _ = assemble_step(first, model, buffers, given, elsewhere, unknown)
+        begun, before = (first, unknown) if halved else (solves, contacts)
+        contacts, found_off, found_rubs = assemble_step(begun, model, buffers, given, elsewhere, before)
+        if not halved:
+            off, rubs = found_off, found_rubs
+            if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
+                # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
+                for i in range(len(about)):
+                    for a in range(about.shape[1]):
+                        about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+                halved = True
+                continue
+        halved = False
         last_off = off
         copy_points(about, last_about)
         if contacts < 0:
