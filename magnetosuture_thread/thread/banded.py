@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     SPAN,
@@ -51,7 +51,7 @@ from magnetosuture_thread.thread.program import (
 Axes = tuple[int, ...]
 
 
-@compiled_uncounted
+@compiled_within
 def assemble_matrix(axes: Axes, program: ChainProgram, weights: Vector, active: Mask, band: Table) -> None:
     """Write the lower band of P + sum w a a': band[j, k] is the entry of row j + k and column j."""
     d, width = len(axes), SPAN * len(axes)
@@ -82,7 +82,7 @@ def assemble_matrix(axes: Axes, program: ChainProgram, weights: Vector, active: 
                 band[j, 0] = 1.0
 
 
-@compiled_uncounted
+@compiled_within
 def factorise(axes: Axes, band: Table) -> bool:
     """Replace the band by its factors L D L', the inverse of D in the first column."""
     width = SPAN * len(axes)
@@ -293,7 +293,7 @@ def update(
     return changes, gap
 
 
-@compiled_inner
+@compiled_within
 def search(
     program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
 ) -> float:
@@ -329,7 +329,7 @@ def search(
     return part
 
 
-@compiled_uncounted
+@compiled_within
 def solve_positive_definite(matrix: Table, x: Vector) -> bool:
     """Solve a small dense system in place by Cholesky's factor, written over the matrix; return whether there is one.
 
@@ -402,7 +402,7 @@ def _copy(given: Vector, factor: float, count: int, written: Vector) -> None:
         written[k] = factor * given[k]
 
 
-@compiled_inner
+@compiled_within
 def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> None:
     """Write weights, proximal centres and the rows that are active at the guess."""
     vectors, active, unknowns = buffers.vectors, buffers.active, program.linear.size

@@ -21,7 +21,7 @@ import math
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
@@ -180,7 +180,7 @@ def stays_clear(
     return found >= 0
 
 
-@compiled_uncounted
+@compiled_within
 def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
     """Keep what contacts push nodes and segments with, and their forces with those of friction.
 
@@ -210,7 +210,7 @@ def knows_friction(friction: Vector) -> bool:
     return largest > 0.0
 
 
-@compiled_uncounted
+@compiled_within
 def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, interval: float) -> tuple[int, float]:
     """Write the rows of friction of what shapes pushed in the last solve and is in contact with them now.
 
@@ -274,7 +274,7 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
     return written, change / greatest if greatest > 0.0 else 0.0
 
 
-@compiled_uncounted
+@compiled_within
 def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, friction: Vector) -> None:
     """Keep the normal forces of a solve, by place and shape, and what friction there was.
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
@@ -193,7 +193,7 @@ def bending_gradient(
             gradient[i + 1, a] += moment[i, a]
 
 
-@compiled_uncounted
+@compiled_within
 def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> None:
     """Take the rest curvature at a node from its deviation: in the plane to the left, in space as it bends."""
     dimension = positions.shape[1]

@@ -553,7 +553,7 @@ class RodFormulation(Formulation):
             before = self.warm_start()
         while True:
             done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
-            worst, solves = Residuals(*map(max, worst, done.residuals)), done.solves
+            worst, solves = _worse(worst, done.residuals), done.solves
             status = status if status != SOLVED else banded.STATUS[done.status]
             if done.code == NO_ROOM:
                 self._refuse_contacts()
@@ -580,7 +580,7 @@ class RodFormulation(Formulation):
                     buffers.tail_load[:] += added.force(pushes, positions.shape)[0]
                 added = self._linearised(interval)
                 off = added.off
-            worst, solves = Residuals(*map(max, worst, solution.residuals)), solves + 1
+            worst, solves = _worse(worst, solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
         about, before_step = buffers.motion[ABOUT], buffers.motion[BEFORE]
@@ -637,3 +637,8 @@ class RodFormulation(Formulation):
     def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
         """Return connectivity and compression; see `Formulation`."""
         return [Connectivity(self._thread.segment_length), Compression(self.rest_lengths(positions, heading))]
+
+
+def _worse(one: tuple[float, float, float], other: tuple[float, float, float]) -> Residuals:
+    """Return the larger residual of each kind."""
+    return Residuals(*(max(pair) for pair in zip(one, other, strict=True)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.distances import (
     EDGE_WIDTH,
@@ -46,7 +46,7 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
     return radius, -1.0, 0.0
 
 
-@compiled_inline
+@compiled_within
 def _ball_contact(x: float, y: float, z: float, s: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
     disc = data.discs[s]
@@ -58,7 +58,7 @@ def _ball_contact(x: float, y: float, z: float, s: int, data: WorkspaceData, cou
     return add_row(count, count, length - disc[2], direction, rows)
 
 
-@compiled_uncounted
+@compiled_within
 def _polygon_contacts(x: float, y: float, polygon: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the rows of a polygon at one point; return the new count, -1 when they are too many."""
     box, reach = data.boxes[polygon], data.reach
@@ -172,7 +172,9 @@ class Workspace:
             expected = f"one for each of {len(self.shapes)} shapes"
             raise ConfigurationError("workspace.friction", f"{len(self.friction)} values", expected)
         if dimension != 2 and max(wall_friction, *self.friction, 0.0) > 0.0:
-            raise ConfigurationError("workspace.friction", friction, "0 in space: friction is of the plane")
+            raise ConfigurationError(
+                "workspace.friction", (wall_friction, *self.friction), "0 in space: friction is of the plane"
+            )
         self.data = pack_obstacles(self.shapes, wall_radius, reach, (wall_friction, *self.friction))
 
     def near(self, points: Points) -> Contacts:
@@ -260,7 +262,7 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
     return min(lowest, best)
 
 
-@compiled_uncounted
+@compiled_within
 def _from_polygon(
     ax: float, ay: float, bx: float, by: float, signed: float, polygon: int, data: WorkspaceData
 ) -> float:
