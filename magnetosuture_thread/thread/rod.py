@@ -454,23 +454,9 @@ class RodFormulation(Formulation):
         barriers: Sequence[Barrier] = (),
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
-        medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
         self._buffers = RodBuffers.of(self._program, self.dimension)
-        self.rod = RodProperties(
-            clamped,
-            thread.segment_length,
-            self._radius,
-            thread.bending_stiffness,
-            medium.drag_across,
-            medium.drag_along,
-            medium.mass_per_length,
-            medium.bending_damping,
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, clamped),
-            self._vector("flow", medium.flow),
-        )
+        self._bands = mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED)
+        self.rod = self.rod_of(thread)
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
@@ -508,12 +494,20 @@ class RodFormulation(Formulation):
     def rod_of(self, thread: Thread) -> RodProperties:
         """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
         medium = thread.medium
-        return self.rod._replace(
-            bending_stiffness=thread.bending_stiffness,
-            drag_across=medium.drag_across,
-            drag_along=medium.drag_along,
-            rest_angles=np.ascontiguousarray(thread.rest_angles),
-            flow=self._vector("flow", medium.flow),
+        return RodProperties(
+            thread.attachment is Attachment.CLAMPED,
+            thread.segment_length,
+            self._radius,
+            thread.bending_stiffness,
+            medium.drag_across,
+            medium.drag_along,
+            medium.mass_per_length,
+            medium.bending_damping,
+            self._vector("gravity", medium.gravity),
+            np.ascontiguousarray(thread.rest_angles),
+            mechanics.end_corrected_weights(thread.segments),
+            self._bands,
+            self._vector("flow", medium.flow),
         )
 
     def _vector(self, name: str, values: tuple[float, ...]) -> Vector:

@@ -188,11 +188,6 @@ class AddedBarriers:
         """Return whether there are any."""
         return bool(self._barriers)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the barriers, in their order."""
-        return tuple(barrier.name for barrier in self._barriers)
-
     def rows(self, positions: Points) -> list[BarrierRows]:
         """Return the rows of each barrier at positions of shape (n + 1, d) [m]."""
         return [barrier.rows(positions) for barrier in self._barriers]

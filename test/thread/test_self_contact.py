@@ -96,9 +96,9 @@ def test_no_random_motion_takes_a_thread_through_itself(seed: int, steps: int):
 
 
 def test_the_depth_decides_where_the_scene_says_nothing():
-    barriers = [SelfContact.name in predictor_of(None, depth=depth).formulation.added.names for depth in (1e-4, 2e-4)]
-    assert barriers == [True, False]
-    assert SelfContact.name not in predictor_of(False, depth=1e-5).formulation.added.names
+    assert predictor_of(None, depth=1e-4).formulation.touches_itself
+    assert not predictor_of(None, depth=2e-4).formulation.touches_itself
+    assert not predictor_of(False, depth=1e-5).formulation.touches_itself
 
 
 def test_a_thread_that_starts_across_itself_is_refused_where_it_may_not():
