@@ -1,4 +1,4 @@
-"""The decorator of all compiled functions, and their cache."""
+"""The decorators of compiled functions, and their cache."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numba
 from numba.core import event
@@ -21,62 +21,63 @@ _IMPORT = re.compile(rb"^\s*(?:from|import) magnetosuture_thread\.([\w.]+)", re.
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-# Said of every function, as numba takes it over from whatever calls one first where it is not said.
-# Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
-_COUNTED: dict[str, Any] = {"_nrt": True, "no_cfunc_wrapper": True}
-_UNCOUNTED: dict[str, Any] = {"_nrt": False, "no_cfunc_wrapper": True}
-_INNER: dict[str, Any] = {**_UNCOUNTED, "no_cpython_wrapper": True}
 _EVENTS = cast(Any, event)  # without types
 _COMPILATIONS = _EVENTS.RecordingListener()
 _EVENTS.register("numba:compile", _COMPILATIONS)
 
 
-def compiled(function: _Function) -> _Function:
-    """Compile a function with numba at its first call, with numpy's rules for division by zero.
+class _Decorator(Protocol):
+    def __call__(self, function: _Function, /) -> _Function: ...
 
-    The result is cached beside the source file, so that only the first start of a node on a machine compiles.
+
+def _decorator(**options: Any) -> _Decorator:
+    """Return numba's decorator with numpy's rules for division by zero and, but for what is inlined, a cache.
+
+    Options are said of every function, as numba takes them over from whatever calls one first where they are not.
+    Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
     """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_COUNTED)(function))
+    return cast(_Decorator, numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options))
 
 
-def compiled_inline(function: _Function) -> _Function:
-    """Compile a function as `compiled` does, into each function that calls it, without counting references to arrays.
+compiled = _decorator(cache=True, _nrt=True)
+"""Compile a function at its first call.
 
-    For small functions that kernels call with tuples of arrays, a thousand times a step, and that make no arrays: each
-    array of a tuple is counted twice a call, by atomic operations, which took six times as long as the contacts that
-    were looked for. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
-    """
-    return cast(_Function, numba.njit(error_model="numpy", forceinline=True, **_UNCOUNTED)(function))
+The result is cached beside the source file, so that only the first start of a node on a machine compiles.
+"""
 
+compiled_inline = _decorator(forceinline=True, _nrt=False)
+"""Compile a function into each function that calls it, without counting references to arrays.
 
-def compiled_uncounted(function: _Function) -> _Function:
-    """Compile a function as `compiled` does, without counting references to arrays; see `compiled_inline`.
+For small functions that kernels call with tuples of arrays, a thousand times a step, and that make no arrays: each
+array of a tuple is counted twice a call, by atomic operations, which took six times as long as the contacts that
+were looked for. numba does not document `_nrt`; one that has it no longer would refuse it by its name.
+"""
 
-    For kernels of which a step calls dozens with tuples of arrays. They may neither make arrays, which numba refuses,
-    nor return any, whose references nobody would have counted.
-    """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_UNCOUNTED)(function))
+compiled_uncounted = _decorator(cache=True, _nrt=False)
+"""Compile a function as `compiled` does, without counting references to arrays; see `compiled_inline`.
 
+For kernels of which a step calls dozens with tuples of arrays. They may neither make arrays, which numba refuses,
+nor return any, whose references nobody would have counted.
+"""
 
-def compiled_inner(function: _Function) -> _Function:
-    """Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash.
+compiled_inner = _decorator(cache=True, _nrt=False, no_cpython_wrapper=True)
+"""Compile a function as `compiled_uncounted` does, for compiled code alone: to call it from Python is a crash."""
 
-    Without an entry for Python, which takes apart each array of a tuple, a kernel compiles several times as fast.
-    """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", **_INNER)(function))
+compiled_within = _decorator(inline="always", _nrt=False)
+"""Compile a function as a part of the one kernel that calls it, without counting references to arrays.
 
+What is compiled apart is compiled once by itself, and then again within each kernel that leads to it. For a function
+with one caller; the same done for one with several would compile it in each.
+"""
 
-def compiled_without_gil(function: _Function) -> _Function:
-    """Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.
+compiled_without_gil = _decorator(cache=True, _nrt=True, nogil=True)
+"""Compile a function as `compiled` does, to run without Python's lock: several threads then run it at once.
 
-    For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
-    """
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_COUNTED)(function))
+For functions that are called from Python, write into memory of their own thread only, and take milliseconds.
+"""
 
-
-def compiled_uncounted_without_gil(function: _Function) -> _Function:
-    """Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
-    return cast(_Function, numba.njit(cache=True, error_model="numpy", nogil=True, **_UNCOUNTED)(function))
+compiled_uncounted_without_gil = _decorator(cache=True, _nrt=False, nogil=True)
+"""Compile a function as `compiled_uncounted` does, to run without Python's lock; see `compiled_without_gil`."""
 
 
 def compilations() -> int:

@@ -33,7 +33,7 @@ from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, program_of
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE, StepBuffers, compiled_residuals, program_of
 from magnetosuture_thread.thread.rod import STRAIN_TOLERANCE, RodFormulation, segment_rows
 from magnetosuture_thread.thread.solvers import BandedSolver
 
@@ -343,8 +343,9 @@ def correct(
         prior_information(prior, scale, rod.clamped, work.normals, buffers)
         rows = row + contacts
         u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
-        _, _, residuals = banded.solve_and_check(AXES, program_of(buffers, known, rows), u, multipliers, work.solver)
-        solves, largest = solves + 1, max(residuals)
+        program = program_of(buffers, known, rows)
+        banded.solve(program, u, multipliers, work.solver)
+        solves, largest = solves + 1, max(compiled_residuals(program, u, multipliers))
         if not largest < np.inf:
             return FAILED, solves, off, largest, scale
         moved[:], about[:] = u, start + u

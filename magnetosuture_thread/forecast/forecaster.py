@@ -28,7 +28,7 @@ from magnetosuture_thread.forecast.rollout import (
     roll_out,
 )
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
-from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.scene import Scene
@@ -36,7 +36,7 @@ from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
 from magnetosuture_thread.thread.predictor import MAX_STEP_LENGTH, ThreadPredictor
-from magnetosuture_thread.thread.program import ContactBuffers
+from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import WarmStart
@@ -499,7 +499,7 @@ class ThreadForecaster:
         return RolloutBuffers(
             step=step,
             solver=BandedSolver().buffers(segments + 1, 2, len(step.program.first)),
-            contacts=ContactBuffers.of(segments + 1, 2, len(self.scene.shapes)),
+            contacts=Contacts.room((CONTACTS_PER_NODE + 2 * len(self.scene.shapes)) * (segments + 1), 2),
             ends=np.zeros((3, prescribed, 2)),
             pose=np.zeros(6),
             tension=np.zeros(segments),

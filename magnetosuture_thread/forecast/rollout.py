@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted_without_gil
-from magnetosuture_thread.geometry.obstacles import WALL, WorkspaceData, find_contacts
+from magnetosuture_thread.compiled import compiled, compiled_uncounted_without_gil, compiled_within
+from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
@@ -25,7 +25,6 @@ from magnetosuture_thread.thread.forces import write_forces
 from magnetosuture_thread.thread.program import (
     ABOUT,
     BEFORE,
-    ContactBuffers,
     Indices,
     Mask,
     RodBuffers,
@@ -143,7 +142,7 @@ class RolloutBuffers(NamedTuple):
 
     step: RodBuffers
     solver: SolverBuffers
-    contacts: ContactBuffers
+    contacts: Contacts
     ends: Table
     pose: Vector
     tension: Vector
@@ -204,19 +203,10 @@ class RolloutRecord(NamedTuple):
         )
 
 
-@compiled_inner
-def follow_needle(
-    model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float
-) -> tuple[int, bool]:
-    """Let the thread follow the needle from one pose, that of the buffers, to that of the state.
-
-    The interval is divided as `ThreadPredictor.step` divides it.
-
-    Returns:
-        `ENDED`, or how far `solve_step` got; and whether the barriers themselves hold.
-    """
-    pose, offset, nodes, before, rod = state.pose, model.offset, model.prescribed, buffers.pose, model.step.rod
-    begin, end, ends = buffers.ends[0], buffers.ends[1], buffers.ends[2]
+@compiled_within
+def divide_motion(model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, interval: float) -> int:
+    """Write where prescribed nodes begin and end; return into how many steps `ThreadPredictor` divides the motion."""
+    pose, offset, nodes, begin, end = state.pose, model.offset, model.prescribed, buffers.ends[0], buffers.ends[1]
     for k in range(len(nodes)):
         for a in range(2):
             begin[k, a] = end[k, a] = state.positions[nodes[k], a]
@@ -224,31 +214,32 @@ def follow_needle(
     end[0, 1] = pose[1] + offset[0] * pose[3] + offset[1] * pose[2]
     way = math.hypot(end[0, 0] - begin[0, 0], end[0, 1] - begin[0, 1])
     wanted = max(interval / model.max_step, way / model.max_way, 1.0)
-    substeps = int(min(float(model.max_substeps), math.ceil(wanted - 1e-9)))
-    converged, step, duration = True, buffers.step, interval / substeps
-    for index in range(1, substeps + 1):
-        part = index / substeps
-        for k in range(len(nodes)):
-            for a in range(2):
-                ends[k, a] = begin[k, a] + part * (end[k, a] - begin[k, a])
-        x, y = (1.0 - part) * before[2] + part * pose[2], (1.0 - part) * before[3] + part * pose[3]
-        size = math.sqrt(x * x + y * y)
-        before[4], before[5] = (x / size, y / size) if size > 1e-6 else (pose[2], pose[3])
-        given = StepInput(state.positions, state.velocities, nodes, ends, before[4:], duration, state.last[2])
-        done = solve_step(model.step, step, buffers.solver, given, np.int64(0), 0.0)
-        if done.code != ENDED:
-            return done.code, False
-        for i in range(len(state.positions)):
-            for a in range(2):
-                moved = step.motion[ABOUT, i, a] - step.motion[BEFORE, i, a]
-                state.positions[i, a] = step.motion[ABOUT, i, a] * rod.unit
-                state.velocities[i, a] = moved * (rod.unit / duration)
-        state.last[2] = duration
-        converged = converged and done.off <= 1.0
-    return ENDED, converged
+    return int(min(float(model.max_substeps), math.ceil(wanted - 1e-9)))
 
 
-@compiled_inner
+@compiled_within
+def move_lead(buffers: RolloutBuffers, pose: Vector, part: float) -> None:
+    """Write prescribed nodes and heading at a part of the way from the needle's pose before the step to a pose."""
+    begin, end, ends, before = buffers.ends[0], buffers.ends[1], buffers.ends[2], buffers.pose
+    for k in range(len(begin)):
+        for a in range(2):
+            ends[k, a] = begin[k, a] + part * (end[k, a] - begin[k, a])
+    x, y = (1.0 - part) * before[2] + part * pose[2], (1.0 - part) * before[3] + part * pose[3]
+    size = math.sqrt(x * x + y * y)
+    before[4], before[5] = (x / size, y / size) if size > 1e-6 else (pose[2], pose[3])
+
+
+@compiled_within
+def take_step(motion: Table, unit: float, duration: float, state: RolloutState) -> None:
+    """Take positions and velocities over from a step of the thread."""
+    for i in range(len(state.positions)):
+        for a in range(2):
+            state.positions[i, a] = motion[ABOUT, i, a] * unit
+            state.velocities[i, a] = (motion[ABOUT, i, a] - motion[BEFORE, i, a]) * (unit / duration)
+    state.last[2] = duration
+
+
+@compiled_within
 def record_margins(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -263,7 +254,7 @@ def record_margins(
     nodes, count = len(positions), 0
     margin, node, shape = record.margin[k], record.node[k], record.shape[k]
     if len(model.around.order) > 0 or model.around.wall_radius < np.inf:
-        count = find_contacts(positions, model.around, to.node, to.obstacle, to.distance, to.normal, to.nearest)
+        count = find_contacts(positions, model.around, to)
     if count < 0:
         return False
     close = buffers.close
@@ -300,7 +291,7 @@ def record_margins(
     return True
 
 
-@compiled_inner
+@compiled_within
 def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) -> float:
     """Return the factor on the needle's speed of the friction law at an instant."""
     count, fastest = 0, 0.0
@@ -311,7 +302,7 @@ def friction_slowdown(model: RolloutModel, state: RolloutState, rubbed: Mask) ->
     return float(model.friction.beta**count) if count > 0 and fastest > model.friction.stuck_speed else 1.0
 
 
-@compiled_inner
+@compiled_within
 def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded: float, pull: Vector) -> None:
     """Approach the motion that the thread's pull adds to that of a tip velocity [m/s]; see `NeedleDrag`.
 
@@ -341,7 +332,7 @@ def add_pull(model: RolloutModel, state: RolloutState, velocity: Pair, commanded
         added[k] = max(-limit, min(limit, added[k]))
 
 
-@compiled_inner
+@compiled_within
 def record_thread(
     model: RolloutModel, buffers: RolloutBuffers, state: RolloutState, k: int, record: RolloutRecord
 ) -> bool:
@@ -428,9 +419,25 @@ def roll_out(
             add_pull(model, state, (x, y), commanded, record.pull[k])
         moved_needle(model.needle, pose, (x, y), state.added, interval)
         last[0], last[1], limited = x, y, True
-        code, record.converged[k + 1] = follow_needle(model, buffers, state, interval)
-        if code != ENDED:
-            return code, k
+        substeps = divide_motion(model, buffers, state, interval)
+        duration = interval / substeps
+        for index in range(1, substeps + 1):
+            move_lead(buffers, pose, index / substeps)
+            given = StepInput(
+                state.positions,
+                state.velocities,
+                model.prescribed,
+                buffers.ends[2],
+                buffers.pose[4:],
+                duration,
+                last[2],
+            )
+            done = solve_step(model.step, buffers.step, buffers.solver, given, np.int64(0), 0.0)
+            if done.code != ENDED:
+                record.converged[k + 1] = False
+                return done.code, k
+            take_step(buffers.step.motion, model.step.rod.unit, duration, state)
+            record.converged[k + 1] = record.converged[k + 1] and done.off <= 1.0
         for i in range(len(state.positions)):
             for a in range(2):
                 moved = (state.positions[i, a] - record.vertices[k, i, a]) / interval

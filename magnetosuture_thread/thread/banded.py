@@ -36,23 +36,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     SPAN,
     ChainProgram,
     Mask,
-    Residuals,
     Solution,
     Table,
     Vector,
-    compiled_residuals,
+    residuals_of,
 )
 
 Axes = tuple[int, ...]
 
 
-@compiled_uncounted
+@compiled_within
 def assemble_matrix(axes: Axes, program: ChainProgram, weights: Vector, active: Mask, band: Table) -> None:
     """Write the lower band of P + sum w a a': band[j, k] is the entry of row j + k and column j."""
     d, width = len(axes), SPAN * len(axes)
@@ -83,7 +82,7 @@ def assemble_matrix(axes: Axes, program: ChainProgram, weights: Vector, active: 
                 band[j, 0] = 1.0
 
 
-@compiled_uncounted
+@compiled_within
 def factorise(axes: Axes, band: Table) -> bool:
     """Replace the band by its factors L D L', the inverse of D in the first column."""
     width = SPAN * len(axes)
@@ -139,6 +138,7 @@ class SolverBuffers(NamedTuple):
     """What the compiled solver works with; kept from step to step, so that no step pays for memory.
 
     Attributes:
+        axes: 0 to d - 1.
         tolerance: scaled residual at which it stops.
         iterations: the most Newton steps it may take.
         band: of the matrix, shape (m d + 3 d, 3 d + 1).
@@ -146,6 +146,7 @@ class SolverBuffers(NamedTuple):
         active: the rows whose multipliers change with the velocities.
     """
 
+    axes: Axes
     tolerance: float
     iterations: int
     band: Table
@@ -164,22 +165,24 @@ class BandedSolver:
     name = "banded"
 
     def __init__(self, tolerance: float = 1e-8, iterations: int = 60) -> None:
-        self._buffers = SolverBuffers(tolerance, iterations, np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_))
+        empty = np.empty((0, 0)), np.empty((7, 0)), np.empty(0, np.bool_)
+        self._buffers = SolverBuffers((), tolerance, iterations, *empty)
 
     def solve(self, program: ChainProgram, velocities: Points, multipliers: Vector) -> Solution:
         """Solve one program, started from a guess; see `Solver`."""
         nodes, dimension = program.linear.shape
         buffers = self.buffers(nodes, dimension, len(program.lower))
-        u, found, axes = velocities.copy(), multipliers.copy(), (0, 1, 2)[:dimension]
-        status, iterations, residuals = solve_and_check(axes, program, u, found, buffers)
-        return Solution(u, found, self.name, STATUS[status], iterations, Residuals(*residuals))
+        u, found = velocities.copy(), multipliers.copy()
+        status, iterations = solve(program, u, found, buffers)
+        return Solution(u, found, self.name, STATUS[status], iterations, residuals_of(program, u, found))
 
     def buffers(self, nodes: int, dimension: int, rows: int) -> SolverBuffers:
         """Return what the compiled solver needs for programs of at most so many rows."""
         width = SPAN * dimension
         unknowns = nodes * dimension + width
         if self._buffers.band.shape != (unknowns, width + 1):
-            self._buffers = self._buffers._replace(band=np.empty((unknowns, width + 1)))
+            axes = (0, 1, 2)[:dimension]
+            self._buffers = self._buffers._replace(axes=axes, band=np.empty((unknowns, width + 1)))
         wanted = max(unknowns, rows)
         if self._buffers.vectors.shape[1] < wanted:
             vectors, active = np.empty((7, wanted)), np.empty(wanted, dtype=np.bool_)
@@ -290,7 +293,7 @@ def update(
     return changes, gap
 
 
-@compiled_inner
+@compiled_within
 def search(
     program: ChainProgram, before: Vector, after: Vector, centre: Vector, weights: Vector, start: float, end: float
 ) -> float:
@@ -326,7 +329,7 @@ def search(
     return part
 
 
-@compiled_uncounted
+@compiled_within
 def solve_positive_definite(matrix: Table, x: Vector) -> bool:
     """Solve a small dense system in place by Cholesky's factor, written over the matrix; return whether there is one.
 
@@ -399,7 +402,7 @@ def _copy(given: Vector, factor: float, count: int, written: Vector) -> None:
         written[k] = factor * given[k]
 
 
-@compiled_inner
+@compiled_within
 def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> None:
     """Write weights, proximal centres and the rows that are active at the guess."""
     vectors, active, unknowns = buffers.vectors, buffers.active, program.linear.size
@@ -426,16 +429,10 @@ def begin(axes: Axes, program: ChainProgram, u: Points, multipliers: Vector, buf
         active[r] = is_active(limit[r], multipliers[r])
 
 
-@compiled_inner
-def solve(
-    axes: Axes,
-    program: ChainProgram,
-    u: Points,
-    multipliers: Vector,
-    buffers: SolverBuffers,
-) -> tuple[int, int]:
+@compiled_uncounted
+def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: SolverBuffers) -> tuple[int, int]:
     """Improve u and the multipliers in place; return status and iterations."""
-    tolerance, iterations, band, vectors, active = buffers
+    axes, tolerance, iterations, band, vectors, active = buffers
     d, width, rows, unknowns = len(axes), SPAN * len(axes), len(program.lower), program.linear.size
     step, force, smooth = vectors[0, : len(band)], vectors[1, :unknowns], vectors[2, :unknowns]
     weights, centre, image, before = vectors[3], vectors[4], vectors[5], vectors[6]
@@ -484,16 +481,3 @@ def solve(
             changes += turned
             forces(axes, program, smooth, multipliers, force)
     return LIMIT, iterations
-
-
-@compiled
-def solve_and_check(
-    axes: Axes,
-    program: ChainProgram,
-    u: Points,
-    multipliers: Vector,
-    buffers: SolverBuffers,
-) -> tuple[int, int, tuple[float, float, float]]:
-    """Solve, and compute the residuals by independent code; one call into compiled code is cheaper than two."""
-    status, taken = solve(axes, program, u, multipliers, buffers)
-    return status, taken, compiled_residuals(program, u, multipliers)

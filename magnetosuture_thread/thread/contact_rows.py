@@ -21,9 +21,9 @@ import math
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
+from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     BEFORE,
@@ -31,7 +31,6 @@ from magnetosuture_thread.thread.program import (
     NO_SHAPE,
     SPAN,
     START,
-    ContactBuffers,
     GripBuffers,
     Mask,
     RodBuffers,
@@ -42,16 +41,6 @@ from magnetosuture_thread.thread.program import (
 DEPTH_TOLERANCE = 1e-7  # m; a node deeper in an obstacle or the wall than is asked for is not where its barrier holds
 CONTACT_COMPLIANCE = 1e-7  # compliance of a contact that has to push a node out
 FRICTION_COMPLIANCE = 1e-7  # as of a segment: far below what can be measured, and exact at once for the solver
-
-
-@compiled_inline
-def _chord_part(contacts: ContactBuffers) -> ChordContacts:
-    return ChordContacts(contacts.node, contacts.obstacle, contacts.distance, contacts.normal, contacts.place)
-
-
-@compiled_inline
-def _node_contacts(points: Points, workspace: WorkspaceData, to: ContactBuffers) -> int:
-    return find_contacts(points, workspace, to.node, to.obstacle, to.distance, to.normal, to.nearest)
 
 
 @compiled_uncounted
@@ -88,28 +77,31 @@ def contact_rows(
         The number of rows, -1 if there is no room for them, and the greatest depth of a contact [m].
     """
     nodes, dimension = about.shape
-    points, minimum, contacts = buffers.work[0], buffers.work[1], buffers.contacts
+    points, minimum, contacts, clearances = buffers.work[0], buffers.work[1], buffers.contacts, buffers.clearance
+    # Fields of a large tuple are taken out of it once: to compile each access takes as long as the arithmetic.
+    node, obstacle, place = contacts.node, contacts.obstacle, contacts.place
+    distance, normal = contacts.distance, contacts.normal
+    gradient, lower, upper, push = buffers.gradient, buffers.lower, buffers.upper, buffers.push
     for i in range(nodes):
         minimum[i, 0] = minimum[i, 1] = np.inf
         for a in range(dimension):
             points[i, a] = about[i, a] * unit
-    found = _node_contacts(points, workspace, contacts)
-    buffers.clearance[:] = workspace.reach
+    found = find_contacts(points, workspace, contacts)
+    clearances[:] = workspace.reach
     for c in range(found):
-        contacts.place[c] = 0.0
-        buffers.clearance[contacts.node[c]] = min(buffers.clearance[contacts.node[c]], contacts.distance[c])
+        place[c] = 0.0
+        clearances[node[c]] = min(clearances[node[c]], distance[c])
     if found > 0 and chords:
-        to = _chord_part(contacts)
-        found = find_chord_contacts(points, workspace, unit, radius, buffers.clearance, found, to)
+        found = find_chord_contacts(points, workspace, unit, radius, clearances, found, contacts)
     if found < 0 or row + found > len(buffers.first):
         return -1, 0.0
     kept, depth = 0, 0.0
     for c in range(found):
-        i, s = contacts.node[c], contacts.place[c]
+        i, s = node[c], place[c]
         if known[i] and (s == 0.0 or known[i + 1]):
             continue
         kind = 0 if s == 0.0 else 1
-        clearance = contacts.distance[c] - radius
+        clearance = distance[c] - radius
         minimum[i, kind] = min(minimum[i, kind], clearance)
         depth = max(depth, -clearance)
         bound = -clearance / unit
@@ -117,26 +109,26 @@ def contact_rows(
         for k in range(SPAN):
             weight = 1.0 - s if begin + k == i else (s if begin + k == i + 1 else 0.0)
             for a in range(dimension):
-                buffers.gradient[here, k, a] = weight * contacts.normal[c, a]
-                bound -= buffers.gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
+                gradient[here, k, a] = weight * normal[c, a]
+                bound -= gradient[here, k, a] * (start[begin + k, a] - about[begin + k, a])
             if known[begin + k]:
-                buffers.gradient[here, k] = 0.0
+                gradient[here, k] = 0.0
         buffers.first[here] = begin
-        buffers.lower[here], buffers.upper[here] = bound / interval, np.inf
+        lower[here], upper[here] = bound / interval, np.inf
         # A node that has to be pushed out may be held in by something else, as a chord may by its ends, that lie on
         # both sides of a shape: then as far as it goes.
         buffers.compliance[here] = CONTACT_COMPLIANCE if bound > 0.0 or s > 0.0 else 0.0
         buffers.limit[here] = np.inf
-        contacts.node[kept], contacts.obstacle[kept], contacts.place[kept] = i, contacts.obstacle[c], s
-        contacts.distance[kept] = contacts.distance[c]
+        node[kept], obstacle[kept], place[kept] = i, obstacle[c], s
+        distance[kept] = distance[c]
         for a in range(dimension):
-            contacts.normal[kept, a] = contacts.normal[c, a]
+            normal[kept, a] = normal[c, a]
         kept += 1
     # What pushed a node or a chord pushes it again; of several corners beside a chord, the nearest one does.
     for c in range(kept):
-        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        pushes = contacts.distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
-        buffers.multipliers[row + c] = buffers.push[kind, i] if pushes else 0.0
+        kind, i = 0 if place[c] == 0.0 else 1, node[c]
+        pushes = distance[c] - radius <= max(minimum[i, kind], DEPTH_TOLERANCE)
+        buffers.multipliers[row + c] = push[kind, i] if pushes else 0.0
     return kept, depth
 
 
@@ -175,20 +167,20 @@ def stays_clear(
             square += (about[i, a] - before[i, a]) ** 2
         clearance[i] -= unit * math.sqrt(square)
         if not (clearance[i] >= minimum or known[i]):
-            found = _node_contacts(points[i : i + 1], workspace, to)
+            found = find_contacts(points[i : i + 1], workspace, to)
             clearance[i] = workspace.reach
             for c in range(found):
                 clearance[i] = min(clearance[i], to.distance[c])
             if found < 0 or not clearance[i] >= minimum:
                 return False
-    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), _chord_part(to))
+    found = find_chord_contacts(points, workspace, unit, radius, clearance, np.int64(0), to)
     for c in range(found):
         if to.distance[c] < minimum and not (known[to.node[c]] and known[to.node[c] + 1]):
             return False
     return found >= 0
 
 
-@compiled_uncounted
+@compiled_within
 def keep_pushes(buffers: RodBuffers, rows: int, row: int) -> None:
     """Keep what contacts push nodes and segments with, and their forces with those of friction.
 
@@ -218,7 +210,7 @@ def knows_friction(friction: Vector) -> bool:
     return largest > 0.0
 
 
-@compiled_uncounted
+@compiled_within
 def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, interval: float) -> tuple[int, float]:
     """Write the rows of friction of what shapes pushed in the last solve and is in contact with them now.
 
@@ -235,52 +227,54 @@ def friction_rows(rod: RodBuffers, row: int, count: int, friction: Vector, inter
     """
     buffers, grips, known, contacts = rod.program, rod.grips, rod.known, rod.program.contacts
     best, before, start = grips.contact, rod.motion[BEFORE], rod.motion[START]
+    shapes, forces, gradient, lower, upper = grips.shape, grips.force, buffers.gradient, buffers.lower, buffers.upper
+    node, obstacle, place, normal = contacts.node, contacts.obstacle, contacts.place, contacts.normal
     nodes = len(known)
     best[:] = -1
     for c in range(count):
-        kind, i = 0 if contacts.place[c] == 0.0 else 1, contacts.node[c]
-        slot = _slot_of(grips, kind, i, contacts.obstacle[c])
+        kind, i = 0 if place[c] == 0.0 else 1, node[c]
+        slot = _slot_of(grips, kind, i, obstacle[c])
         if slot >= 0:
-            force, other = grips.force[kind, i, slot], best[kind, i, slot]
-            push = contacts.normal[c, 0] * force[0] + contacts.normal[c, 1] * force[1]
-            least = contacts.normal[other, 0] * force[0] + contacts.normal[other, 1] * force[1] if other >= 0 else 0.0
+            force, other = forces[kind, i, slot], best[kind, i, slot]
+            push = normal[c, 0] * force[0] + normal[c, 1] * force[1]
+            least = normal[other, 0] * force[0] + normal[other, 1] * force[1] if other >= 0 else 0.0
             if push > least:
                 best[kind, i, slot] = c
     written, change, greatest = 0, 0.0, 0.0
     for kind in range(2):
         for i in range(nodes):
             for slot in range(GRIPS):
-                shape = grips.shape[kind, i, slot]
+                shape = shapes[kind, i, slot]
                 if shape == NO_SHAPE:
                     continue
-                grip, limit, c = grips.force[kind, i, slot], 0.0, best[kind, i, slot]
+                grip, limit, c = forces[kind, i, slot], 0.0, best[kind, i, slot]
                 if c >= 0:
                     limit = friction[shape + 1] * math.sqrt(grip[0] * grip[0] + grip[1] * grip[1])
                 change, greatest = max(change, abs(limit - grip[3])), max(greatest, limit, grip[3])
                 if limit == 0.0:
                     continue
                 at = count + written
-                if at >= len(contacts.node):
+                if at >= len(node):
                     return -1, 0.0
                 here, begin, moved = row + at, min(i, nodes - SPAN), 0.0
-                buffers.gradient[here] = 0.0
+                gradient[here] = 0.0
                 for k in range(i, i + kind + 1):
-                    share = 1.0 if kind == 0 else (1.0 - contacts.place[c] if k == i else contacts.place[c])
-                    x, y = -share * contacts.normal[c, 1], share * contacts.normal[c, 0]
+                    share = 1.0 if kind == 0 else (1.0 - place[c] if k == i else place[c])
+                    x, y = -share * normal[c, 1], share * normal[c, 0]
                     if known[k]:
                         moved += x * (start[k, 0] - before[k, 0]) + y * (start[k, 1] - before[k, 1])
                     else:
-                        buffers.gradient[here, k - begin, 0], buffers.gradient[here, k - begin, 1] = x, y
+                        gradient[here, k - begin, 0], gradient[here, k - begin, 1] = x, y
                 buffers.first[here] = begin
-                buffers.lower[here] = buffers.upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
+                lower[here] = upper[here] = FRICTION_COMPLIANCE * grip[2] - moved / interval
                 buffers.compliance[here], buffers.limit[here] = FRICTION_COMPLIANCE, limit
                 buffers.multipliers[here] = max(min(grip[2], limit), -limit)
-                contacts.node[at], contacts.obstacle[at], contacts.place[at] = i, shape, contacts.place[c]
+                node[at], obstacle[at], place[at] = i, shape, place[c]
                 written += 1
     return written, change / greatest if greatest > 0.0 else 0.0
 
 
-@compiled_uncounted
+@compiled_within
 def keep_grips(buffers: StepBuffers, grips: GripBuffers, rows: int, row: int, friction: Vector) -> None:
     """Keep the normal forces of a solve, by place and shape, and what friction there was.
 

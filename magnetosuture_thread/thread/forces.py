@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner
+from magnetosuture_thread.compiled import compiled, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.margins import FrictionState
@@ -70,7 +70,7 @@ class ThreadForces:
         return float(np.max(self.tension))
 
 
-@compiled_inner
+@compiled_within
 def keep_internal_forces(buffers: RodBuffers, rows: int, interval: float) -> None:
     """Keep what the segments push each node with, and what medium and contacts do at the needle's tail.
 

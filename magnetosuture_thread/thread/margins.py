@@ -105,11 +105,6 @@ class BarrierMargins:
         return float(self.clearance.min(initial=math.inf))
 
     @property
-    def minimum_bound(self) -> float:
-        """Least bound of all rows [m]; inf where the barrier has no rows."""
-        return float(self.bound.min(initial=math.inf))
-
-    @property
     def closest(self) -> int:
         """The row with the least clearance.
 
@@ -204,7 +199,7 @@ def _row(margins: BarrierMargins, row: int) -> BarrierMargins:
         margins.obstacle[part],
         margins.value[part],
         margins.clearance[part],
-        np.array([margins.minimum_bound]),
+        np.array([margins.bound.min(initial=math.inf)]),
     )
 
 

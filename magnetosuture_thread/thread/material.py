@@ -223,16 +223,6 @@ class Thread:
         )
 
 
-def direction_between(first: NDArray[np.float64], second: NDArray[np.float64], part: float) -> NDArray[np.float64]:
-    """Return the direction between two unit vectors; where they are opposite, the second."""
-    mixed = [(1.0 - part) * a + part * b for a, b in zip(first.tolist(), second.tolist(), strict=True)]
-    square = 0.0
-    for value in mixed:  # `hypot`, and `sum` from Python 3.12 on, round in another way than numpy
-        square += value * value
-    size = math.sqrt(square)
-    return np.array([value / size for value in mixed]) if size > 1e-6 else second
-
-
 def check_scene(thread: Thread, scene: Scene) -> None:
     """Refuse a scene that the segments of a thread do not resolve.
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end
@@ -118,17 +118,6 @@ def end_corrected_weights(segments: int) -> NDArray[np.float64]:
     return weights
 
 
-def rest_distances(rest_angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distance of the nodes before and after each inner node at rest, delta_i, shape (n - 1,).
-
-    delta_i = 2 cos(theta_i / 2)
-
-    Args:
-        rest_angles: theta_i, angle by which the thread at rest turns at each inner node, shape (n - 1,) [rad].
-    """
-    return np.asarray(2.0 * np.cos(0.5 * rest_angles))
-
-
 def bending_bands(segments: int, clamped: bool) -> NDArray[np.float64]:
     """Return the bands of the bending Hessian K, shape (4, n + 1): K[i, i + k] is at [k, i].
 
@@ -204,7 +193,7 @@ def bending_gradient(
             gradient[i + 1, a] += moment[i, a]
 
 
-@compiled_uncounted
+@compiled_within
 def _take_rest(positions: Points, i: int, turn: float, deviation: Points) -> None:
     """Take the rest curvature at a node from its deviation: in the plane to the left, in space as it bends."""
     dimension = positions.shape[1]

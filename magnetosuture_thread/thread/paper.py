@@ -39,7 +39,6 @@ from magnetosuture_thread.thread.barriers import (
 )
 from magnetosuture_thread.thread.contact_rows import DEPTH_TOLERANCE, contact_rows
 from magnetosuture_thread.thread.material import Thread
-from magnetosuture_thread.thread.mechanics import rest_distances
 from magnetosuture_thread.thread.program import SPAN, Mask, Solver, first_rows
 from magnetosuture_thread.thread.step import (
     AddedRows,
@@ -98,7 +97,7 @@ class PaperFormulation(Formulation):
         super().__init__(thread, workspace, solver, tolerance, barriers, 3 * thread.segments - 2)
         self._options = options or PaperOptions()
         self._wall_radius = (workspace.wall_radius - self._radius) / thread.segment_length
-        self._rest = rest_distances(thread.rest_angles)
+        self._rest = 2.0 * np.cos(0.5 * thread.rest_angles)  # delta_i of the nodes beside each inner node [D]
 
     def step(self, state: ThreadState, drive: PrescribedMotion, interval: float) -> StepResult:
         """Move the prescribed nodes and let the thread follow; see `Formulation`."""
@@ -113,7 +112,8 @@ class PaperFormulation(Formulation):
         start = moved if options.lead_ahead else before
         if state.interval == 0.0:
             self.forget()
-        self._write_objective(velocities, options)
+        buffers.blocks[:], buffers.couplings[:] = np.eye(self.dimension), 0.0  # P = I, q = -kappa v
+        buffers.linear[:] = -options.damping * velocities
         self._write_barriers(start, options)
         contacts, before_depth = self._write_obstacles(start, known, options.gain)
         added: AddedRows | None = None
@@ -135,11 +135,6 @@ class PaperFormulation(Formulation):
         if not converged:
             status = f"not converged, a node is {depth:.1e} m deep and {allowed:.1e} m are allowed; {status}"
         return StepResult(after, solution.solver, status, solution.residuals, 1, converged)
-
-    def _write_objective(self, velocities: Points, options: PaperOptions) -> None:
-        """Write P = I and q = -kappa v."""
-        self._program.blocks[:], self._program.couplings[:] = np.eye(self.dimension), 0.0
-        self._program.linear[:] = -options.damping * velocities
 
     def _write_barriers(self, start: Points, options: PaperOptions) -> None:
         """Write the rows of connectivity, enhanced connectivity and stiffness, with their slacks as compliances."""

@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_in
 from magnetosuture_thread.scene import Scene, find_collision
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import Margins
-from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene, direction_between
+from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene
 from magnetosuture_thread.thread.paper import PaperFormulation, PaperOptions
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, STARTED, NeedlePose, Prediction, check_pose
 from magnetosuture_thread.thread.program import SOLVED, Solver
@@ -326,7 +326,9 @@ class ThreadPredictor:
         substeps = min(self.options.max_substeps, math.ceil(wanted - 1e-9))
 
         def drive(part: float) -> PrescribedMotion:
-            heading = direction_between(last.heading, pose.heading, part)
+            mixed = (1.0 - part) * last.heading + part * pose.heading
+            size = math.hypot(*mixed.tolist())  # 0 between opposite headings
+            heading = mixed / size if size > 1e-6 else pose.heading
             return PrescribedMotion(nodes, begin + part * (end - begin), heading, last.stamp + part * interval)
 
         results = list[StepResult]()

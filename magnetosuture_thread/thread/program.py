@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.geometry.obstacles import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -77,33 +78,6 @@ def no_far_rows(dimension: int) -> tuple[Indices, Table]:
     return np.zeros((0, 1), np.int64), np.zeros((0, 1, dimension))
 
 
-class ContactBuffers(NamedTuple):
-    """Where contacts are written, as by `find_contacts`.
-
-    Attributes:
-        node: shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,) [m].
-        normal: shape (c, d).
-        nearest: shape (c,).
-        place: of a contact on the segment from its node on, 0 at the node itself, shape (c,).
-    """
-
-    node: Indices
-    obstacle: Indices
-    distance: Vector
-    normal: Points
-    nearest: Mask
-    place: Vector
-
-    @classmethod
-    def of(cls, nodes: int, dimension: int, shapes: int = 0) -> ContactBuffers:
-        """Return room for the contacts of a thread; more for one whose nodes may be near many shapes at once."""
-        count = (CONTACTS_PER_NODE + 2 * shapes) * nodes
-        (node, obstacle), (distance, place) = np.zeros((2, count), np.int64), np.zeros((2, count))
-        return cls(node, obstacle, distance, np.zeros((count, dimension)), np.zeros(count, np.bool_), place)
-
-
 class StepBuffers(NamedTuple):
     """Memory for the programs of a thread with n + 1 nodes, kept from step to step so that no step pays for it.
 
@@ -134,7 +108,7 @@ class StepBuffers(NamedTuple):
     multipliers: Vector
     chords: Vector
     work: Table
-    contacts: ContactBuffers
+    contacts: Contacts
     clearance: Vector
     push: Table
 
@@ -157,7 +131,7 @@ class StepBuffers(NamedTuple):
             multipliers,
             chords=np.zeros(nodes - 1),
             work=np.zeros((2, nodes, dimension)),
-            contacts=ContactBuffers.of(nodes, dimension),
+            contacts=Contacts.room(CONTACTS_PER_NODE * nodes, dimension),
             clearance=np.zeros(nodes),
             push=np.zeros((2, nodes)),
         )
@@ -275,10 +249,6 @@ class Residuals(NamedTuple):
         """The largest of the three."""
         return max(self)
 
-    def or_worse(self, other: Residuals) -> Residuals:
-        """Return the larger of each."""
-        return Residuals(max(self[0], other[0]), max(self[1], other[1]), max(self[2], other[2]))
-
 
 class Solution(NamedTuple):
     """What a solver found.
@@ -354,25 +324,27 @@ def _residuals(
 ) -> tuple[float, float, float]:
     """Return them, with memory for P u + q and for the sum of what rows pull with, 0; each of shape (m, d)."""
     nodes, dimension = velocities.shape
+    blocks, couplings, linear, known = program.blocks, program.couplings, program.linear, program.known
+    compliance, limit = program.compliance, program.limit
     largest = 1.0
     for i in range(nodes):
         for k in range(dimension):
             value = 0.0
             for j in range(dimension):
-                value += program.blocks[i, k, j] * velocities[i, j]
+                value += blocks[i, k, j] * velocities[i, j]
             for apart in range(1, SPAN + 1):
                 if i >= apart:
-                    value += program.couplings[apart - 1, i - apart] * velocities[i - apart, k]
+                    value += couplings[apart - 1, i - apart] * velocities[i - apart, k]
                 if i + apart < nodes:
-                    value += program.couplings[apart - 1, i] * velocities[i + apart, k]
-            largest = max(largest, abs(value), abs(program.linear[i, k]))
-            force[i, k] = value + program.linear[i, k]
+                    value += couplings[apart - 1, i] * velocities[i + apart, k]
+            largest = max(largest, abs(value), abs(linear[i, k]))
+            force[i, k] = value + linear[i, k]
     primal, complementarity, pushed, outside = 0.0, 0.0, 1.0, 0.0
     finite = True
     for r in range(len(program.lower)):
         multiplier, scale = multipliers[r], 1.0
         image = _pull(program, r, velocities, multiplier, pulled)
-        image += program.compliance[r] * multiplier
+        image += compliance[r] * multiplier
         scale = max(scale, abs(image))
         lower, upper = program.lower[r], program.upper[r]
         if np.isfinite(lower):
@@ -380,10 +352,10 @@ def _residuals(
         if np.isfinite(upper):
             scale = max(scale, abs(upper))
         gap = abs(image - lower) if multiplier > 0.0 else abs(image - upper)
-        if program.limit[r] < np.inf:
-            outside = max(outside, abs(multiplier) - program.limit[r])
+        if limit[r] < np.inf:
+            outside = max(outside, abs(multiplier) - limit[r])
             for miss, push in ((lower - image, multiplier), (image - upper, -multiplier)):
-                weight = program.limit[r] - push if miss > 0.0 else max(push, 0.0)
+                weight = limit[r] - push if miss > 0.0 else max(push, 0.0)
                 complementarity = max(complementarity, weight * min(abs(miss) / scale, 1.0))
             gap = 0.0
         else:
@@ -392,12 +364,12 @@ def _residuals(
         complementarity = max(complementarity, abs(multiplier) * (min(gap / scale, 1.0)))
         pushed = max(pushed, abs(multiplier))
         finite = finite and np.isfinite(image) and np.isfinite(multiplier)
-        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(program.limit[r]))
+        finite = finite and not (np.isnan(lower) or np.isnan(upper) or np.isnan(limit[r]))
     dual = 0.0
     for i in range(nodes):
         for k in range(dimension):
             finite = finite and np.isfinite(force[i, k])
-            if not program.known[i]:
+            if not known[i]:
                 largest = max(largest, abs(pulled[i, k]))
                 dual = max(dual, abs(force[i, k] - pulled[i, k]))
     if not finite:

@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.barrier import Barrier
-from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
@@ -69,6 +69,7 @@ from magnetosuture_thread.thread.program import (
     Solver,
     StepBuffers,
     Vector,
+    compiled_residuals,
     first_rows,
     program_view,
 )
@@ -96,7 +97,6 @@ class StepModel(NamedTuple):
     """The thread and what is around it, for compiled code.
 
     Attributes:
-        axes: 0 to d - 1.
         rod: the thread.
         workspace: obstacles and wall, with the reach of the program's rows [m].
         tolerance: the largest residual with which a solution is accepted.
@@ -104,7 +104,6 @@ class StepModel(NamedTuple):
         structured: whether the structured solver is to solve; if not, every solve is left to the caller.
     """
 
-    axes: banded.Axes
     rod: RodProperties
     workspace: WorkspaceData
     tolerance: float
@@ -142,7 +141,7 @@ def copy_points(given: Points, written: Points) -> None:
             written[i, a] = given[i, a]
 
 
-@compiled_inner
+@compiled_within
 def assemble_step(
     solves: int, model: StepModel, buffers: RodBuffers, given: StepInput, elsewhere: float, last_contacts: int
 ) -> tuple[int, float, bool]:
@@ -178,7 +177,7 @@ def assemble_step(
     return contacts, off if solves > 0 else np.inf, rubs
 
 
-@compiled_inner
+@compiled_within
 def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> None:
     """Write P and q, with r the bending stiffness over the unit of the metric and D^4.
 
@@ -233,7 +232,7 @@ def _objective(rod: RodProperties, buffers: RodBuffers, given: StepInput) -> Non
     _taut(program, about, start, interval)
 
 
-@compiled_inner
+@compiled_within
 def _taut(buffers: StepBuffers, about: Points, start: Points, interval: float) -> None:
     """Add the curvature of the constraints: that of -sum T_i h_i, for the segments that are pulled.
 
@@ -286,7 +285,7 @@ def segment_rows(buffers: StepBuffers, about: Points, start: Points, known: Mask
     return strain
 
 
-@compiled_inner
+@compiled_within
 def init_step(buffers: RodBuffers, given: StepInput, unit: float) -> None:
     """Begin a step, about where the thread would be if it moved on as it did: a guess of second order.
 
@@ -372,14 +371,20 @@ def solve_step(
     # Numbers of a type of their own: a function is compiled again for each number that is written out.
     first, unknown, status = np.int64(0), np.int64(-1), np.int64(banded.SOLVED)
     last_off, contacts, code, u = np.inf, unknown, UNSOLVED, buffers.motion[VELOCITIES]
+    off, rubs, halved = np.inf, False, False
     while True:
-        contacts, off, rubs = assemble_step(solves, model, buffers, given, elsewhere, contacts)
-        if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
-            # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
-            for i in range(len(about)):
-                for a in range(about.shape[1]):
-                    about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
-            contacts, _, _ = assemble_step(first, model, buffers, given, elsewhere, unknown)
+        begun, before = (first, unknown) if halved else (solves, contacts)
+        contacts, found_off, found_rubs = assemble_step(begun, model, buffers, given, elsewhere, before)
+        if not halved:
+            off, rubs = found_off, found_rubs
+            if contacts >= 0 and 1.0 < off < np.inf and off > 0.5 * last_off and solves < model.max_solves:
+                # Solves that swing from side to side, as of a chord that turns about a corner: the middle is better.
+                for i in range(len(about)):
+                    for a in range(about.shape[1]):
+                        about[i, a] = 0.5 * (about[i, a] + last_about[i, a])
+                halved = True
+                continue
+        halved = False
         last_off = off
         copy_points(about, last_about)
         if contacts < 0:
@@ -394,11 +399,13 @@ def solve_step(
             break
         rows = segments + contacts
         program, multipliers = program_view(buffers.program, buffers.known, rows), buffers.program.multipliers[:rows]
-        word, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+        word, _ = banded.solve(program, u, multipliers, solver_buffers)
+        found = compiled_residuals(program, u, multipliers)
         if not max(found) <= model.tolerance:
             u[:] = 0.0
             multipliers[:] = 0.0
-            _, _, found = banded.solve_and_check(model.axes, program, u, multipliers, solver_buffers)
+            banded.solve(program, u, multipliers, solver_buffers)
+            found = compiled_residuals(program, u, multipliers)
             if not max(found) <= model.tolerance:
                 u[:] = 0.0
                 multipliers[:] = 0.0
@@ -447,23 +454,9 @@ class RodFormulation(Formulation):
         barriers: Sequence[Barrier] = (),
     ) -> None:
         super().__init__(thread, workspace, solver, tolerance, barriers, thread.segments)
-        medium, clamped = thread.medium, thread.attachment is Attachment.CLAMPED
         self._buffers = RodBuffers.of(self._program, self.dimension)
-        self.rod = RodProperties(
-            clamped,
-            thread.segment_length,
-            self._radius,
-            thread.bending_stiffness,
-            medium.drag_across,
-            medium.drag_along,
-            medium.mass_per_length,
-            medium.bending_damping,
-            self._vector("gravity", medium.gravity),
-            np.ascontiguousarray(thread.rest_angles),
-            mechanics.end_corrected_weights(thread.segments),
-            mechanics.bending_bands(thread.segments, clamped),
-            self._vector("flow", medium.flow),
-        )
+        self._bands = mechanics.bending_bands(thread.segments, thread.attachment is Attachment.CLAMPED)
+        self.rod = self.rod_of(thread)
         first = solver.first if type(solver) is FallbackSolver else solver
         self._structured = type(first) is BandedSolver  # another one's way of solving is its own
         banded_solver = first if isinstance(first, BandedSolver) else BandedSolver()
@@ -501,12 +494,20 @@ class RodFormulation(Formulation):
     def rod_of(self, thread: Thread) -> RodProperties:
         """Return a thread that differs in stiffness, rest curvature and medium, for compiled code."""
         medium = thread.medium
-        return self.rod._replace(
-            bending_stiffness=thread.bending_stiffness,
-            drag_across=medium.drag_across,
-            drag_along=medium.drag_along,
-            rest_angles=np.ascontiguousarray(thread.rest_angles),
-            flow=self._vector("flow", medium.flow),
+        return RodProperties(
+            thread.attachment is Attachment.CLAMPED,
+            thread.segment_length,
+            self._radius,
+            thread.bending_stiffness,
+            medium.drag_across,
+            medium.drag_along,
+            medium.mass_per_length,
+            medium.bending_damping,
+            self._vector("gravity", medium.gravity),
+            np.ascontiguousarray(thread.rest_angles),
+            mechanics.end_corrected_weights(thread.segments),
+            self._bands,
+            self._vector("flow", medium.flow),
         )
 
     def _vector(self, name: str, values: tuple[float, ...]) -> Vector:
@@ -546,7 +547,7 @@ class RodFormulation(Formulation):
             before = self.warm_start()
         while True:
             done = solve_step(model, buffers, self._solver_buffers, given, solves, off)
-            worst, solves = worst.or_worse(Residuals(*done.residuals)), done.solves
+            worst, solves = _worse(worst, done.residuals), done.solves
             status = status if status != SOLVED else banded.STATUS[done.status]
             if done.code == NO_ROOM:
                 self._refuse_contacts()
@@ -573,7 +574,7 @@ class RodFormulation(Formulation):
                     buffers.tail_load[:] += added.force(pushes, positions.shape)[0]
                 added = self._linearised(interval)
                 off = added.off
-            worst, solves = worst.or_worse(solution.residuals), solves + 1
+            worst, solves = _worse(worst, solution.residuals), solves + 1
             if status == SOLVED:
                 status, solver = solution.status, solution.solver
         about, before_step = buffers.motion[ABOUT], buffers.motion[BEFORE]
@@ -592,7 +593,7 @@ class RodFormulation(Formulation):
 
     def step_model(self) -> StepModel:
         """Return the thread and what is around it, for compiled code."""
-        return StepModel((0, 1, 2)[: self.dimension], self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
+        return StepModel(self.rod, self.workspace.data, self._tolerance, MAX_SOLVES)
 
     def _linearised(self, interval: float) -> AddedRows:
         motion = self._buffers.motion
@@ -630,3 +631,8 @@ class RodFormulation(Formulation):
     def segment_barriers(self, positions: Points, heading: Points) -> list[Barrier]:
         """Return connectivity and compression; see `Formulation`."""
         return [Connectivity(self._thread.segment_length), Compression(self.rest_lengths(positions, heading))]
+
+
+def _worse(one: tuple[float, float, float], other: tuple[float, float, float]) -> Residuals:
+    """Return the larger residual of each kind."""
+    return Residuals(*(max(pair) for pair in zip(one, other, strict=True)))

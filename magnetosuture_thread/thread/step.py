@@ -188,11 +188,6 @@ class AddedBarriers:
         """Return whether there are any."""
         return bool(self._barriers)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the barriers, in their order."""
-        return tuple(barrier.name for barrier in self._barriers)
-
     def rows(self, positions: Points) -> list[BarrierRows]:
         """Return the rows of each barrier at positions of shape (n + 1, d) [m]."""
         return [barrier.rows(positions) for barrier in self._barriers]
@@ -364,7 +359,7 @@ class Formulation(ABC):
         """Return the rows of the built-in barriers at positions of shape (n + 1, d) [m], in SI units."""
         around = self._margin_workspace
         contacts = around.near(positions)
-        distance = half_segment_distances(positions, around.data, contacts)
+        distance = half_segment_distances(np.ascontiguousarray(positions), around.data, contacts)
         return [
             *(barrier.rows(positions) for barrier in self.segment_barriers(positions, heading)),
             ObstacleAvoidance(around, self._radius).rows_of(contacts, distance),

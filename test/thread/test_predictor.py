@@ -45,16 +45,6 @@ def test_steps_are_bounded_whatever_the_interval():
     assert np.abs(late.strain).max() < 1e-3
 
 
-def test_the_same_motion_in_other_samples_gives_the_same_thread():
-    fine, coarse = started(), started()
-    for k in range(1, 61):
-        prediction = fine.step(pose(k / 60.0, 5e-3 * k / 60.0, 2e-3 * (k / 60.0)))
-    for k in range(1, 16):
-        other = coarse.step(pose(k / 15.0, 5e-3 * k / 15.0, 2e-3 * (k / 15.0)))
-    difference = np.linalg.norm(prediction.positions - other.positions, axis=1).mean()
-    assert difference / THREAD.length < 2e-4
-
-
 @pytest.mark.parametrize(
     ("bad", "words"),
     [

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import SolverError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.thread.material import Attachment, Thread
 from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
-from magnetosuture_thread.thread.step import Formulation, PrescribedMotion, ThreadState
+from magnetosuture_thread.thread.step import PrescribedMotion, ThreadState
 from test.thread.scenes import (
     DT,
     TOLERANCE,
@@ -27,14 +27,6 @@ from test.thread.scenes import (
     straight,
     stretch,
 )
-
-OBSTACLE = 2  # the place of the obstacles among the margins
-
-
-def clearance(formulation: Formulation, positions: np.ndarray) -> float:
-    """Return the least distance of a node but the needle's from an obstacle."""
-    rows = formulation.margins(positions, east(positions.shape[1]))[OBSTACLE]
-    return float(rows.value[rows.nodes[:, 0] > 0].min(initial=np.inf))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -141,34 +133,6 @@ def test_a_thread_pulled_hard_needs_no_more_than_a_few_solves():
     assert max(done.solves for done in steps) <= 3
     assert np.mean([done.solves for done in steps]) < 1.2
     assert max(stretch(thread, done.state.positions) for done in steps) < 1e-3
-
-
-SQUARE = Polygon(((-0.012, 0.001), (-0.008, 0.001), (-0.008, 0.005), (-0.012, 0.005)))
-NOTCHED = Polygon(  # with a concave corner that the thread is drawn into
-    ((-0.014, 0.004), (-0.010, 0.002), (-0.006, 0.004), (-0.006, 0.008), (-0.014, 0.008))
-)
-
-
-@pytest.mark.parametrize(
-    "obstacles",
-    [
-        (Disc((-0.009, 0.0025), 0.0015),),
-        (SQUARE,),
-        (NOTCHED.smoothed(2e-4),),
-        (Disc((-0.006, 0.003), 0.001), Disc((-0.0085, 0.0025), 0.001), SQUARE),
-    ],
-)
-def test_a_thread_pushed_onto_obstacles_stays_outside_and_bears_on_them(obstacles: tuple[Disc | Polygon, ...]):
-    thread = polyamide()
-    formulation = formulated(thread, obstacles)
-    touched = False
-    for done in followed(formulation, straight(thread), lambda k: k * 4e-5 * np.array([0.0, 1.0]), 300):
-        least = clearance(formulation, done.state.positions)
-        assert least > -1e-6
-        assert done.residuals.largest < TOLERANCE
-        assert stretch(thread, done.state.positions) < 5e-3
-        touched = touched or least < 1e-7
-    assert touched
 
 
 def test_held_nodes_stay_and_driven_nodes_go_where_they_are_told():

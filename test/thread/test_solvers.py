@@ -7,7 +7,7 @@ import pytest
 
 from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution, Solver, Vector, no_far_rows
 from magnetosuture_thread.thread.solvers import BandedSolver, FallbackSolver, OsqpSolver
-from test.thread.test_program import one_node, rubbing
+from test.thread.test_program import one_node
 
 
 def random_program(seed: int, nodes: int = 9, dimension: int = 2, soft: bool = False) -> ChainProgram:
@@ -82,16 +82,6 @@ def test_rows_over_nodes_far_apart_are_solved_as_by_a_general_solver(dimension: 
         np.testing.assert_allclose(found.velocities, expected.velocities, atol=1e-4)
         pushed += int((found.multipliers[-3:] > 1e-3).sum())
     assert pushed > 15
-
-
-@pytest.mark.parametrize("pull", [-4.0, -1.0, 1.0, 4.0])
-def test_both_solvers_know_the_limit_of_friction(pull: float):
-    """At most 1.8 of friction against the pull along x: below that the node stays, above it the rest moves it."""
-    moved = 0.5 * float(np.sign(pull)) * max(abs(pull) - 1.8, 0.0)
-    for solver in (BandedSolver(), OsqpSolver()):
-        found = solved(solver, rubbing(1.8, pull))
-        np.testing.assert_allclose(found.velocities[0], [moved, 0.0], atol=1e-5)
-        assert found.residuals.largest < 1e-5
 
 
 def test_a_bad_guess_is_as_good_as_none():

@@ -5,13 +5,12 @@ from __future__ import annotations
 from magnetosuture_thread.geometry.obstacles.contacts import (
     MAX_FRICTION,
     WALL,
-    Contacts,
     Workspace,
     find_contacts,
     half_segment_distances,
     wall_contact,
 )
-from magnetosuture_thread.geometry.obstacles.distances import WorkspaceData
+from magnetosuture_thread.geometry.obstacles.distances import Contacts, WorkspaceData
 from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon, triangulate
 
 __all__ = [

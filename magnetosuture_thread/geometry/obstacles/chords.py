@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted
-from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData
+from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, Contacts, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = tuple[float, float, float]
@@ -35,33 +35,8 @@ class Chord(NamedTuple):
     length: float
 
 
-class ChordContacts(NamedTuple):
-    """Arrays that contacts are written to; see `find_contacts` for the first four.
-
-    Attributes:
-        node: the first of the segment's two, shape (c,).
-        obstacle: shape (c,).
-        distance: shape (c,) [m].
-        normal: shape (c, d).
-        place: where on the segment, 0 to 1, shape (c,).
-    """
-
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    place: NDArray[np.float64]
-
-
 @compiled_inline
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@compiled_inline
-def _write(
-    count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: ChordContacts
-) -> int:
+def _write(count: int, place: float, distance: float, normal: Vector, node: int, obstacle: int, to: Contacts) -> int:
     """Write a contact; return the new count, -1 if there is no room."""
     if count < 0 or count >= len(to.node):
         return -1
@@ -71,7 +46,7 @@ def _write(
     return count + 1
 
 
-@compiled_inline
+@compiled_within
 def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance and normal of a polygon's corner, the start of edge k; a place of -1 for none.
 
@@ -98,11 +73,11 @@ def _corner(chord: Chord, numbers: NDArray[np.float64], k: int, reach: float) ->
     return s / chord.length, distance, (nx, ny, 0.0)
 
 
-@compiled_inline
+@compiled_within
 def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Vector]:
     """Return place, distance from the centre and normal of a disc or ball; a place of -1 for none."""
     to = centre[0] - chord.start[0], centre[1] - chord.start[1], centre[2] - chord.start[2]
-    s = _dot(to, chord.along)
+    s = to[0] * chord.along[0] + to[1] * chord.along[1] + to[2] * chord.along[2]
     x, y, z = s * chord.along[0] - to[0], s * chord.along[1] - to[1], s * chord.along[2] - to[2]
     length = math.sqrt(x * x + y * y + z * z)
     if not (0.0 < s < chord.length and 0.0 < length <= reach):
@@ -110,7 +85,7 @@ def _round(chord: Chord, centre: Vector, reach: float) -> tuple[float, float, Ve
     return s / chord.length, length, (x / length, y / length, z / length)
 
 
-@compiled_inline
+@compiled_within
 def _bulge(points: Points, i: int, s: float, normal: Vector) -> float:
     """Return how far a segment's arc is from its chord at a place s, along a normal: s (1 - s) / 2 of its turn."""
     turn = 0.0
@@ -129,7 +104,7 @@ def find_chord_contacts(
     radius: float,
     clearance: NDArray[np.float64],
     count: int,
-    to: ChordContacts,
+    to: Contacts,
 ) -> int:
     """Write where the chords between nodes are closest to what sticks out of obstacles; what nodes touch is not in it.
 

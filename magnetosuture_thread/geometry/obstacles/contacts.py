@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles.distances import (
     EDGE_WIDTH,
+    NO_BLOCK,
     ContactRows,
+    Contacts,
     WorkspaceData,
     add_row,
     closest_on_segment,
@@ -45,7 +46,7 @@ def wall_contact(x: float, y: float, radius: float) -> tuple[float, float, float
     return radius, -1.0, 0.0
 
 
-@compiled_inline
+@compiled_within
 def _ball_contact(x: float, y: float, z: float, s: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the row of a disc or ball, |p - c| - r, when it is within reach; return the new count."""
     disc = data.discs[s]
@@ -57,7 +58,7 @@ def _ball_contact(x: float, y: float, z: float, s: int, data: WorkspaceData, cou
     return add_row(count, count, length - disc[2], direction, rows)
 
 
-@compiled_uncounted
+@compiled_within
 def _polygon_contacts(x: float, y: float, polygon: int, data: WorkspaceData, count: int, rows: ContactRows) -> int:
     """Write the rows of a polygon at one point; return the new count, -1 when they are too many."""
     box, reach = data.boxes[polygon], data.reach
@@ -84,30 +85,19 @@ def _polygon_contacts(x: float, y: float, polygon: int, data: WorkspaceData, cou
 
 
 @compiled_uncounted
-def find_contacts(
-    points: Points,
-    data: WorkspaceData,
-    node: NDArray[np.int64],
-    obstacle: NDArray[np.int64],
-    distance: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    nearest: NDArray[np.bool_],
-) -> int:
+def find_contacts(points: Points, data: WorkspaceData, to: Contacts) -> int:
     """Write the contacts of points into the caller's arrays; see `Workspace.near` for what they are.
 
     Args:
         points: shape (m, d) [m].
         data: `Workspace.data`.
-        node: index of the point, shape (c,), c rows of room.
-        obstacle: index of the obstacle, `WALL` for the wall, shape (c,).
-        distance: signed distance, shape (c,) [m].
-        normal: gradient of the signed distance, shape (c, d).
-        nearest: whether the row is the nearest of its point and obstacle, shape (c,).
+        to: written, but for the place.
 
     Returns:
         The number of contacts, or -1 when there are more than the arrays have room for.
     """
-    count, rows, discs = 0, ContactRows(distance, normal), len(data.discs)
+    node, obstacle, distance, nearest = to.node, to.obstacle, to.distance, to.nearest
+    count, rows, discs = 0, ContactRows(distance, to.normal), len(data.discs)
     # Nearer to the centre than this, a point has no contact with the wall: most points pay for one comparison.
     inner = data.wall_radius - data.reach
     inner_square = inner * inner if inner > 0.0 else -1.0
@@ -138,29 +128,6 @@ def find_contacts(
             if count > start:
                 nearest[best] = True
     return count
-
-
-@dataclass(frozen=True, eq=False)
-class Contacts:
-    """Where points are near obstacles or the dish wall: k rows, in the order of nodes, then obstacles.
-
-    Attributes:
-        node: index of the point, shape (k,).
-        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
-        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
-        normal: gradient of the signed distance, unit vectors, shape (k, d).
-        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
-    """
-
-    node: NDArray[np.int64]
-    obstacle: NDArray[np.int64]
-    distance: NDArray[np.float64]
-    normal: Points
-    nearest: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return len(self.node)
 
 
 class Workspace:
@@ -201,7 +168,13 @@ class Workspace:
         for i, shape in enumerate(self.shapes):
             _check(f"workspace.shapes[{i}]", shape, dimension)
         self.friction, self.wall_friction = tuple(friction) or (0.0,) * len(self.shapes), wall_friction
-        _check_friction(self.friction, wall_friction, len(self.shapes), dimension)
+        if len(self.friction) != len(self.shapes):
+            expected = f"one for each of {len(self.shapes)} shapes"
+            raise ConfigurationError("workspace.friction", f"{len(self.friction)} values", expected)
+        if dimension != 2 and max(wall_friction, *self.friction, 0.0) > 0.0:
+            raise ConfigurationError(
+                "workspace.friction", (wall_friction, *self.friction), "0 in space: friction is of the plane"
+            )
         self.data = pack_obstacles(self.shapes, wall_radius, reach, (wall_friction, *self.friction))
 
     def near(self, points: Points) -> Contacts:
@@ -231,21 +204,9 @@ class Workspace:
         room, count = 16 * (len(points) + 1), -1
         while count < 0:  # in a scene of many shapes a point may be near all of them
             room *= 2
-            node, obstacle, nearest = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.bool_)
-            distance, normal = np.empty(room), np.empty((room, self.dimension))
-            count = find_contacts(points, self.data, node, obstacle, distance, normal, nearest)
-        found = [array[:count].copy() for array in (node, obstacle, distance, normal, nearest)]
-        for array in found:
-            array.setflags(write=False)
-        return Contacts(*found)
-
-
-def _check_friction(friction: tuple[float, ...], wall_friction: float, shapes: int, dimension: int) -> None:
-    if len(friction) != shapes:
-        raise ConfigurationError("workspace.friction", f"{len(friction)} values", f"one for each of {shapes} shapes")
-    for name, value in (("wall_friction", wall_friction), *((f"friction[{i}]", mu) for i, mu in enumerate(friction))):
-        if value > 0.0 and dimension != 2:
-            raise ConfigurationError(f"workspace.{name}", value, "0 in space: friction is of the plane")
+            contacts = Contacts.room(room, self.dimension)
+            count = find_contacts(points, self.data, contacts)
+        return Contacts(*(array[:count].copy() for array in contacts))
 
 
 def _check(name: str, shape: Obstacle, dimension: int) -> None:
@@ -278,13 +239,15 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
     length, edges = math.hypot(bx - ax, by - ay), data.edges
     intervals = np.empty((64, 2))  # halved depth first
     intervals[0, 0], intervals[0, 1], pending, halvings = 0.0, 1.0, 1, 0
-    best = min(nearest_edge(ax, ay, polygon, -1, data).signed, nearest_edge(bx, by, polygon, -1, data).signed)
+    best = min(
+        nearest_edge(ax, ay, polygon, NO_BLOCK, data).signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed
+    )
     lowest = best
     while pending > 0:
         pending -= 1
         low, high = intervals[pending, 0], intervals[pending, 1]
         px, py, qx, qy = ax + low * (bx - ax), ay + low * (by - ay), ax + high * (bx - ax), ay + high * (by - ay)
-        before, after = nearest_edge(px, py, polygon, -1, data), nearest_edge(qx, qy, polygon, -1, data)
+        before, after = nearest_edge(px, py, polygon, NO_BLOCK, data), nearest_edge(qx, qy, polygon, NO_BLOCK, data)
         best = min(best, before.signed, after.signed)
         bound = 0.5 * (before.signed + after.signed - (high - low) * length)
         for k in (before.edge, after.edge):
@@ -299,7 +262,7 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
     return min(lowest, best)
 
 
-@compiled_uncounted
+@compiled_within
 def _from_polygon(
     ax: float, ay: float, bx: float, by: float, signed: float, polygon: int, data: WorkspaceData
 ) -> float:
@@ -308,7 +271,7 @@ def _from_polygon(
     Outside it is that of an end, or that of a corner of the polygon from the line.
     """
     ux, uy, edges = bx - ax, by - ay, data.edges
-    least, length = min(signed, nearest_edge(bx, by, polygon, -1, data).signed), math.hypot(ux, uy)
+    least, length = min(signed, nearest_edge(bx, by, polygon, NO_BLOCK, data).signed), math.hypot(ux, uy)
     for block in range(data.polygons[polygon, 0], data.polygons[polygon, 1]):
         if least <= TOLERANCE:
             break
@@ -362,18 +325,6 @@ def half_segment_distance(points: Points, i: int, obstacle: int, signed: float, 
 
 
 @compiled
-def _lower(
-    points: Points,
-    data: WorkspaceData,
-    node: NDArray[np.int64],
-    obstacle: NDArray[np.int64],
-    distance: NDArray[np.float64],
-) -> None:
-    """Lower the distances of nodes to those of the half segments beside them."""
-    for row in range(len(node)):
-        distance[row] = half_segment_distance(points, node[row], obstacle[row], distance[row], data)
-
-
 def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contacts) -> NDArray[np.float64]:
     """Return the least signed distance of a node and the half segments beside it, for each contact, shape (k,) [m].
 
@@ -387,6 +338,7 @@ def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contac
         data: `Workspace.data`.
         contacts: of these nodes with it.
     """
-    distance: NDArray[np.float64] = contacts.distance.copy()
-    _lower(np.ascontiguousarray(points, dtype=np.float64), data, contacts.node, contacts.obstacle, distance)
+    distance = contacts.distance.copy()
+    for row in range(len(distance)):
+        distance[row] = half_segment_distance(points, contacts.node[row], contacts.obstacle[row], distance[row], data)
     return distance

@@ -26,6 +26,7 @@ EDGE_WIDTH = 14
 pseudo-normals at start and end (2 each), and one to fill."""
 MIN_DISTANCE = 1e-12
 """At a smaller distance from a vertex or an edge, the direction away from it is lost in rounding [m]."""
+NO_BLOCK, NO_ROW = np.int64(-1), np.int64(0)  # typed: a kernel is compiled again for each number that is written out
 _SAME_POINT = 1e-7  # two rows of one obstacle that differ by less are one point of its boundary
 
 
@@ -169,6 +170,32 @@ class Nearest(NamedTuple):
     y: float
     edge: int
     block: int
+
+
+class Contacts(NamedTuple):
+    """Where points or chords are near obstacles or the wall: k rows, in the order of nodes, then obstacles.
+
+    Attributes:
+        node: index of the point, or of the chord's first node, shape (k,).
+        obstacle: index of the obstacle, `WALL` for the dish wall, shape (k,).
+        distance: signed distance, negative inside of an obstacle and beyond the wall, shape (k,) [m].
+        normal: gradient of the signed distance, unit vectors, shape (k, d).
+        nearest: whether the row is the nearest of its point and obstacle, one for each pair, shape (k,).
+        place: where on the segment from the node on, 0 at the node itself, shape (k,).
+    """
+
+    node: NDArray[np.int64]
+    obstacle: NDArray[np.int64]
+    distance: Vector
+    normal: Points
+    nearest: NDArray[np.bool_]
+    place: Vector
+
+    @classmethod
+    def room(cls, count: int, dimension: int) -> Contacts:
+        """Return arrays for a number of rows."""
+        (node, obstacle), (distance, place) = np.zeros((2, count), np.int64), np.zeros((2, count))
+        return cls(node, obstacle, distance, np.zeros((count, dimension)), np.zeros(count, np.bool_), place)
 
 
 class ContactRows(NamedTuple):
@@ -316,14 +343,14 @@ def nearest_edge(x: float, y: float, polygon: int, guess: int, data: WorkspaceDa
     first, last = data.polygons[polygon, 0], data.polygons[polygon, 1]
     best = Nearest(0, np.inf, np.inf, 0.0, 0.0, 0, -1)
     if first <= guess < last:
-        best = search_block(x, y, -1.0, guess, data, 0, 0, no_rows)
+        best = search_block(x, y, -1.0, guess, data, NO_ROW, NO_ROW, no_rows)
     reach = math.sqrt(best.square)
     for block in range(first, last):
         dx, dy = x - data.circles[block, 0], y - data.circles[block, 1]
         far = reach + data.circles[block, 2]
         if block == guess or dx * dx + dy * dy >= far * far:
             continue
-        found = search_block(x, y, -1.0, block, data, 0, 0, no_rows)
+        found = search_block(x, y, -1.0, block, data, NO_ROW, NO_ROW, no_rows)
         if found.square < best.square:
             best, reach = found, math.sqrt(found.square)
     return best

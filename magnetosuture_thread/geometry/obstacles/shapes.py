@@ -222,25 +222,14 @@ def _check_holes(outline: Ring, holes: tuple[Ring, ...], source: str) -> None:
     solid = shapely.Polygon(outline)
     shapes = [shapely.Polygon(hole) for hole in holes]
     for i, shape in enumerate(shapes):
-        problem, expectation = "", "a hole inside the outline, apart from it"
-        if not solid.intersects(shape):
-            problem = "a hole outside the outline"
-        elif not solid.contains_properly(shape):
-            where = solid.exterior.intersection(shape.exterior)
-            meets = "around the outline" if where.is_empty else f"that meets the outline at {_position_text(where)}"
-            problem = f"a hole {meets}"
-        for j, other in enumerate(shapes[:i]):
-            if not problem and shape.intersects(other):
-                problem = f"a hole that meets holes[{j}] at {_position_text(shape.intersection(other))}"
-                expectation = "holes apart from each other"
-        if problem:
-            raise ConfigurationError(f"polygon.holes[{i}]", problem, expectation, source)
-
-
-def _position_text(shape: shapely.Geometry) -> str:
-    """Return a point of a shape as text [m]."""
-    point = shape.representative_point()
-    return f"({point.x:.6g}, {point.y:.6g})"
+        met = [f"holes[{j}]" for j, other in enumerate(shapes[:i]) if shape.intersects(other)]
+        if not solid.contains_properly(shape):
+            met.insert(0, "the outline")
+        if met:
+            problem = f"a hole that is outside of the outline or meets it or another: {', '.join(met)}"
+            raise ConfigurationError(
+                f"polygon.holes[{i}]", problem, "a hole inside the outline, apart from all", source
+            )
 
 
 def _oriented(ring: Ring, counter_clockwise: bool) -> Ring:
@@ -327,13 +316,11 @@ def triangulate(polygon: Polygon) -> NDArray[np.float64]:
     total = float(shapely.area(pieces).sum())
     rounding = 1e-9 * area + 1e-14 * float(np.ptp(vertices, axis=0).max()) ** 2
     own = {tuple(vertex) for vertex in vertices.tolist()}
-    problem = ""
-    if len(corners) != count:
-        problem = f"{len(corners)} triangles in place of {count}"
-    elif abs(total - area) > rounding:
-        problem = f"triangles of {total:.9g} m^2 in a shape of {area:.9g} m^2"
-    elif not own.issuperset(map(tuple, corners.reshape(-1, 2).tolist())):
-        problem = "a triangle's corner that is none of the polygon"
-    if problem:
+    if (
+        len(corners) != count
+        or abs(total - area) > rounding
+        or not own.issuperset(map(tuple, corners.reshape(-1, 2).tolist()))
+    ):
+        problem = f"{len(corners)} triangles of {total:.9g} m^2 for {count} of {area:.9g} m^2"
         raise ConfigurationError("polygon", problem, expectation, polygon.source)
     return np.ascontiguousarray(corners)

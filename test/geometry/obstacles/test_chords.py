@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import shapely
 
-from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
-from magnetosuture_thread.geometry.obstacles.chords import ChordContacts, find_chord_contacts
-from magnetosuture_thread.thread.step import ThreadState
-from test.thread.scenes import DT, east, formulated, lead, silk
+from magnetosuture_thread.geometry.obstacles import Contacts, Disc, Obstacle, Polygon, Workspace
+from magnetosuture_thread.geometry.obstacles.chords import find_chord_contacts
+from test.thread.scenes import east
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 REACH = 0.02  # of nodes; chords have a part of it
@@ -32,9 +31,7 @@ def contacts(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> list[tup
 def contacts_of(obstacle: Obstacle, points: np.ndarray) -> list[tuple[float, float, np.ndarray]]:
     """Return the same of a chain."""
     room, dimension = 50, points.shape[1]
-    to = ChordContacts(
-        np.zeros(room, np.int64), np.zeros(room, np.int64), np.zeros(room), np.zeros((room, dimension)), np.zeros(room)
-    )
+    to = Contacts.room(room, dimension)
     data = Workspace((obstacle,), REACH, dimension).data
     clearance = np.full(len(points), -np.inf)
     assert find_chord_contacts(points, data, SEGMENT, 0.0, -clearance, 0, to) == 0
@@ -109,35 +106,3 @@ def test_around_a_disc_arcs_touch_and_beside_it_chords_do(centre: tuple[float, .
     assert distance == pytest.approx(1e-4)
     assert place == pytest.approx(0.4)
     np.testing.assert_allclose(normal, east(len(centre)), atol=1e-12)
-
-
-def deepest(obstacle: Polygon, positions: np.ndarray, radius: float) -> float:
-    """Return how deep the deepest point of the chain is, of its surface, as sampled at a hundred places a segment."""
-    at = np.linspace(0.0, 1.0, 101)[:, None, None]
-    points = ((1.0 - at) * positions[:-1] + at * positions[1:]).reshape(-1, 2)
-    shape = shapely.Polygon(obstacle.outline)
-    within = shapely.contains_xy(shape, points)
-    depth = shapely.distance(shape.exterior, shapely.points(points))
-    return float(np.max(np.where(within, depth, -depth) + radius))
-
-
-@pytest.mark.parametrize("polygon", [SQUARE, rounded(0.003, 8), rounded(0.0005, 5)])
-def test_a_thread_drawn_around_corners_is_nowhere_deeper_than_its_nodes(polygon: Polygon):
-    thread = silk(segments=81)
-    formulation = formulated(thread, (polygon,))
-    start = np.array([0.03, 0.011])
-    positions = start - thread.segment_length * np.arange(82)[:, None] * np.array([1.0, 0.0])
-    state, worst, pressed = ThreadState.at_rest(positions), -1.0, 0.0
-    for k in range(1, 401):
-        # Around the upper right corner, down along the right side, and left below, at 10 mm/s.
-        angle = 0.0095 * k
-        tail = np.array([0.012, 0.008]) + 0.018 * np.array([math.cos(angle), -math.sin(angle)])
-        done = formulation.step(state, lead(start + min(1.0, k / 40) * (tail - start)), DT)
-        assert done.converged
-        assert done.loads is not None
-        state = done.state
-        pressed = max(pressed, float(np.linalg.norm(done.loads[1], axis=1).max()))
-        if k % 10 == 0:
-            worst = max(worst, deepest(polygon, state.positions, 0.5 * thread.diameter))
-    assert pressed > 1.0
-    assert worst < 1.5e-7

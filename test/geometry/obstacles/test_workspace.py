@@ -179,11 +179,3 @@ def test_the_wall_is_a_contact_of_its_own_before_the_obstacles():
 def test_what_cannot_be_a_workspace_is_refused(shapes: list[Obstacle], changes: dict[str, Any], reason: str):
     with pytest.raises(ConfigurationError, match=reason):
         Workspace(shapes, **{"reach": 0.1, **changes})
-
-
-def test_points_that_are_near_hundreds_of_shapes_have_a_contact_with_each():
-    discs = [Disc((0.001 * (k % 20), 0.001 * (k // 20)), 1e-4) for k in range(200)]
-    points = np.column_stack([np.linspace(0.0, 0.019, 60), np.full(60, 0.00475)])
-    found = Workspace(discs, 0.05).near(points)
-    assert len(found.node) == 200 * 60
-    assert set(found.obstacle.tolist()) == set(range(200))
