@@ -19,7 +19,7 @@ from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 PERIOD = 0.005
@@ -132,25 +132,6 @@ def test_source_timeout_and_time_to_stop(timeout: float):
     outputs = plant.run(1.0)
     assert outputs[-1].reasons == (f"no command for {timeout:g} s",)
     assert timeout - 3 * PERIOD < stopped_after(plant, last) <= timeout - PERIOD + 1e-9
-
-
-@pytest.mark.parametrize(("lost", "timeout"), [("command", 0.3), ("pose", 0.2)])
-def test_an_input_ends_by_the_monotonic_clock_though_that_of_the_stamps_stands_still(lost: str, timeout: float):
-    plant = Plant(CoilBridgeSettings(command_timeout=0.3, pose_timeout=0.2)).ready()
-    plant.run(0.5)
-    plant.command((0.005, 0.002))
-    plant.bridge.extrapolator.update(TAIL, EAST, plant.time, plant.poses + 1, plant.time, plant.time)
-    moved = 0.0
-    for k in range(1, 100):
-        stamp, arrival = plant.time, plant.time + k * PERIOD
-        if lost == "command":
-            plant.bridge.extrapolator.update(TAIL, EAST, stamp, plant.poses + 1 + k, stamp, arrival)
-        else:
-            plant.bridge.command("needle", np.array([0.005, 0.002]), stamp, plant.commands + k, stamp, arrival)
-        plant.bridge.on_margins(stamp, True, 1.0, plant.bridge.scene_version, arrival)
-        if not still(plant.bridge.step(stamp, arrival, plant.driver)):
-            moved = k * PERIOD
-    assert timeout - 3 * PERIOD < moved + PERIOD <= timeout - PERIOD + 1e-9
 
 
 def test_cease_after_stop():
@@ -324,22 +305,6 @@ def test_nor_does_a_needle_whose_pull_is_compensated(
     least = min(safety.clearance(tail, heading) for tail, heading in motion)
     assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
-
-
-@pytest.mark.parametrize("pull", [0.0, 6e-4])
-def test_a_needle_beside_a_block_that_it_is_pulled_to_gets_free_sideways(pull: float):
-    """It cannot turn away; poses are 50 ms late, and what pulls it is not known at first."""
-    settings = CoilBridgeSettings(motion_compensation=True)
-    e, keep = np.array([math.cos(0.6), math.sin(0.6)]), settings.keep_out
-    n = np.array([-e[1], e[0]])
-    far = 0.5 * keep + 2e-3
-    corners = [a * e + b * n for a, b in ((-0.01, 0.5 * keep), (0.01, 0.5 * keep), (0.01, far), (-0.01, far))]
-    polygon = Polygon(tuple((float(x), float(y)) for x, y in corners))
-    scene = Scene(Dish(0.05), (SceneShape("block", "wall", polygon),))
-    plant = Plant(settings, scene, velocity=tuple(1e-3 * e)).ready()
-    tail = -0.5 * settings.needle().chord * e - 0.4 * keep * n
-    *_, (tail, heading) = compensated_motion(plant, tail, e, pull * n, 400)
-    assert settings.safety_filter(scene).clearance(tail, heading) > keep
 
 
 def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: pytest.MonkeyPatch):
@@ -522,21 +487,6 @@ def test_a_needle_that_is_commanded_to_move_and_rests_says_what_stops_it():
         assert output.commanded.tolist() == [0.01, 0.0]
 
 
-def test_a_pose_outside_of_the_dish_stops_the_needle_until_one_agrees_with_the_last_before_it():
-    plant = Plant().ready()
-    plant.run(0.2)
-    inside = plant.tail
-    plant.tail = np.array([0.014, 0.0])
-    with pytest.raises(InvalidInputError, match="from the dish's centre"):
-        plant.run(0.05)
-    plant.tail = None
-    output = plant.run(PERIOD)[0]
-    assert still(output)
-    assert output.reasons[0].startswith("needle pose rejected: its tip is 0.021 m from the dish's centre")
-    plant.tail = inside
-    assert not still(plant.run(0.1)[-1])
-
-
 def test_a_jump_of_the_pose_is_not_accepted_by_itself_while_armed():
     plant = Plant().ready()
     plant.run(0.2)
@@ -569,26 +519,6 @@ def test_a_bridge_that_stood_still_until_the_boards_stopped_is_in_fault():
     plant.bridge.reset(HARDWARE)
     plant.bridge.arm(HARDWARE)
     assert not still(plant.run(0.2)[-1])
-
-
-def test_where_no_currents_keep_the_needle_off_the_wall_it_rests_for_a_while(monkeypatch: pytest.MonkeyPatch):
-    plant = Plant().ready()
-    plant.run(0.2)
-    zero = plant.bridge._coils.zero()
-    monkeypatch.setattr(plant.bridge._coils, "allocate", lambda *_: (zero, "wall"))
-    assert plant.run(PERIOD)[0].reasons == ("stopped by wall: no feasible currents",)
-    monkeypatch.undo()
-    assert all(still(output) for output in plant.run(0.08))
-    assert not still(plant.run(0.1)[-1])
-
-
-def test_two_that_command_at_once_stop_it_until_one_is_silent():
-    plant = Plant().ready()
-    plant.run(0.5)
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        plant.command((-0.01, 0.0), number=7777)
-    plant.velocity = None
-    assert plant.run(0.05)[-1].reasons == ("several publishers of needle/servo_cv at once",)
 
 
 def test_an_operator_may_take_over_from_two_that_dispute_the_needle():

@@ -183,17 +183,6 @@ def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
     assert share * HOLD * 0.05 / lever == pytest.approx(math.asin(c), rel=1e-6)
 
 
-def test_one_who_is_too_near_to_a_post_or_the_wall_may_leave_and_goes_no_nearer():
-    post = SceneShape("post", "instrument", Disc((0.002, 0.0), 0.001))
-    filtered = safety(Scene(Dish(0.05), (post,)), 0.0)
-    for at in ((0.0007, 0.0), (0.0015, 0.0), (-0.0248, 0.0)):  # before the post, inside, and before the wall
-        inwards = 0.001 * EAST if at[0] > 0.0 else -0.001 * EAST
-        assert filtered.safe_share(inwards, np.array(at), EAST)[0] < 1e-6
-        assert filtered.safe_share(-inwards, np.array(at), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.0007, 0.0]), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.002, 0.0]), EAST)[0] == 1.0
-
-
 def test_a_point_that_comes_from_beyond_an_edges_end_meets_the_edge():
     wall = SceneShape("block", "wall", Polygon(((0.0, 0.001), (0.01, 0.001), (0.01, 0.003), (0.0, 0.003))))
     share, _ = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(

@@ -139,28 +139,6 @@ def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit:
     assert found.active == ("half_plane",)
 
 
-class Appearing(MovingHalfPlane):
-    """The same bound, which there is only from a time on."""
-
-    def value(self, positions: np.ndarray) -> np.ndarray:
-        """Return a row for each point, or none."""
-        return super().value(positions)[: len(positions) if self.time > 0.1 else 0]
-
-    def gradient(self, positions: np.ndarray) -> Gradient:
-        """Return its gradient."""
-        found = super().gradient(positions)
-        count = len(self.value(positions))
-        return Gradient(found.nodes[:count], found.values[:count])
-
-
-def test_a_barrier_that_appears_within_the_hold_is_kept_too():
-    safety, tail = needle(Appearing(0.0), length=0.0), np.array([0.0, -0.001])
-    assert safety.filter(np.array([0.01, 0.0]), tail, EAST, time=0.0).active == ()
-    found = safety.filter(np.array([0.0, 0.01]), tail, EAST, time=0.0)  # 2 mm in the hold
-    assert found.active == ("half_plane",)
-    assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
-
-
 PERIOD, CLEARANCE = 0.05, 1e-4  # s and m
 
 

@@ -13,10 +13,9 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts, segment_contacts
 
 SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 WIDTH = 6  # of the band: half-width and diagonal
@@ -74,7 +73,8 @@ class Rod(NamedTuple):
     radius: float
 
 
-def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float) -> NDArray[np.float64]:
+@compiled
+def drag_matrices(q: Vector, rod: Rod, scale: float) -> Vector:
     """Return each node's drag: half of each segment beside it, so that a free end carries half a cell.
 
         Z_i = scale sum D / 2 (across I - (across - along) t t')
@@ -87,25 +87,20 @@ def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float) -> NDArray[np.
     Returns:
         Z_xx, Z_xy, Z_yy, shape (n + 1, 3).
     """
-    t = np.diff(q[1:].reshape(-1, 2), axis=0)
-    t /= np.hypot(t[:, 0], t[:, 1])[:, None]
-    xx, xy, yy = t[:, 0] ** 2, t[:, 0] * t[:, 1], t[:, 1] ** 2
-    less = rod.across - rod.along
-    each = 0.5 * rod.segment * scale * np.column_stack([rod.across - less * xx, -less * xy, rod.across - less * yy])
-    drag = np.zeros((len(each) + 1, 3))
-    drag[:-1] += each
-    drag[1:] += each
+    drag = np.zeros(((q.shape[0] - 1) // 2, 3))
+    half, less = 0.5 * rod.segment * scale, rod.across - rod.along
+    for i in range(drag.shape[0] - 1):
+        ex, ey = q[2 * i + 3] - q[2 * i + 1], q[2 * i + 4] - q[2 * i + 2]
+        square = ex * ex + ey * ey
+        for node in (i, i + 1):
+            drag[node, 0] += half * (rod.across - less * ex * ex / square)
+            drag[node, 1] -= half * less * ex * ey / square
+            drag[node, 2] += half * (rod.across - less * ey * ey / square)
     return drag
 
 
-@compiled
-def add_drag(
-    q: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    drag: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-) -> float:
+@compiled_uncounted
+def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vector) -> float:
     """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
     energy = 0.0
     for i in range(drag.shape[0]):
@@ -121,14 +116,8 @@ def add_drag(
     return energy
 
 
-@compiled
-def add_stretching(
-    q: NDArray[np.float64],
-    rod: Rod,
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
+@compiled_uncounted
+def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
     energy = 0.0
     k = rod.stretching / rod.segment
@@ -157,8 +146,8 @@ def add_stretching(
     return energy
 
 
-@compiled
-def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64], band: NDArray[np.float64]) -> float:
+@compiled_uncounted
+def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     """Add sum EI / D (1 - cos(phi_i)) at inner nodes, phi_i the turn from segment to segment.
 
         = EI / (2 D^3) sum |x_{i+1} - 2 x_i + x_{i-1}|^2
@@ -183,8 +172,8 @@ def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64],
     return energy
 
 
-@compiled
-def find_contacts(q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArray[np.float64]) -> int:
+@compiled_uncounted
+def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     """Write what nodes 1 ... n and segments sink into; return how many.
 
     Args:
@@ -214,15 +203,8 @@ def find_contacts(q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArra
     return count
 
 
-@compiled
-def add_contact(
-    q: NDArray[np.float64],
-    k: float,
-    rows: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
+@compiled_uncounted
+def add_contact(q: Vector, k: float, rows: Vector, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add k / 2 depth^2 of every contact, the rows of `find_contacts`.
 
     For a segment the gap's second derivative is that of the distance between a point and a line.
@@ -257,7 +239,7 @@ def add_contact(
     return energy
 
 
-def find_friction(contacts: NDArray[np.float64], shapes: Shapes) -> NDArray[np.float64]:
+def find_friction(contacts: Vector, shapes: Shapes) -> Vector:
     """Return where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
 
     A contact that pushes with the force N at the start of a step adds, for its slip s = t . (x - x_start) along it,
@@ -274,29 +256,16 @@ def find_friction(contacts: NDArray[np.float64], shapes: Shapes) -> NDArray[np.f
         Index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N], shape (k, 5).
     """
     a, s, depth, nx, ny, _ = contacts.T
-    found = np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
-    return found if shapes.friction > 0.0 else found[:0]
+    return np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
 
 
-@compiled
-def add_friction(
-    q: NDArray[np.float64],
-    start: NDArray[np.float64],
-    slip: float,
-    friction: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-) -> float:
+@compiled_uncounted
+def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradient: Vector, band: Vector) -> float:
     """Add the friction of a step from `start` to q; `slip` is e [m]."""
     energy = 0.0
     for row in range(friction.shape[0]):
-        a, s, tx, ty, limit = (
-            int(friction[row, 0]),
-            friction[row, 1],
-            friction[row, 2],
-            friction[row, 3],
-            friction[row, 4],
-        )
+        a, s, limit = int(friction[row, 0]), friction[row, 1], friction[row, 4]
+        tx, ty = friction[row, 2], friction[row, 3]
         w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
         count = 2 if s == 0.0 else 4
         along = 0.0
@@ -312,8 +281,8 @@ def add_friction(
     return energy
 
 
-@compiled
-def factor(band: NDArray[np.float64]) -> bool:
+@compiled_uncounted
+def factor(band: Vector) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
     for i in range(band.shape[0]):
         low = max(0, i - WIDTH + 1)
@@ -330,8 +299,8 @@ def factor(band: NDArray[np.float64]) -> bool:
     return True
 
 
-@compiled
-def back_substitute(band: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+@compiled_uncounted
+def back_substitute(band: Vector, right: Vector) -> None:
     """Solve in place with the factor that `factor` left."""
     size = band.shape[0]
     for i in range(size):

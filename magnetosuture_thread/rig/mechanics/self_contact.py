@@ -17,23 +17,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes
+from magnetosuture_thread.compiled import compiled, compiled_uncounted
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector
 from magnetosuture_thread.rig.mechanics.rod import Rod, back_substitute
 
 NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
 
 
-@compiled
-def _side(q: NDArray[np.float64], a: int, b: int, c: int) -> float:
+@compiled_uncounted
+def _side(q: Vector, a: int, b: int, c: int) -> float:
     """Return twice the area of the triangle of three nodes, by their first unknowns, positive counter-clockwise."""
     return float((q[b] - q[a]) * (q[c + 1] - q[a + 1]) - (q[b + 1] - q[a + 1]) * (q[c] - q[a]))
 
 
-@compiled
-def _cross(q: NDArray[np.float64], a: int, b: int) -> bool:
+@compiled_uncounted
+def _cross(q: Vector, a: int, b: int) -> bool:
     """Return whether the segments from two nodes on cross, by the nodes' first unknowns; one that is none does not."""
     if min(a, b) < 1 or max(a, b) + 3 >= q.shape[0] or abs(a - b) < 4:
         return False
@@ -43,8 +42,8 @@ def _cross(q: NDArray[np.float64], a: int, b: int) -> bool:
     )
 
 
-@compiled
-def crosses_anew(start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
+@compiled_uncounted
+def crosses_anew(start: Vector, end: Vector) -> bool:
     """Return whether two segments cross at the end of a step that did not at its start."""
     for a in range(1, end.shape[0] - 6, 2):
         for b in range(a + 4, end.shape[0] - 2, 2):
@@ -55,8 +54,8 @@ def crosses_anew(start: NDArray[np.float64], end: NDArray[np.float64]) -> bool:
     return False
 
 
-@compiled
-def find_pairs(q: NDArray[np.float64], rod: Rod, shapes: Shapes, pairs: NDArray[np.float64]) -> int:
+@compiled_uncounted
+def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
     """Write what of the thread is near itself at the start of a step.
 
     What crosses itself already is free to move apart.
@@ -97,30 +96,30 @@ def find_pairs(q: NDArray[np.float64], rod: Rod, shapes: Shapes, pairs: NDArray[
     return count
 
 
-@compiled
-def _write(row: NDArray[np.float64], a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
+@compiled_uncounted
+def _write(row: Vector, a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
     row[0], row[1], row[2], row[3], row[4], row[5] = a, b, s, x, y, limit
 
 
-@compiled
-def _places(row: NDArray[np.float64], places: NDArray[np.int64], weights: NDArray[np.float64]) -> None:
-    """Write the six unknowns of a row and the derivative of its gap or slip by each."""
-    a, b, s = int(row[0]), int(row[1]), row[2]
-    for d in range(2):
-        places[d], places[2 + d], places[4 + d] = a + d, b + d, b + 2 + d
-        weights[d], weights[2 + d], weights[4 + d] = row[3 + d], -(1.0 - s) * row[3 + d], -s * row[3 + d]
+@compiled_uncounted
+def _place(row: Vector, r: int) -> tuple[int, float]:
+    """Return one of the six unknowns of a row, by its number, and the derivative of the row's gap or slip by it."""
+    s, weight = row[2], row[3 + r % 2]
+    if r < 2:
+        return int(row[0]) + r, weight
+    return int(row[1]) + r - 2, -weight * (1.0 - s if r < 4 else s)
 
 
-@compiled
+@compiled_uncounted
 def add_pairs(
-    q: NDArray[np.float64],
-    start: NDArray[np.float64],
+    q: Vector,
+    start: Vector,
     slip: float,
     diameter: float,
     stiffness: float,
-    pairs: NDArray[np.float64],
-    second: NDArray[np.float64],
-    gradient: NDArray[np.float64],
+    pairs: Vector,
+    second: Vector,
+    gradient: Vector,
 ) -> float:
     """Add energy and gradient of all rows, and write the second derivative of each by its gap or slip.
 
@@ -134,12 +133,12 @@ def add_pairs(
         second: written, shape (p,).
         gradient: added to, shape (N,).
     """
-    energy, places, weights = 0.0, np.empty(6, dtype=np.int64), np.empty(6)
+    energy = 0.0
     for row in range(pairs.shape[0]):
-        _places(pairs[row], places, weights)
         along, limit = 0.0, pairs[row, 5]
         for r in range(6):
-            along += weights[r] * (q[places[r]] - (start[places[r]] if limit != NORMAL else 0.0))
+            at, weight = _place(pairs[row], r)
+            along += weight * (q[at] - (start[at] if limit != NORMAL else 0.0))
         if limit == NORMAL:
             depth = max(diameter - along, 0.0)
             energy += 0.5 * stiffness * depth * depth
@@ -150,18 +149,13 @@ def add_pairs(
             force, second[row] = limit * along / root, limit * slip * slip / root**3
         if force != 0.0:
             for r in range(6):
-                gradient[places[r]] += force * weights[r]
+                at, weight = _place(pairs[row], r)
+                gradient[at] += force * weight
     return energy
 
 
 @compiled
-def couple(
-    chol: NDArray[np.float64],
-    pairs: NDArray[np.float64],
-    second: NDArray[np.float64],
-    first_free: int,
-    step: NDArray[np.float64],
-) -> None:
+def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: Vector) -> None:
     """Correct a step, found with the factor of the band alone, for the rows' second derivatives.
 
     Args:
@@ -174,20 +168,20 @@ def couple(
     rows = np.flatnonzero(second > 0.0)
     if len(rows) == 0:
         return
-    size, places, weights = len(rows), np.empty(6, dtype=np.int64), np.empty(6)
+    size = len(rows)
     columns, matrix, force = np.zeros((size, step.shape[0])), np.zeros((size, size)), np.zeros(size)
     for i in range(size):
-        _places(pairs[rows[i]], places, weights)
         for r in range(6):
-            if places[r] >= first_free:
-                columns[i, places[r]] += weights[r]
+            at, weight = _place(pairs[rows[i]], r)
+            if at >= first_free:
+                columns[i, at] += weight
         back_substitute(chol, columns[i])
     for i in range(size):
-        _places(pairs[rows[i]], places, weights)
         matrix[i, i] = 1.0 / second[rows[i]]
         for r in range(6):
-            if places[r] >= first_free:
-                force[i] += weights[r] * step[places[r]]
+            at, weight = _place(pairs[rows[i]], r)
+            if at >= first_free:
+                force[i] += weight * step[at]
                 for j in range(size):
-                    matrix[i, j] += weights[r] * columns[j, places[r]]
+                    matrix[i, j] += weight * columns[j, at]
     step -= np.linalg.solve(matrix, force) @ columns

@@ -85,10 +85,3 @@ def test_a_stage_has_two_coils_on_each_board_in_order(tmp_path):
     assert stage.currents() == pytest.approx([0.25, 0.5, 1.25, 1.5, 2.25, 2.5], rel=1e-3)
     stage.close()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_stage_that_cannot_open_leaves_nothing(tmp_path):
-    stage = PowerStage([str(tmp_path / "a"), str(tmp_path / "nowhere" / "b")], 24.0, 1.0, 0.01)
-    with pytest.raises(ConfigurationError):
-        stage.open()
-    assert not list(tmp_path.iterdir())
