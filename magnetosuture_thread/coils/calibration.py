@@ -24,10 +24,6 @@ MIN_COILS = 3  # needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
 REQUIRED_KEYS = ("name", "angle", "distance", "radius", "field_per_current")
 
-FILE_HEADER = """\
-# Calibration of a rig's coils, for the parameter `calibration` of coil_bridge. SI units: rad, m, T/A, ohm, T.
-"""
-
 
 @dataclass(frozen=True)
 class CoilCalibration:
@@ -48,11 +44,15 @@ class CoilCalibration:
     def to_yaml(self) -> str:
         """Return the calibration as YAML text."""
         head = {**{key: getattr(self, key) for key in TEXT_KEYS}, "model": MODEL}
+        header = (
+            "# Calibration of a rig's coils, for the parameter `calibration` of coil_bridge. "
+            "SI units: rad, m, T/A, ohm, T.\n"
+        )
         coils = []
         for coil in self.coils:
             named = {k: float(f"{v:.8g}") if isinstance(v, float) else v for k, v in to_mapping(coil).items()}
             coils.append({key: value for key, value in named.items() if key in REQUIRED_KEYS or value})
-        return FILE_HEADER + yaml.safe_dump({**head, "coils": coils}, sort_keys=False, allow_unicode=True)
+        return header + yaml.safe_dump({**head, "coils": coils}, sort_keys=False, allow_unicode=True)
 
 
 def read_calibration(path: Path) -> CoilCalibration:
@@ -106,7 +106,6 @@ MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
 RADIUS_BOUNDS = (0.002, 0.5)  # m
-COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
 PARAMETERS = ("angle", "distance", "radius", "field_per_current")
 # Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
 # unidentifiable. The field hardly depends on the radius, which has no such limit.
@@ -337,7 +336,7 @@ def _solve(
         of_coil = current * (axial[:, None] * axis + outwards[:, None] * across)
         return np.asarray(((x[-2:] if background is None else background / size) + of_coil - field).ravel())
 
-    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), JOINT_TOLERANCE if background is None else COIL_TOLERANCE)
+    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12 if background is None else 1e-5)
     options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
     found = [least_squares(residuals, np.clip(start, low, high), max_nfev=300, **options) for start in starts]
     return min(found, key=lambda solution: float(solution.cost))

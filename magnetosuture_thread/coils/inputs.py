@@ -27,7 +27,6 @@ BodyVelocity = tuple[float, float, float]
 ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
-MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
 
 
 class StampAges:
@@ -501,7 +500,7 @@ class PoseExtrapolator:
         if covariance is None or not np.isfinite(covariance).all():
             return 0.0
         square = covariance[0, 0] + covariance[1, 1] + self._needle.chord**2 * covariance[2, 2]
-        return min(MAX_POSE_UNCERTAINTY, 3.0 * math.sqrt(max(0.0, square)))
+        return min(2e-3, 3.0 * math.sqrt(max(0.0, square)))
 
     def _check_stall(self, arrival: float) -> None:
         """Drop the pose after a stall longer than the coils certainly hold their currents."""

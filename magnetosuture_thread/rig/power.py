@@ -238,8 +238,6 @@ def answer(address: int, command: int, data: bytes) -> bytes:
     return data + struct.pack(">H", checksum(bytes((address, command)) + data))
 
 
-TICK = 0.01  # s between two looks at the boards' own timeouts
-ASK = b"?"
 TIMEOUT = 5.0  # s for the boards to be taken away
 
 
@@ -316,7 +314,8 @@ class Line:
 
     def _serve(self) -> None:
         while not self._ends.is_set():
-            readable, _, _ = select.select([self._host], [], [], TICK)
+            # The boards' own timeouts are looked at every 10 ms.
+            readable, _, _ = select.select([self._host], [], [], 0.01)
             if readable:
                 with suppress(OSError):  # nobody reads, and the line is full
                     data, now = os.read(self._host, 4096), time.monotonic()
@@ -438,7 +437,7 @@ class StageProcess:
             GraphError: the process ended.
         """
         with suppress(BrokenPipeError):  # reading tells
-            cast(BinaryIO, self._running().stdin).write(ASK)
+            cast(BinaryIO, self._running().stdin).write(b"?")
         return np.frombuffer(self._read(self._bytes))
 
     def _read(self, size: int | None = None) -> bytes:

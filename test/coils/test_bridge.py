@@ -215,36 +215,60 @@ def test_after_a_stall_in_which_the_driver_went_to_zero_it_starts_from_rest():
     assert np.abs(after.allocation.currents).max() <= 100.0 * 2 * PERIOD + 1e-9
 
 
-@pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0)])
-@pytest.mark.parametrize(
-    ("obstacles", "latency", "interval"),
-    [((), 0, 1), ((0.006, 0.0, 0.002), 0, 1), ((), 16, 7), ((0.006, 0.0, 0.002), 30, 6)],
-)
-def test_the_needle_never_comes_closer_than_it_may(
-    towards: tuple[float, float], obstacles: tuple[float, ...], latency: int, interval: int
-):
-    """Told to go on for ever, it comes to rest before the wall or the obstacle, by what its coils give it.
+def driven(
+    plant: Plant,
+    steps: int,
+    *,
+    tail: NDArray[np.float64] = TAIL,
+    pull: NDArray[np.float64] | float = 0.0,
+    error: NDArray[np.float64] | float = 0.0,
+    latency: int = 0,
+    interval: int = 1,
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the needle's tail and heading after each step, by what its coils give it.
 
-    Also where poses come late, and seldom; both in periods.
+    It is pulled at a velocity; its poses are off by an error, and come late and seldom, both in periods.
     """
-    settings = CoilBridgeSettings()
-    posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
-    scene = Scene(Dish(0.035), posts)
-    plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
-    plant.tail = None
-    tail, heading = TAIL - np.array([0.004, 0.0]), EAST
-    needle, safety = settings.needle().kinematics, settings.safety_filter(scene)
-    least = np.inf
+    heading, needle, plant.tail = EAST, plant.settings.needle().kinematics, None
     poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
-    for number in range(1, 1000):
+    for number in range(1, steps):
         poses.append((plant.time, tail, heading))
         if number > latency and number % interval == 0:
             then, old_tail, old_heading = poses[number - 1 - latency]
-            plant.bridge.extrapolator.update(old_tail, old_heading, then, number, plant.time, plant.time)
-        output = plant.run(PERIOD)[0]
-        moved = needle.body_velocity(heading, output.allocation.velocity)
-        tail, heading = needle.moved(tail, heading, *moved, PERIOD)
-        least = min(least, safety.clearance(tail, heading))
+            plant.bridge.on_pose(old_tail - error, old_heading, then, number, plant.time, plant.time)
+        found = plant.run(PERIOD)[0].allocation
+        e = needle.chord_direction(heading)
+        n = np.array([-e[1], e[0]])
+        drift = found.drift if plant.settings.motion_compensation else 0.0  # else it counts as part of the turn
+        along, across = needle.body_velocity(heading, found.velocity)
+        tail, heading = needle.moved(tail, heading, along, across - drift, PERIOD)
+        tail = tail + PERIOD * (drift * n + pull)
+        yield tail, heading
+
+
+@pytest.mark.parametrize("towards", [(0.7, 0.7), (-1.0, 0.0)])
+@pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
+@pytest.mark.parametrize(
+    ("compensates", "pull", "latency", "interval"),
+    [(False, 0.0, 0, 1), (False, 0.0, 30, 6), (True, 0.0, 10, 10), (True, 1e-3, 10, 10)],
+)
+def test_the_needle_never_comes_closer_than_it_may(
+    towards: tuple[float, float],
+    obstacles: tuple[float, ...],
+    compensates: bool,
+    pull: float,
+    latency: int,
+    interval: int,
+):
+    """Told to go on for ever, it comes to rest before the wall or the obstacle, also where it is pulled to it."""
+    settings = CoilBridgeSettings(motion_compensation=compensates)
+    posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
+    scene = Scene(Dish(0.035), posts)
+    plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
+    safety, drag = settings.safety_filter(scene), pull * np.array(towards)
+    begin = TAIL - np.array([0.004, 0.0])
+    motion = driven(plant, 1000, tail=begin, pull=drag, latency=latency, interval=interval)
+    least = min(safety.clearance(tail, heading) for tail, heading in motion)
     assert least > settings.keep_out - 1e-9
     assert least < 0.003  # it did get there
 
@@ -255,56 +279,11 @@ def test_a_pose_error_within_pose_margin_brings_the_needle_no_closer_than_keep_o
     for margin in (0.0, error):
         settings, scene = CoilBridgeSettings(pose_margin=margin), Scene(Dish(0.035), ())
         plant = Plant(settings, scene, velocity=(0.02, 0.0)).ready()
-        plant.tail = None
-        tail, heading, needle = np.array([0.004, 0.0]), EAST, settings.needle().kinematics
-        for number in range(1, 800):
-            if number % 10 == 0:
-                measured = tail - error * EAST
-                plant.bridge.extrapolator.update(measured, heading, plant.time, number, plant.time, plant.time)
-            moved = needle.body_velocity(heading, plant.run(PERIOD)[0].allocation.velocity)
-            tail, heading = needle.moved(tail, heading, *moved, PERIOD)
-        least[margin] = scene.dish.radius - math.hypot(*needle.tip(tail, heading)) - settings.keep_out
+        *_, at_end = driven(plant, 800, tail=np.array([0.004, 0.0]), error=error * EAST, interval=10)
+        tip = settings.needle().kinematics.tip(*at_end)
+        least[margin] = scene.dish.radius - math.hypot(*tip) - settings.keep_out
     assert least[0.0] < -0.8 * error
     assert -1e-9 < least[error] < 1e-5
-
-
-def compensated_motion(
-    plant: Plant, tail: NDArray[np.float64], heading: NDArray[np.float64], pull: NDArray[np.float64], steps: int
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield the needle's tail and heading after each step: it is pulled, and its poses come late and seldom."""
-    plant.tail = None
-    needle = plant.bridge._settings.needle().kinematics
-    poses: list[tuple[float, NDArray[np.float64], NDArray[np.float64]]] = []
-    for number in range(1, steps):
-        poses.append((plant.time, tail, heading))
-        if number > 10 and number % 10 == 0:
-            then, old_tail, old_heading = poses[number - 11]
-            plant.bridge.on_pose(old_tail, old_heading, then, number, plant.time, plant.time)
-        found = plant.run(PERIOD)[0].allocation
-        e = needle.chord_direction(heading)
-        n = np.array([-e[1], e[0]])
-        turning = float(found.velocity @ n) - found.drift
-        tail, heading = needle.moved(tail, heading, float(found.velocity @ e), turning, PERIOD)
-        tail = tail + PERIOD * (found.drift * n + pull)
-        yield tail, heading
-
-
-@pytest.mark.parametrize("towards", [(0.7, 0.7), (0.3, -0.9)])
-@pytest.mark.parametrize("obstacles", [(), (0.006, 0.0, 0.002)])
-@pytest.mark.parametrize("pull", [0.0, 1e-3])
-def test_nor_does_a_needle_whose_pull_is_compensated(
-    towards: tuple[float, float], obstacles: tuple[float, ...], pull: float
-):
-    """Something pulls it to the wall or the obstacle; poses are late and seldom."""
-    settings = CoilBridgeSettings(motion_compensation=True)
-    posts = (SceneShape("post", "instrument", Disc(obstacles[:2], obstacles[2])),) if obstacles else ()
-    scene = Scene(Dish(0.035), posts)
-    plant = Plant(settings, scene, velocity=(0.02 * towards[0], 0.02 * towards[1])).ready()
-    safety, drag = settings.safety_filter(scene), pull * np.array(towards) / math.hypot(*towards)
-    motion = compensated_motion(plant, TAIL - np.array([0.004, 0.0]), EAST, drag, 1200)
-    least = min(safety.clearance(tail, heading) for tail, heading in motion)
-    assert least > settings.keep_out - 1e-9
-    assert least < 0.003  # it did get there
 
 
 def test_an_error_that_nobody_foresaw_ends_at_zero_and_is_latched(monkeypatch: pytest.MonkeyPatch):

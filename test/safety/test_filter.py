@@ -12,8 +12,8 @@ from benchmarks.keep_out import Needle, World, random_scene
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
-from magnetosuture_thread.safety.barriers import BAND
 from magnetosuture_thread.safety.filter import MAX_SIDESTEP, SIDESTEP_MARGIN, SIDESTEP_RATE
+from magnetosuture_thread.safety.motion import BAND
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 
 EAST, NORTH = np.array([1.0, 0.0]), np.array([0.0, 1.0])
@@ -138,18 +138,6 @@ def test_shapes_are_named_right_whatever_kinds_come_before_them():
     ):
         assert safety.safe_share(velocity, at, EAST)[1] == name
         assert safety.filter(velocity, at, EAST).active == (name,)
-
-
-HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
-
-
-HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
-
-
-HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
-
-
-HOLD, RATE, KEEP, LENGTH = 0.2, 5.0, 5e-4, 0.007
 
 
 def test_a_curved_needle_is_kept_clear_of_the_wall_with_its_belly():

@@ -33,7 +33,7 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
 
 FULL_DUTY = 32767  # duty of the full supply voltage
-MIN_RETRY_DELAY, MAX_RETRY_DELAY = 0.1, 2.0  # s between two attempts to connect
+MAX_RETRY_DELAY = 2.0  # s between two attempts to connect
 DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the supply
 MAX_MISMATCHES, MAX_OVERCURRENTS = 2, 3  # consecutive answers that are a fault; the first may be a lost packet
 # Consecutive measurements of a missing current: a fifth of a second and more at 200 Hz, so that neither a change of
@@ -50,8 +50,6 @@ OPEN_PROBLEMS = {
 }
 ACK = b"\xff"
 MAX_ATTEMPTS = 2
-# Pause after a failure, in which the board drops a partial packet.
-RETRY_DELAY = 0.015  # s
 
 
 def retry_delay(failures: int) -> float:
@@ -60,7 +58,7 @@ def retry_delay(failures: int) -> float:
     >>> [retry_delay(failures) for failures in (1, 2, 5, 6, 10**6)]
     [0.1, 0.2, 1.6, 2.0, 2.0]
     """
-    return min(MAX_RETRY_DELAY, MIN_RETRY_DELAY * 2.0 ** min(failures - 1, 10))
+    return min(MAX_RETRY_DELAY, 0.1 * 2.0 ** min(failures - 1, 10))
 
 
 def duties_for(currents: Vector, resistances: Vector, voltage: float) -> tuple[tuple[int, ...], bool]:
@@ -507,7 +505,7 @@ class Board:
 
     def _drain(self) -> bool:
         """Return whether all earlier answers of the board have come."""
-        time.sleep(RETRY_DELAY)
+        time.sleep(0.015)  # in which the board drops a partial packet
         self._expires = math.inf
         result = self._attempt(self._device.ReadMainBatteryVoltage, self._address)  # no such answer begins with an ACK
         self._port.is_drained = result is not None and bool(result[0])

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magnetosuture_thread.compiled import compiled, compiled_uncounted
+from magnetosuture_thread.compiled import compiled, compiled_inner
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, Vector
@@ -27,18 +27,20 @@ from magnetosuture_thread.rig.mechanics.rod import (
     add_contact,
     add_drag,
     add_friction,
+    add_pairs,
     add_stretching,
     back_substitute,
+    couple,
+    crosses_anew,
     drag_matrices,
     factor,
     find_contacts,
     find_friction,
+    find_pairs,
 )
-from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, crosses_anew, find_pairs
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
-MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
 MAX_ITERATIONS = 60  # of Newton in a step
@@ -95,7 +97,7 @@ class System(NamedTuple):
     rows: Vector
 
 
-@compiled_uncounted
+@compiled_inner
 def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
@@ -219,7 +221,7 @@ class RigDynamics:
         heading: float,
         thread_points: Points,
         *,
-        largest_step: float = MAX_STEP,
+        largest_step: float = 2e-3,
     ) -> None:
         self.field = field
         length = thread.length / thread.segments
