@@ -114,14 +114,6 @@ def test_the_share_that_the_bridge_asks_for_knows_added_barriers():
     assert safety.safe_share(np.array([0.0, -0.02]), np.array([0.0, 0.0]), np.array([0.0, 1.0])) == (1.0, "")
 
 
-def test_the_share_that_keeps_an_added_barrier_includes_the_drift():
-    safety = needle(HalfPlane(0.001))
-    tail, east, drift = np.array([0.0, 0.0008]), np.array([1.0, 0.0]), 2e-3
-    share, name = safety.safe_share(np.zeros(2), tail, east, drift)  # the tip stays, and the tail moves twice as fast
-    assert name == "half_plane"
-    assert share == pytest.approx(2e-4 / (2.0 * drift * HOLD), abs=0.01)
-
-
 @pytest.mark.parametrize("unit", [1.0, 250.0])
 def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit: float):
     class Slow(HalfPlane):

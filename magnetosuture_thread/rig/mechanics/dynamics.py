@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magnetosuture_thread.compiled import compiled, compiled_inner
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, Vector
@@ -97,7 +97,7 @@ class System(NamedTuple):
     rows: Vector
 
 
-@compiled_inner
+@compiled
 def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 

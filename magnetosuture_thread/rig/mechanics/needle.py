@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.coils.field import fields_per_current
-from magnetosuture_thread.compiled import compiled_uncounted
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts
 
@@ -147,7 +147,7 @@ class Needle(NamedTuple):
     clamp: float
 
 
-@compiled_uncounted
+@compiled
 def add_needle(
     q: Vector,
     field: Vector,
@@ -222,7 +222,7 @@ def add_needle(
     return float(energy)
 
 
-@compiled_uncounted
+@compiled
 def add_clamp(q: Vector, needle: Needle, segment: float, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add d |x_1 - x_0 + R (D, 0)|^2, the half cell of bending at a clamped tail.
 

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inner, compiled_uncounted
+from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts, segment_contacts
 
 SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
@@ -112,7 +112,7 @@ def drag_matrices(q: Vector, rod: Rod, scale: float) -> Vector:
     return drag
 
 
-@compiled_inner
+@compiled
 def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vector) -> float:
     """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
     energy = 0.0
@@ -129,7 +129,7 @@ def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vect
     return energy
 
 
-@compiled_uncounted
+@compiled
 def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
     energy = 0.0
@@ -159,7 +159,7 @@ def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: 
     return energy
 
 
-@compiled_uncounted
+@compiled
 def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     """Add sum EI / D (1 - cos(phi_i)) at inner nodes, phi_i the turn from segment to segment.
 
@@ -185,7 +185,7 @@ def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     return energy
 
 
-@compiled_uncounted
+@compiled
 def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     """Write what nodes 1 ... n and segments sink into; return how many.
 
@@ -216,7 +216,7 @@ def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     return count
 
 
-@compiled_uncounted
+@compiled
 def add_contact(q: Vector, k: float, rows: Vector, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add k / 2 depth^2 of every contact, the rows of `find_contacts`.
 
@@ -272,7 +272,7 @@ def find_friction(contacts: Vector, shapes: Shapes) -> Vector:
     return np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
 
 
-@compiled_inner
+@compiled
 def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradient: Vector, band: Vector) -> float:
     """Add the friction of a step from `start` to q; `slip` is e [m]."""
     energy = 0.0
@@ -294,7 +294,7 @@ def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradie
     return energy
 
 
-@compiled_uncounted
+@compiled
 def factor(band: Vector) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
     for i in range(band.shape[0]):
@@ -312,7 +312,7 @@ def factor(band: Vector) -> bool:
     return True
 
 
-@compiled_inner
+@compiled
 def back_substitute(band: Vector, right: Vector) -> None:
     """Solve in place with the factor that `factor` left."""
     size = band.shape[0]
@@ -328,13 +328,13 @@ def back_substitute(band: Vector, right: Vector) -> None:
         right[i] = total / band[i, 0]
 
 
-@compiled_inner
+@compiled
 def _side(q: Vector, a: int, b: int, c: int) -> float:
     """Return twice the area of the triangle of three nodes, by their first unknowns, positive counter-clockwise."""
     return float((q[b] - q[a]) * (q[c + 1] - q[a + 1]) - (q[b + 1] - q[a + 1]) * (q[c] - q[a]))
 
 
-@compiled_inner
+@compiled
 def _cross(q: Vector, a: int, b: int) -> bool:
     """Return whether the segments from two nodes on cross, by the nodes' first unknowns; one that is none does not."""
     if min(a, b) < 1 or max(a, b) + 3 >= q.shape[0] or abs(a - b) < 4:
@@ -345,7 +345,7 @@ def _cross(q: Vector, a: int, b: int) -> bool:
     )
 
 
-@compiled_uncounted
+@compiled
 def crosses_anew(start: Vector, end: Vector) -> bool:
     """Return whether two segments cross at the end of a step that did not at its start."""
     for a in range(1, end.shape[0] - 6, 2):
@@ -357,7 +357,7 @@ def crosses_anew(start: Vector, end: Vector) -> bool:
     return False
 
 
-@compiled_uncounted
+@compiled
 def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
     """Write what of the thread is near itself at the start of a step.
 
@@ -399,12 +399,12 @@ def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
     return count
 
 
-@compiled_inner
+@compiled
 def _write(row: Vector, a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
     row[0], row[1], row[2], row[3], row[4], row[5] = a, b, s, x, y, limit
 
 
-@compiled_inner
+@compiled
 def _place(row: Vector, r: int) -> tuple[int, float]:
     """Return one of the six unknowns of a row, by its number, and the derivative of the row's gap or slip by it."""
     s, weight = row[2], row[3 + r % 2]
@@ -413,7 +413,7 @@ def _place(row: Vector, r: int) -> tuple[int, float]:
     return int(row[1]) + r - 2, -weight * (1.0 - s if r < 4 else s)
 
 
-@compiled_uncounted
+@compiled
 def add_pairs(
     q: Vector,
     start: Vector,

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties, minimise
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 
 Vector = NDArray[np.float64]
@@ -195,19 +194,3 @@ def test_the_thread_goes_round_an_obstacle(kind: str):
     assert np.abs(made.tension).max() / POLYAMIDE.stretching_stiffness < 1e-3
     # It hangs over the far side.
     assert made.thread[:, 0].max() > 2e-3
-
-
-def test_a_step_that_fails_is_halved_and_the_time_is_kept(monkeypatch: pytest.MonkeyPatch):
-    made, plain, calls = rig(), rig(), [0]
-
-    def sometimes(*arguments: Any) -> tuple[int, float, float]:
-        calls[0] += 1
-        return (-1, 1.0, 1.0) if calls[0] in (3, 4) else minimise(*arguments)
-
-    steered(plain, 2.0 * FRAME)
-    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.minimise", sometimes)
-    steered(made, FRAME)
-    assert made.halvings == 2
-    steered(made, FRAME)
-    assert made.time == pytest.approx(2.0 * FRAME)
-    np.testing.assert_allclose(made.thread, plain.thread, atol=1e-4)
