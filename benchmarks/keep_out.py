@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import cmath
 import contextlib
+import copy
 import dataclasses
 import math
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,11 +52,9 @@ class Needle:
 
     def __post_init__(self) -> None:
         """Lay its axis around the middle of its chord, along the real axis."""
-        s = np.linspace(0.0, self.length, 2 if self.curvature == 0.0 else 161)
-        if self.curvature == 0.0:
-            axis = s.astype(complex)
-        else:
-            axis = (np.exp(1j * self.curvature * s) - 1.0) / (1j * self.curvature)
+        turn, straight = 1j * self.curvature, self.curvature == 0.0
+        s = np.linspace(0.0, self.length, 2 if straight else 161)
+        axis = s.astype(complex) if straight else (np.exp(turn * s) - 1.0) / turn
         self.chord = abs(axis[-1])
         self._tilt = cmath.phase(axis[-1])
         self.axis = (axis * cmath.exp(-1j * self._tilt)) - 0.5 * self.chord
@@ -68,8 +66,7 @@ class Needle:
         way = inside.real * duration
         if abs(turn * duration) > 1e-7:
             way = inside.real * (cmath.exp(1j * turn * duration) - 1.0) / (1j * turn)
-        moved = object.__new__(Needle)
-        moved.__dict__.update(self.__dict__)
+        moved = copy.copy(self)
         moved.middle = self.middle + way * cmath.exp(1j * self.angle)
         moved.angle = self.angle + turn * duration
         return moved
@@ -219,35 +216,10 @@ class Tally:
 
     def add(self, other: Tally) -> None:
         """Add what another found."""
-        for name in ("seconds", "steps", "episodes", "driven", "pressed", "stalls", "faults", "violations", "worst"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.deepest = max(self.deepest, other.deepest)
-
-
-class LatePoses:
-    """Poses of a needle that are true at their stamp, and come later.
-
-    Args:
-        random: of the times.
-        period: between two poses [s].
-        delay: maximum of their age when they come [s].
-        begin: stamp of the first [s].
-    """
-
-    def __init__(self, random: np.random.Generator, period: float, delay: float, begin: float) -> None:
-        self._random, self._period, self._delay, self.next = random, period, delay, begin
-        self._waiting: deque[tuple[float, float, tuple[np.ndarray, np.ndarray]]] = deque()
-
-    def take(self, needle: Needle, stamp: float) -> None:
-        """Measure a pose, unless it would come before the last."""
-        late = self._delay * float(self._random.uniform(0.5, 1.0))
-        if not self._waiting or stamp + late >= self._waiting[-1][0]:
-            self._waiting.append((stamp + late, stamp, needle.pose()))
-
-    def due(self, now: float) -> Iterator[tuple[float, tuple[np.ndarray, np.ndarray]]]:
-        """Yield stamp and pose of those that have come."""
-        while self._waiting and self._waiting[0][0] <= now:
-            yield self._waiting.popleft()[1:]
+        deepest = max(self.deepest, other.deepest)
+        for name, value in vars(other).items():
+            setattr(self, name, getattr(self, name) + value)
+        self.deepest = deepest
 
 
 def attack(seed: int, duration: float = EPISODE) -> Tally:
@@ -271,15 +243,23 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
     period, now, end = 1.0 / settings.rate, START, START + duration
     pose_period = min(float(random.uniform(0.005, 0.1)), 0.3 * settings.pose_timeout)
     delay = float(random.uniform(0.0, 0.9)) * max(0.0, settings.pose_timeout - 3.0 * period - pose_period)
-    poses, number = LatePoses(random, pose_period, delay, now), 0
+    waiting: deque[tuple[float, float, tuple[np.ndarray, np.ndarray]]] = deque()  # due, stamp and pose
+    next_pose, number = now, 0
+
+    def measure(measured: Needle, stamp: float) -> None:
+        """Measure a pose that is true at its stamp and comes later, unless it would come before the last."""
+        due = stamp + delay * float(random.uniform(0.5, 1.0))
+        if not waiting or due >= waiting[-1][0]:
+            waiting.append((due, stamp, measured.pose()))
+
     command, mode, until = np.zeros(2), 0, 0.0
     clearance = world.clearance([needle.points()])
     while now < end:
-        if now >= poses.next:
-            poses.take(needle, now)
-            poses.next = now + pose_period
-        for stamp, (tail, heading) in poses.due(now):
-            number += 1
+        if now >= next_pose:
+            measure(needle, now)
+            next_pose = now + pose_period
+        while waiting and waiting[0][0] <= now:
+            (_, stamp, (tail, heading)), number = waiting.popleft(), number + 1
             try:
                 bridge.on_pose(tail, heading, stamp, number, now, now)
             except InvalidInputError as error:
@@ -317,9 +297,9 @@ def attack(seed: int, duration: float = EPISODE) -> Tally:
                 if depth > TOLERANCE:
                     found.violations += 1
                     found.worst.append({"seed": seed, "time": now - START, "deeper": depth})
-            while poses.next < now + moving:  # poses fall due within the motion too
-                poses.take(needle.moved(velocity, poses.next - now), poses.next)
-                poses.next += pose_period
+            while next_pose < now + moving:  # poses fall due within the motion too
+                measure(needle.moved(velocity, next_pose - now), next_pose)
+                next_pose += pose_period
             needle = needle.moved(velocity, moving)
             clearance = world.clearance([needle.points()])
         now += gap
@@ -350,12 +330,8 @@ def _start(random: np.random.Generator, settings: CoilBridgeSettings, world: Wor
     """Return a needle that keeps clear of everything; None if there is no room."""
     for _ in range(60):
         r, a = world.radius * math.sqrt(random.uniform()), random.uniform(-math.pi, math.pi)
-        needle = Needle(
-            settings.needle_length,
-            settings.needle_curvature,
-            cmath.rect(r, a),
-            float(random.uniform(-math.pi, math.pi)),
-        )
+        angle = float(random.uniform(-math.pi, math.pi))
+        needle = Needle(settings.needle_length, settings.needle_curvature, cmath.rect(r, a), angle)
         if world.clearance([needle.points()]) > 1.2 * settings.keep_out + 0.01 * settings.needle_length:
             return needle
     return None
@@ -393,16 +369,11 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
         if total.seconds >= shown + REPORT_EVERY:
             shown = total.seconds
             print(f"{shown:.0f} s, {total.violations} violations", file=sys.stderr, flush=True)
-    figures: dict[str, Any] = {
-        **dataclasses.asdict(total),
-        "worst": total.worst[:20],
-        "cpu_seconds": time.process_time() - began,
-    }
-    if math.isinf(total.deepest):
-        figures["deepest"] = None  # the needle was never near; JSON has no infinity
+    deepest = None if math.isinf(total.deepest) else total.deepest  # the needle was never near; JSON has no infinity
+    found = {"worst": total.worst[:20], "deepest": deepest, "cpu_seconds": time.process_time() - began}
     log(
         f"{total.seconds:.0f} s in {total.episodes} episodes, {total.steps} steps, {total.stalls} stalls, "
         f"{total.faults} faults: "
         f"{total.violations} violations beyond {1e6 * TOLERANCE:g} um, deepest {1e6 * total.deepest:.4f} um"
     )
-    return figures, not total.violations
+    return {**dataclasses.asdict(total), **found}, not total.violations

@@ -24,10 +24,6 @@ MIN_COILS = 3  # needed to pull in every direction
 TEXT_KEYS = ("name", "date", "notes")
 REQUIRED_KEYS = ("name", "angle", "distance", "radius", "field_per_current")
 
-FILE_HEADER = """\
-# Calibration of a rig's coils, for the parameter `calibration` of coil_bridge. SI units: rad, m, T/A, ohm, T.
-"""
-
 
 @dataclass(frozen=True)
 class CoilCalibration:
@@ -48,8 +44,15 @@ class CoilCalibration:
     def to_yaml(self) -> str:
         """Return the calibration as YAML text."""
         head = {**{key: getattr(self, key) for key in TEXT_KEYS}, "model": MODEL}
-        coils = [_rounded(to_mapping(coil)) for coil in self.coils]
-        return FILE_HEADER + yaml.safe_dump({**head, "coils": coils}, sort_keys=False, allow_unicode=True)
+        header = (
+            "# Calibration of a rig's coils, for the parameter `calibration` of coil_bridge. "
+            "SI units: rad, m, T/A, ohm, T.\n"
+        )
+        coils = []
+        for coil in self.coils:
+            named = {k: float(f"{v:.8g}") if isinstance(v, float) else v for k, v in to_mapping(coil).items()}
+            coils.append({key: value for key, value in named.items() if key in REQUIRED_KEYS or value})
+        return header + yaml.safe_dump({**head, "coils": coils}, sort_keys=False, allow_unicode=True)
 
 
 def read_calibration(path: Path) -> CoilCalibration:
@@ -91,14 +94,7 @@ def read_calibration(path: Path) -> CoilCalibration:
         if coils[-1].name in [coil.name for coil in coils[:-1]]:
             expected = "a name of its own for each"
             raise ConfigurationError("coils", f"two of the name {coils[-1].name}", expected, source)
-    name, date, notes = (content.get(key, "") for key in TEXT_KEYS)
-    return CoilCalibration(name, date, notes, tuple(coils))
-
-
-def _rounded(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values rounded to eight digits, without those that were not measured."""
-    named = {key: float(f"{value:.8g}") if isinstance(value, float) else value for key, value in values.items()}
-    return {key: value for key, value in named.items() if key in REQUIRED_KEYS or value}
+    return CoilCalibration(*(content.get(key, "") for key in TEXT_KEYS), tuple(coils))
 
 
 Array = NDArray[np.float64]
@@ -110,7 +106,6 @@ MAX_COILS = 64
 MIN_READINGS = 6  # of a coil with current: twelve numbers for four parameters, with some for the residual
 MIN_DISTANCE_RATIO = 1.05  # of a coil's distance to that of the farthest point
 RADIUS_BOUNDS = (0.002, 0.5)  # m
-COIL_TOLERANCE, JOINT_TOLERANCE = 1e-5, 1e-12  # of cost and parameters: initial fit of one coil, fit of all
 PARAMETERS = ("angle", "distance", "radius", "field_per_current")
 # Standard deviations, of the angle in rad, of the others relative: above, a parameter is poorly determined, or
 # unidentifiable. The field hardly depends on the radius, which has no such limit.
@@ -140,10 +135,6 @@ class ProbeMeasurements:
     field: NDArray[np.float64]
     lines: NDArray[np.int64]
 
-    def location(self, line: int) -> str:
-        """Return file and line number, for an error."""
-        return f"{self.source}, line {line}"
-
 
 def read_measurements(path: Path) -> ProbeMeasurements:
     """Read measurements from a CSV file with the columns coil, current, x, y, bx, by in any order, in SI units.
@@ -160,17 +151,21 @@ def read_measurements(path: Path) -> ProbeMeasurements:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise InvalidInputError(str(path), reason, "a readable CSV file") from None
-    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    rows = [(number, _cells(f"{path}, line {number}", line)) for number, line in numbered]
-    if not rows or sorted(rows[0][1]) != sorted(COLUMNS):
-        where, given = (f"{path}, line {rows[0][0]}", rows[0][1]) if rows else (str(path), "nothing")
-        raise InvalidInputError(where, given, f"the columns {','.join(COLUMNS)}")
-    (_, header), *rows = rows
-    if not rows:
+    rows: list[tuple[str, int, list[str]]] = []  # place, number and cells of each line
+    for number, line in enumerate(lines, 1):
+        where = f"{path}, line {number}"
+        if line.strip() and not line.startswith("#"):
+            try:
+                rows.append((where, number, [cell.strip() for cells in csv.reader([line]) for cell in cells]))
+            except csv.Error as error:
+                raise InvalidInputError(where, str(error), "comma-separated values") from None
+    where, _, header = rows[0] if rows else (str(path), 0, [])
+    if sorted(header) != sorted(COLUMNS):
+        raise InvalidInputError(where, header or "nothing", f"the columns {','.join(COLUMNS)}")
+    if len(rows) == 1:
         raise InvalidInputError(str(path), "a header only", "measurements below it")
     named, numbers = [], []
-    for number, cells in rows:
-        where = f"{path}, line {number}"
+    for where, _, cells in rows[1:]:
         if len(cells) != len(COLUMNS):
             raise InvalidInputError(where, f"{len(cells)} values", f"{len(COLUMNS)}: {','.join(header)}")
         values = dict(zip(header, cells, strict=True))
@@ -179,16 +174,8 @@ def read_measurements(path: Path) -> ProbeMeasurements:
         named.append(f"coil_{int(values['coil'])}" if _is_index(values["coil"]) else values["coil"])
         numbers.append([_number(f"{where}, {column}", values[column], column) for column in COLUMNS[1:]])
     names, table = _ordered_names(named, path), np.array(numbers)
-    coil = np.array([names.index(name) for name in named], dtype=np.int64)
-    at = np.array([number for number, _ in rows], dtype=np.int64)
+    coil, at = np.array([names.index(name) for name in named]), np.array([number for _, number, _ in rows[1:]])
     return ProbeMeasurements(str(path), names, coil, table[:, 0], table[:, 1:3], table[:, 3:], at)
-
-
-def _cells(where: str, line: str) -> list[str]:
-    try:
-        return [cell.strip() for cells in csv.reader([line]) for cell in cells]
-    except csv.Error as error:
-        raise InvalidInputError(where, str(error), "comma-separated values") from None
 
 
 def _is_index(text: str) -> bool:
@@ -286,8 +273,7 @@ def fit_calibration(data: ProbeMeasurements) -> CalibrationFit:
     off = data.field[data.current == 0.0]
     background = off.mean(axis=0) if len(off) else np.zeros(2)
     starts = [_start(data, index, background, size) for index in range(len(data.names))]
-    solve = _Problem(data, np.arange(len(data.names)), size)
-    found = solve.best([np.concatenate([*starts, background / size])], JOINT_TOLERANCE)
+    found = _solve(data, np.arange(len(data.names)), size, [np.concatenate([*starts, background / size])])
     difference = size * found.fun.reshape(-1, 2)
     residual = float(np.sqrt(np.mean(difference**2)))
     # A residual of more than a quarter of the measured field means other coils.
@@ -321,59 +307,51 @@ def _check_readings(data: ProbeMeasurements) -> None:
         raise InvalidInputError(f"{data.source}, bx and by", "less than 1e-6 T everywhere", "the field of coils in T")
 
 
-class _Problem:
-    """Residuals of some of the coils, in units of the field's size, over numbers of order one.
+def _solve(
+    data: ProbeMeasurements, coils: NDArray[np.int64], size: float, starts: list[Array], background: Array | None = None
+) -> Any:
+    """Return the best least-squares fit of some of the coils, from several starts, in numbers of order one.
 
-    The numbers are, for each coil, angle, log distance, log radius and field / size; then the background / size.
+    The numbers are, for each coil, angle, log distance, log radius and field / size; then the background / size, unless
+    that is given, as one coil alone might not tell it from its own field. Residuals are in units of the field's size.
     """
+    from scipy.optimize import least_squares  # here, as whoever reads a calibration alone need not wait for it
 
-    def __init__(self, data: ProbeMeasurements, coils: NDArray[np.int64], size: float) -> None:
-        rows = np.flatnonzero(np.isin(data.coil, coils))
-        self._of = np.searchsorted(coils, data.coil[rows])
-        self._points, self._current = data.points[rows], data.current[rows, None]
-        self._field = data.field[rows] / size
-        nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
-        low = [-np.inf, math.log(nearest), math.log(RADIUS_BOUNDS[0]), -np.inf]
-        # A coil is at most 1 m away.
-        high = [np.inf, math.log(max(1.0, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf]
-        count = len(coils)
-        self._bounds = (np.array(low * count + [-np.inf] * 2), np.array(high * count + [np.inf] * 2))
+    rows = np.flatnonzero(np.isin(data.coil, coils))
+    of, points, current = np.searchsorted(coils, data.coil[rows]), data.points[rows], data.current[rows, None]
+    field = data.field[rows] / size
+    # A coil is beyond all points, and at most 1 m away.
+    nearest = max(0.01, MIN_DISTANCE_RATIO * float(np.hypot(*data.points.T).max()))
+    low = [-np.inf, math.log(nearest), math.log(RADIUS_BOUNDS[0]), -np.inf] * len(coils)
+    high = [np.inf, math.log(max(1.0, 2.0 * nearest)), math.log(RADIUS_BOUNDS[1]), np.inf] * len(coils)
+    if background is None:
+        low, high = [*low, -np.inf, -np.inf], [*high, np.inf, np.inf]
 
-    def best(self, starts: list[Array], tolerance: float, background: bool = True) -> Any:
-        """Return the best solution of several starts."""
-        from scipy.optimize import least_squares  # here, as whoever reads a calibration alone need not wait for it
-
-        low, high = self._bounds
-        if not background:  # which one coil alone might not tell from its own field
-            low, high = low.copy(), high.copy()
-            low[-2:], high[-2:] = starts[0][-2:] - 1e-9, starts[0][-2:] + 1e-9
-        tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
-        options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
-        found = [least_squares(self._residuals, np.clip(start, low, high), max_nfev=300, **options) for start in starts]
-        return min(found, key=lambda solution: float(solution.cost))
-
-    def _residuals(self, x: Array) -> Array:
-        angle, distance, radius, field = x[:-2].reshape(-1, 4).T[:, self._of]
-        distance, radius = np.exp(distance), np.exp(radius)
+    def residuals(x: Array) -> Array:
+        angle, distance, radius, strength = x[: 4 * len(coils)].reshape(-1, 4).T[:, of]
         axis = np.column_stack([np.cos(angle), np.sin(angle)])
         across = np.column_stack([-axis[:, 1], axis[:, 0]])
-        along, aside = np.sum(self._points * axis, axis=1), np.sum(self._points * across, axis=1)
-        axial, outwards = loop_fields(along, aside, distance, radius, field)
-        of_coil = self._current * (axial[:, None] * axis + outwards[:, None] * across)
-        return np.asarray((x[-2:] + of_coil - self._field).ravel())
+        along, aside = np.sum(points * axis, axis=1), np.sum(points * across, axis=1)
+        axial, outwards = loop_fields(along, aside, np.exp(distance), np.exp(radius), strength)
+        of_coil = current * (axial[:, None] * axis + outwards[:, None] * across)
+        return np.asarray(((x[-2:] if background is None else background / size) + of_coil - field).ravel())
+
+    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12 if background is None else 1e-5)
+    options: dict[str, Any] = {"jac": "3-point", "bounds": (low, high), "x_scale": "jac", **tolerances}
+    found = [least_squares(residuals, np.clip(start, low, high), max_nfev=300, **options) for start in starts]
+    return min(found, key=lambda solution: float(solution.cost))
 
 
 def _start(data: ProbeMeasurements, index: int, background: Array, size: float) -> Array:
     """Return initial parameters of a coil from its own readings, without the background."""
     on = (data.coil == index) & (data.current != 0.0)
-    per_current = (data.field[on] - background) / data.current[on, None]
-    points = data.points[on]
+    points, per_current = data.points[on], (data.field[on] - background) / data.current[on, None]
     # Field and gradient at the centre by a straight line, and how fast the field grows along itself.
-    system = np.column_stack([np.ones(len(points)), points / max(1e-6, float(np.abs(points).max()))])
-    line = np.linalg.lstsq(system, per_current, rcond=None)[0]
+    reach = max(1e-6, float(np.abs(points).max()))
+    line = np.linalg.lstsq(np.column_stack([np.ones(len(points)), points / reach]), per_current, rcond=None)[0]
     strength = max(float(np.linalg.norm(line[0])), 1e-9)
     along = line[0] / strength
-    growth = abs(float(along @ (line[1:].T / max(1e-6, float(np.abs(points).max()))) @ along)) / strength
+    growth = abs(float(along @ (line[1:].T / reach) @ along)) / strength
     distance = 2.5 / max(growth, 2.5)  # a dipole's is 3 / distance, a loop's a little less
     angle = math.atan2(along[1], along[0])
     starts = [
@@ -382,11 +360,7 @@ def _start(data: ProbeMeasurements, index: int, background: Array, size: float) 
         for share in (1.0, 0.5, 2.0)
         for turned, sign in ((angle, 1.0), (angle + math.pi, -1.0))
     ]
-    alone = _Problem(data, np.array([index]), size)
-    found = alone.best(
-        [np.concatenate([start, background / size]) for start in starts], COIL_TOLERANCE, background=False
-    )
-    return np.asarray(found.x[:4])
+    return np.asarray(_solve(data, np.array([index]), size, starts, background).x)
 
 
 def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference: Array) -> CoilProperties:
@@ -394,10 +368,9 @@ def _coil(data: ProbeMeasurements, index: int, x: Array, size: float, difference
     angle, distance, radius, field = x[4 * index : 4 * index + 4]
     farthest = int(np.argmax(np.hypot(*data.points.T)))
     if math.exp(distance) <= 1.001 * MIN_DISTANCE_RATIO * float(np.linalg.norm(data.points[farthest])):
-        where, place = data.location(int(data.lines[farthest])), data.points[farthest].tolist()
-        raise InvalidInputError(
-            where, f"a point at {place} m", f"points within the coils; {data.names[index]} is nearer"
-        )
+        where, place = f"{data.source}, line {data.lines[farthest]}", data.points[farthest].tolist()
+        expected = f"points within the coils; {data.names[index]} is nearer"
+        raise InvalidInputError(where, f"a point at {place} m", expected)
     residual = float(np.sqrt(np.mean(difference[data.coil == index] ** 2)))
     wrapped = math.remainder(float(angle), 2.0 * math.pi)
     try:

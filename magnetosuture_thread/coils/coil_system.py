@@ -58,6 +58,7 @@ class CoilSystem:
         latch: arming state; it outlives a configuration, as an emergency stop must.
         bridge: None while unconfigured.
         driver: the last that was opened.
+        driver_name: of the driver in use.
         output: of the last step; None while unconfigured.
         timing: of the watchdog's loop.
         closed: why there is no bridge, while there is none.
@@ -76,14 +77,9 @@ class CoilSystem:
         self.timing = LoopTiming(1.0)
         self.closed = UNCONFIGURED
         self._record = record
-        self._driver_name = "none"
+        self.driver_name = "none"
         self._auto_arm = False
         self._imported: tuple[str, ...] = ()
-
-    @property
-    def driver_name(self) -> str:
-        """Name of the driver in use."""
-        return self._driver_name
 
     @property
     def driver_state(self) -> DriverState:
@@ -145,7 +141,7 @@ class CoilSystem:
 
     def open(self, settings: CoilBridgeSettings, bridge: CoilBridge, driver: CoilDriver) -> None:
         """Open a driver; from now on each step applies currents, zero at first."""
-        self.driver, self._driver_name = driver, settings.driver
+        self.driver, self.driver_name = driver, settings.driver
         driver.open()
         self.bridge, self.timing = bridge, LoopTiming(1.0 / settings.rate)
 
@@ -165,8 +161,7 @@ class CoilSystem:
         final = None if self.bridge is None else self.bridge.final_output(reason)
         self.bridge = self.output = None
         self.closed = reason
-        self._auto_arm = False
-        self._driver_name = "none"
+        self._auto_arm, self.driver_name = False, "none"
         if self.driver is not None:
             self.driver.close()
         return final

@@ -16,8 +16,6 @@ from magnetosuture_thread.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
 
-MIN_MEAN, MAX_MEANS = 1e-8, 40  # of c_n over a_n, whose next one is its square; and how many
-AXIS_TOLERANCE = 1e-5  # of the radius; closer to the axis the closed form is 0 / 0
 MIN_FIELD_PER_CURRENT = 1e-6  # T/A; a weaker coil has no effect
 
 
@@ -77,11 +75,11 @@ def _elliptic_integrals(p: float) -> tuple[float, float]:
     Source: Abramowitz and Stegun, Handbook of Mathematical Functions, section 17.6. Deviation: none.
     """
     a, b, weight, total = 1.0, math.sqrt(p), 1.0, 0.5 * (1.0 - p)
-    for _ in range(MAX_MEANS):
+    for _ in range(40):
         a, b, c = 0.5 * (a + b), math.sqrt(a * b), 0.5 * (a - b)
         total += weight * c * c
         weight *= 2.0
-        if c <= MIN_MEAN * a:
+        if c <= 1e-8 * a:  # the next one is its square
             break
     first = 0.5 * math.pi / a
     return first, first * (1.0 - total)
@@ -113,7 +111,7 @@ def loop_field(along: float, aside: float, distance: float, radius: float, field
         Components in the directions of `along` and `aside` [T/A].
     """
     a, z = radius, along - distance
-    rho = max(abs(aside), AXIS_TOLERANCE * a)
+    rho = max(abs(aside), 1e-5 * a)  # closer to the axis the closed form is 0 / 0
     far, near = (a + rho) ** 2 + z**2, (a - rho) ** 2 + z**2
     first, second = _elliptic_integrals(near / far)
     # On the axis B_z = S a^2 / (a^2 + z^2)^(3/2).

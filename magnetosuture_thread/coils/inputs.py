@@ -27,34 +27,6 @@ BodyVelocity = tuple[float, float, float]
 ZERO_VELOCITY: BodyVelocity = (0.0, 0.0, 0.0)
 TOPIC = "needle/measured_cp"
 CONSISTENT_POSES = 5  # consecutive consistent poses until poses are accepted again after a rejected one
-MAX_POSE_UNCERTAINTY = 2e-3  # m; upper bound on the uncertainty taken from a pose's covariance
-
-
-def check_stamp(topic: str, stamp: float, now: float, last: float, max_age: float) -> None:
-    """Reject a message with an invalid stamp.
-
-    Args:
-        topic: of the message, for the error.
-        stamp: of the message [s].
-        now: the same clock now [s].
-        last: stamp of the previous message, -inf if there was none. One from the future, as after time was set
-            back, is not compared with [s].
-        max_age: maximum age of the stamp [s].
-
-    Raises:
-        InvalidInputError: the stamp is not set, too old, from the future, or older than the last one.
-    """
-    field = f"{topic}.header.stamp"
-    if stamp <= 0.0 or now <= 0.0:
-        raise InvalidInputError(
-            field, f"{stamp:g} s at the time {now:g} s", "a time: 0 is none in ROS, as before /clock"
-        )
-    if now - stamp > max_age:
-        raise InvalidInputError(field, f"{now - stamp:.3f} s old", f"at most {max_age:g} s")
-    if stamp - now > CLOCK_TOLERANCE:
-        raise InvalidInputError(field, f"{stamp - now:.3f} s ahead", f"at most {CLOCK_TOLERANCE:g} s")
-    if stamp < last <= now + CLOCK_TOLERANCE:
-        raise InvalidInputError(field, f"{stamp:.6f} s", f"no earlier than the last one's {last:.6f} s")
 
 
 class StampAges:
@@ -123,6 +95,61 @@ class PublisherCounter:
         self._publishers = [entry for entry in self._publishers if arrival - entry[1] <= SILENCE_TIMEOUT]
 
 
+class InputCheck:
+    """Checks the messages of one input: finite, stamped in time and in order, and of one publisher.
+
+    Args:
+        topic: of the input, for errors and reasons.
+        max_age: maximum age of a stamp [s].
+
+    Attributes:
+        stamp: of the last valid message, -inf before the first [s].
+    """
+
+    def __init__(self, topic: str, max_age: float) -> None:
+        self.stamp = -math.inf
+        self._topic, self._max_age, self._publishers = topic, max_age, PublisherCounter()
+
+    def update(
+        self, values: Vector, field: str, expected: str, stamp: float, number: int, now: float, arrival: float
+    ) -> None:
+        """Accept a message or reject it.
+
+        Args:
+            values: of the message.
+            field: of the values, for the error.
+            expected: the same.
+            stamp: when it was made [s].
+            number: of the message, counted by its publisher.
+            now: the same clock now [s].
+            arrival: a monotonic clock now [s].
+
+        Raises:
+            InvalidInputError: a value is not finite; the stamp is not set, too old, from the future, or older than the
+                last one, unless that is from the future, as after time was set back; or there are several publishers.
+        """
+        publishers = self._publishers.update(number, arrival)
+        if not np.all(np.isfinite(values)):
+            raise InvalidInputError(f"{self._topic}.{field}", values.tolist(), expected)
+        name, last = f"{self._topic}.header.stamp", self.stamp
+        if stamp <= 0.0 or now <= 0.0:
+            found = f"{stamp:g} s at the time {now:g} s"
+            raise InvalidInputError(name, found, "a time: 0 is none in ROS, as before /clock")
+        if now - stamp > self._max_age:
+            raise InvalidInputError(name, f"{now - stamp:.3f} s old", f"at most {self._max_age:g} s")
+        if stamp - now > CLOCK_TOLERANCE:
+            raise InvalidInputError(name, f"{stamp - now:.3f} s ahead", f"at most {CLOCK_TOLERANCE:g} s")
+        if stamp < last <= now + CLOCK_TOLERANCE:
+            raise InvalidInputError(name, f"{stamp:.6f} s", f"no earlier than the last one's {last:.6f} s")
+        if publishers > 1:
+            raise InvalidInputError(self._topic, f"{publishers} publishers at once", "one")
+        self.stamp = stamp
+
+    def conflict(self, arrival: float) -> str:
+        """Return a text if several publishers are active at a monotonic time [s]; empty if not."""
+        return f"several publishers of {self._topic} at once" if self._publishers.count(arrival) > 1 else ""
+
+
 class CommandWatchdog:
     """Keeps the last valid command of one input until it is stale.
 
@@ -132,11 +159,8 @@ class CommandWatchdog:
     """
 
     def __init__(self, timeout: float, topic: str = "needle/servo_cv") -> None:
-        self._timeout = timeout
-        self._topic = topic
-        self._publishers = PublisherCounter()
+        self._timeout, self._check = timeout, InputCheck(topic, timeout)
         self._velocity = np.zeros(2)
-        self._stamp = -math.inf
         self._arrival = -math.inf
 
     def update(self, velocity: Vector, stamp: float, number: int, now: float, arrival: float) -> None:
@@ -153,14 +177,8 @@ class CommandWatchdog:
             InvalidInputError: the command is not finite, too old, from the future, older than the last one, or
                 there are several publishers.
         """
-        publishers = self._publishers.update(number, arrival)
-        if not np.all(np.isfinite(velocity)):
-            raise InvalidInputError(f"{self._topic}.twist.linear", velocity.tolist(), "finite numbers [m/s]")
-        check_stamp(self._topic, stamp, now, self._stamp, self._timeout)
-        if publishers > 1:
-            raise InvalidInputError(self._topic, f"{publishers} publishers at once", "one")
-        self._velocity = np.array(velocity, dtype=np.float64)
-        self._stamp, self._arrival = stamp, arrival
+        self._check.update(velocity, "twist.linear", "finite numbers [m/s]", stamp, number, now, arrival)
+        self._velocity, self._arrival = np.array(velocity, dtype=np.float64), arrival
 
     def clear(self) -> None:
         """Drop the last command; only later ones are valid."""
@@ -174,11 +192,11 @@ class CommandWatchdog:
     @property
     def stamp(self) -> float:
         """Stamp of the last valid command [s], -inf before the first."""
-        return self._stamp
+        return self._check.stamp
 
     def has_conflict(self, arrival: float) -> bool:
         """Return whether several publishers are active at a monotonic time [s]."""
-        return self._publishers.count(arrival) > 1
+        return bool(self._check.conflict(arrival))
 
     @property
     def is_empty(self) -> bool:
@@ -195,11 +213,11 @@ class CommandWatchdog:
             now: time of the stamps' clock [s].
             arrival: a monotonic time [s].
         """
-        if self.has_conflict(arrival):
-            return f"several publishers of {self._topic} at once"
-        if self._arrival == -math.inf:
+        if conflict := self._check.conflict(arrival):
+            return conflict
+        if self.is_empty:
             return "no command yet"
-        age = max(arrival - self._arrival, now - self._stamp)
+        age = max(arrival - self._arrival, now - self.stamp)
         return "" if age <= self._timeout else f"no command for {self._timeout:g} s"
 
 
@@ -325,8 +343,7 @@ class PoseExtrapolator:
         self._needle, self._timeout, self._reach = needle, timeout, reach
         self._max_speed, self._uncertainty = max_speed, uncertainty
         self._min_hold, self._max_hold = min_hold, max_hold
-        self._publishers = PublisherCounter()
-        self._newest = -math.inf  # stamp of the last pose, accepted or not
+        self._check = InputCheck(TOPIC, timeout)
         self._arrival = -math.inf  # of the last accepted one
         self._accepted: _Measured | None = None
         self.rejection = ""
@@ -372,18 +389,13 @@ class PoseExtrapolator:
             InvalidInputError: the pose is not finite, too old, from the future, older than the last one, not
                 plausible, or there are several publishers.
         """
-        publishers = self._publishers.update(number, arrival)
-        if not (np.all(np.isfinite(tail)) and np.all(np.isfinite(heading))):
-            raise InvalidInputError(f"{TOPIC}.pose", [*tail.tolist(), *heading.tolist()], "finite numbers")
-        check_stamp(TOPIC, stamp, now, self._newest, self._timeout)
-        if publishers > 1:
-            raise InvalidInputError(TOPIC, f"{publishers} publishers at once", "one")
-        if stamp < self._newest:  # time was set back
+        newest = self._check.stamp
+        self._check.update(np.append(tail, heading), "pose", "finite numbers", stamp, number, now, arrival)
+        if stamp < newest:  # time was set back
             self._accepted = self._candidate = None
-            self._rejected_since = math.inf
-            self._unknown_until = -math.inf
+            self._rejected_since, self._unknown_until = math.inf, -math.inf
             self._history.clear()
-        self._newest, self.first_stamp = stamp, min(self.first_stamp, stamp)
+        self.first_stamp = min(self.first_stamp, stamp)
         measured = _Measured(tail, self._needle.tip(tail, heading), stamp, self._pose_uncertainty(covariance))
         self._check_plausible(measured, armed)
         self._check_stall(arrival)
@@ -403,8 +415,8 @@ class PoseExtrapolator:
 
         A pose becomes stale by its stamp or by its arrival, whichever comes first.
         """
-        if self._publishers.count(arrival) > 1:
-            return f"several publishers of {TOPIC} at once"
+        if conflict := self._check.conflict(arrival):
+            return conflict
         if self.rejection:
             return f"needle pose rejected: {self.rejection}"
         if self._accepted is None:
@@ -480,10 +492,7 @@ class PoseExtrapolator:
         for name, end, before in (("tail", measured.tail, last.tail), ("tip", measured.tip, last.tip)):
             distance = math.hypot(*(end - before))
             if distance > max_distance:
-                return (
-                    f"its {name} jumped by {distance:.2g} m in {elapsed:.2g} s",
-                    f"at most {max_distance:.2g} m",
-                )
+                return f"its {name} jumped by {distance:.2g} m in {elapsed:.2g} s", f"at most {max_distance:.2g} m"
         return None
 
     def _pose_uncertainty(self, covariance: Vector | None) -> float:
@@ -491,7 +500,7 @@ class PoseExtrapolator:
         if covariance is None or not np.isfinite(covariance).all():
             return 0.0
         square = covariance[0, 0] + covariance[1, 1] + self._needle.chord**2 * covariance[2, 2]
-        return min(MAX_POSE_UNCERTAINTY, 3.0 * math.sqrt(max(0.0, square)))
+        return min(2e-3, 3.0 * math.sqrt(max(0.0, square)))
 
     def _check_stall(self, arrival: float) -> None:
         """Drop the pose after a stall longer than the coils certainly hold their currents."""

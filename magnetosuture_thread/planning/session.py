@@ -31,8 +31,7 @@ from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
 
-NO_POSE, NO_THREAD, NO_MARGINS = "no needle pose yet", "no thread yet", "no margins of the thread yet"
-NOT_HELD = "nobody holds the page"
+NO_POSE = "no needle pose yet"
 
 
 @dataclass(frozen=True)
@@ -237,7 +236,7 @@ class LoopState:
 
     def _page_problem(self, now: float) -> str:
         held = now - self._held <= self._settings.hold_timeout
-        return NOT_HELD if self.hold_to_run and not held else ""
+        return "nobody holds the page" if self.hold_to_run and not held else ""
 
     def _needle_problem(self, now: float) -> str:
         """Return the first reason why the needle cannot be commanded; empty for none."""
@@ -250,9 +249,9 @@ class LoopState:
     def _thread_problem(self, now: float) -> str:
         margins = self._margins
         if self._vertices is None:
-            return NO_THREAD
+            return "no thread yet"
         if margins is None:
-            return NO_MARGINS
+            return "no margins of the thread yet"
         if margins.reason:
             return f"the thread is not known: {margins.reason}"
         if now - margins.time > self._settings.thread_timeout:

@@ -30,7 +30,6 @@ STEEL_BGR = (52.0, 48.0, 44.0)
 GLEAM_BGR = (88.0, 84.0, 78.0)
 SHADOW = np.convolve(cv2.getGaussianKernel(25, 3.0, cv2.CV_32F).ravel(), (0.5, 0.5)).astype(np.float32)
 MENISCUS = 1.3  # a floating thread looks wider, by the liquid's edge along it
-NOISE_FIELDS = 12
 REACH_PX = 24.0  # of shadows and blur around what moves
 # Beyond the radius, width [m]; depth. The inner edge is where independently rendered frames of a dish have it.
 RIM_DEPTHS = ((0.199e-3, 0.21e-3, 145.0), (0.98e-3, 0.18e-3, 100.0))
@@ -159,7 +158,7 @@ class DishCamera:
         size: tuple[int, int] = (640, 480),
         seed: int = 0,
         lighting: Lighting | None = None,
-        noise_fields: int = NOISE_FIELDS,
+        noise_fields: int = 12,
     ) -> None:
         self._scene = scene
         self.view = view

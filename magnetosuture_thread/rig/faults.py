@@ -18,10 +18,8 @@ DROPPED, LATE, CAMERA_STOPPED = "dropped_frames", "late_frames", "camera_stopped
 NEEDLE_OUT, COIL_STUCK = "needle_out", "coil_stuck"
 KINDS = (GLARE, HAND, TOOL, DIM, OVEREXPOSED, DROPPED, LATE, CAMERA_STOPPED, NEEDLE_OUT, COIL_STUCK)
 
-DIM_GAIN, BRIGHT_GAIN = 0.3, 1.9
 LIFT_TIME = 0.6  # s in which the needle is carried over the rim
 STEEL_BGR = (115.0, 112.0, 108.0)
-HAND_WIDTH, TOOL_WIDTH = 0.28, 0.07  # of the dish's diameter
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class FaultSchedule:
     def gain(self, time: float) -> float:
         """Return the exposure's gain."""
         kinds = self.kinds(time)
-        return (DIM_GAIN if DIM in kinds else 1.0) * (BRIGHT_GAIN if OVEREXPOSED in kinds else 1.0)
+        return (0.3 if DIM in kinds else 1.0) * (1.9 if OVEREXPOSED in kinds else 1.0)
 
     def drops(self, time: float, chance: float) -> bool:
         """Return whether a frame gets lost; `chance` is drawn from 0 to 1."""
@@ -158,7 +156,7 @@ class FaultSchedule:
                 outline = _ellipse(place, radius, random.uniform(0.5, 1.0) * radius, angle)
                 result.append(Cover(outline, (265.0, 265.0, 265.0), blur_px=4.0))
             else:
-                width = (HAND_WIDTH if fault.kind == HAND else TOOL_WIDTH) * self._dish
+                width = (0.28 if fault.kind == HAND else 0.07) * self._dish
                 bgr = (120.0, 145.0, 195.0) if fault.kind == HAND else STEEL_BGR
                 outline = _finger(place, angle, width, sway, 3.0 * self._dish)
                 result.append(Cover(outline, bgr, blur_px=3.0 if fault.kind == HAND else 1.5))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import random
 import select
 import struct
 import subprocess
@@ -19,9 +18,8 @@ import threading
 import time
 import tty
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO, cast
@@ -36,45 +34,34 @@ ADDRESSES = range(0x80, 0x88)
 
 
 class Command(IntEnum):
-    """The commands that a board knows."""
+    """The commands of the maker's protocol that a driver of coils needs."""
 
     SET_TIMEOUT = 14
     GET_TIMEOUT = 15
     GET_VERSION = 21
     GET_MAIN_VOLTAGE = 24
-    GET_LOGIC_VOLTAGE = 25
-    SET_DUTY_1 = 32
-    SET_DUTY_2 = 33
     SET_DUTIES = 34
     GET_DUTIES = 48
     GET_CURRENTS = 49
-    GET_TEMPERATURE = 82
     GET_STATUS = 90
     GET_VOLTAGES = 100
     SET_LIMIT_1 = 133
     SET_LIMIT_2 = 134
     GET_LIMIT_1 = 135
     GET_LIMIT_2 = 136
-    RESET_STOP = 200
 
 
-# What each command that changes something carries, between command and checksum.
+COMMANDS = frozenset(Command)
+# What each command that changes something carries, between command and checksum. The others come without a checksum.
 ARGUMENTS: dict[int, str] = {
     Command.SET_TIMEOUT: ">B",
-    Command.SET_DUTY_1: ">h",
-    Command.SET_DUTY_2: ">h",
     Command.SET_DUTIES: ">hh",
     Command.SET_LIMIT_1: ">II",
     Command.SET_LIMIT_2: ">II",
-    Command.RESET_STOP: ">",
 }
-# Those that only ask come without a checksum.
-QUESTIONS: frozenset[int] = frozenset(command for command in Command if command.name.startswith("GET"))
 
 FULL = 32767  # duty of the whole supply voltage
 FACTORY_LIMIT = 3000  # in units of 10 mA
-FACTORY_TIMEOUT = 0  # none
-EMERGENCY_STOP = 0x0001
 
 
 class RoboClawBoard:
@@ -114,23 +101,34 @@ class RoboClawBoard:
         self.supply, self.resistance, self.inductance = supply, resistance, inductance
         self.duties = (0, 0)
         self.currents = (0.0, 0.0)
-        self.timeout = FACTORY_TIMEOUT
-        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
+        self.timeout, self.limits = 0, [FACTORY_LIMIT, FACTORY_LIMIT]
         self.errors = self.warnings = 0
         self.ignored: set[int] = set()
         self.mismeasured = 0.0
         self.broken: set[int] = set()
         self.timeline: deque[tuple[float, tuple[int, int]]] = deque(maxlen=10_000)
         self.heard = -math.inf
-        self._parser = _Parser()
-        self._time = -math.inf
+        self._buffer, self._received, self._time = b"", -math.inf, -math.inf
 
     def receive(self, data: bytes, time: float) -> bytes:
         """Receive bytes from the line and return the answers."""
         self.advance(time)
-        answers = b""
-        for packet in self._parser.feed(data, time):
-            if packet[0] == self.address:
+        # A packet that is not complete is forgotten after a gap of 10 ms.
+        self._buffer = data if time - self._received > 0.01 else self._buffer + data
+        self._received, answers = time, b""
+        while len(self._buffer) > 1:
+            address, command = self._buffer[:2]
+            if address not in ADDRESSES:
+                self._buffer = self._buffer[1:]
+                continue
+            if command not in COMMANDS:  # nobody can tell where it ends
+                self._buffer = b""
+                break
+            size = 4 + struct.calcsize(ARGUMENTS[command]) if command in ARGUMENTS else 2
+            if len(self._buffer) < size:
+                break
+            packet, self._buffer = self._buffer[:size], self._buffer[size:]
+            if address == self.address:
                 answers += self._handle(packet)
         return answers
 
@@ -147,17 +145,11 @@ class RoboClawBoard:
     def power_cycle(self) -> None:
         """Let its supply go and come back at once: duties zero, timeout and limits as it was delivered."""
         self._set((0, 0), self._time)
-        self.timeout = FACTORY_TIMEOUT
-        self.limits = [FACTORY_LIMIT, FACTORY_LIMIT]
-        self._parser = _Parser()
-
-    @property
-    def outputs(self) -> tuple[int, int]:
-        """What is left of the duties where a coil is at its limit."""
-        first, second = (self._output(channel) for channel in (0, 1))
-        return first, second
+        self.timeout, self.limits = 0, [FACTORY_LIMIT, FACTORY_LIMIT]
+        self._buffer = b""
 
     def _output(self, channel: int) -> int:
+        """Return what is left of a duty where its coil is at the limit."""
         duty, limit = self.duties[channel], 0.01 * self.limits[channel]
         if abs(self.currents[channel]) < 0.999 * limit or duty * self.currents[channel] <= 0.0:
             return duty
@@ -183,7 +175,7 @@ class RoboClawBoard:
 
     def _handle(self, packet: bytes) -> bytes:
         command = packet[1]
-        if command in QUESTIONS:
+        if command not in ARGUMENTS:
             self.heard = self._time
             return answer(self.address, command, self._data(command))
         if checksum(packet[:-2]) != struct.unpack(">H", packet[-2:])[0]:
@@ -196,35 +188,25 @@ class RoboClawBoard:
     def _obey(self, command: int, values: tuple[int, ...]) -> None:
         if command == Command.SET_TIMEOUT:
             self.timeout = values[0]
-        elif command in (Command.SET_LIMIT_1, Command.SET_LIMIT_2):
+        elif command == Command.SET_DUTIES:
+            if not self.errors:
+                self._set((values[0], values[1]), self._time)
+        else:
             self.limits[command - Command.SET_LIMIT_1] = values[0]
-        elif command == Command.RESET_STOP:
-            self.errors &= ~EMERGENCY_STOP
-        elif not self.errors:
-            first = values[0] if command != Command.SET_DUTY_2 else self.duties[0]
-            second = values[-1] if command != Command.SET_DUTY_1 else self.duties[1]
-            self._set((first, second), self._time)
 
     def _data(self, command: int) -> bytes:
         """Return what the answer to a question says."""
-        if command == Command.GET_VERSION:
-            return b"RoboClaw simulated 2x15A v4.2.4\n\x00"
-        if command == Command.GET_TIMEOUT:
-            return bytes((self.timeout,))
-        if command == Command.GET_STATUS:
-            return struct.pack(">I", self.warnings << 16 | self.errors)
-        if command in (Command.GET_LIMIT_1, Command.GET_LIMIT_2):
-            return struct.pack(">II", self.limits[command - Command.GET_LIMIT_1], 0)
-        if command == Command.GET_DUTIES:
-            return struct.pack(">hh", *self.outputs)
-        if command == Command.GET_CURRENTS:
-            return struct.pack(">hh", *(self._reported(channel) for channel in (0, 1)))
-        volts, logic = struct.pack(">H", round(10.0 * self.supply)), struct.pack(">H", 50)
+        volts = round(10.0 * self.supply)
         answers: dict[int, bytes] = {
-            Command.GET_MAIN_VOLTAGE: volts,
-            Command.GET_LOGIC_VOLTAGE: logic,
-            Command.GET_VOLTAGES: volts + logic,
-            Command.GET_TEMPERATURE: struct.pack(">H", 250),
+            Command.GET_TIMEOUT: bytes((self.timeout,)),
+            Command.GET_VERSION: b"RoboClaw simulated 2x15A v4.2.4\n\x00",
+            Command.GET_MAIN_VOLTAGE: struct.pack(">H", volts),
+            Command.GET_DUTIES: struct.pack(">hh", self._output(0), self._output(1)),
+            Command.GET_CURRENTS: struct.pack(">hh", self._reported(0), self._reported(1)),
+            Command.GET_STATUS: struct.pack(">I", self.warnings << 16 | self.errors),
+            Command.GET_VOLTAGES: struct.pack(">HH", volts, 50),
+            Command.GET_LIMIT_1: struct.pack(">II", self.limits[0], 0),
+            Command.GET_LIMIT_2: struct.pack(">II", self.limits[1], 0),
         }
         return answers[command]
 
@@ -251,76 +233,12 @@ def checksum(data: bytes) -> int:
     return crc
 
 
-def _length(command: int) -> int | None:
-    """Return the number of bytes of a packet with a command, None if it is unknown."""
-    if command in QUESTIONS:
-        return 2
-    return 4 + struct.calcsize(ARGUMENTS[command]) if command in ARGUMENTS else None
-
-
 def answer(address: int, command: int, data: bytes) -> bytes:
     """Return the answer to a question: data, and the checksum over the question and the data."""
     return data + struct.pack(">H", checksum(bytes((address, command)) + data))
 
 
-class _Parser:
-    """Cuts a stream of bytes into packets."""
-
-    def __init__(self) -> None:
-        self._bytes = b""
-        self._heard = 0.0
-
-    def feed(self, data: bytes, time: float) -> list[bytes]:
-        """Receive bytes at a time [s] and return the packets that they complete, checksums not yet verified."""
-        # A packet that is not complete is forgotten after a gap of 10 ms.
-        if time - self._heard > 0.01:
-            self._bytes = b""
-        self._heard = time
-        self._bytes += data
-        packets: list[bytes] = []
-        while True:
-            while self._bytes and self._bytes[0] not in ADDRESSES:
-                self._bytes = self._bytes[1:]
-            if len(self._bytes) < 2:
-                return packets
-            size = _length(self._bytes[1])
-            if size is None:  # nobody can tell where it ends
-                self._bytes = b""
-                return packets
-            if len(self._bytes) < size:
-                return packets
-            packets.append(self._bytes[:size])
-            self._bytes = self._bytes[size:]
-
-
-TICK = 0.01  # s between two looks at the boards' own timeouts
-ASK = b"?"
 TIMEOUT = 5.0  # s for the boards to be taken away
-
-
-@dataclass
-class LineFaults:
-    """What goes wrong on a line; may be set at any time.
-
-    Attributes:
-        deaf: whether nothing gets to the boards, as if they were off.
-        silent: whether nothing comes back from them.
-        garbage: whether other bytes come back than they sent.
-        wrong_checksum: whether the last bit of each answer is turned.
-        lateness: how long an answer takes [s].
-        lose_in: of the bytes to the boards, each of this number gets lost; 0 is none.
-        lose_out: the same of the bytes from them.
-        mute: addresses of boards that neither hear nor answer.
-    """
-
-    deaf: bool = False
-    silent: bool = False
-    garbage: bool = False
-    wrong_checksum: bool = False
-    lateness: float = 0.0
-    lose_in: int = 0
-    lose_out: int = 0
-    mute: frozenset[int] = frozenset()
 
 
 class Line:
@@ -331,24 +249,13 @@ class Line:
     Args:
         path: where the line is to be found.
         boards: on it, each with an address of its own.
-        clock: tells the time [s].
 
     Attributes:
-        faults: what goes wrong on it.
         boards: on it; look at them while holding `lock`.
     """
 
-    def __init__(
-        self, path: str | Path, boards: Sequence[RoboClawBoard], clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.path = Path(path)
-        self.boards = tuple(boards)
-        self.faults = LineFaults()
-        self.lock = threading.Lock()
-        self._clock = clock
-        self._random = random.Random(0)
-        self._late: deque[tuple[float, bytes]] = deque()
-        self._counts = {"in": 0, "out": 0}
+    def __init__(self, path: str | Path, boards: Sequence[RoboClawBoard]) -> None:
+        self.path, self.boards, self.lock = Path(path), tuple(boards), threading.Lock()
         self._ends = threading.Event()
         self._thread: threading.Thread | None = None
         self._host = self._device = -1
@@ -391,7 +298,7 @@ class Line:
         """Let the boards be where they are now."""
         with self.lock:
             for board in self.boards:
-                board.advance(self._clock())
+                board.advance(time.monotonic())
 
     def _link(self, name: str) -> None:
         if self.path.exists() and not self.path.is_symlink():
@@ -404,46 +311,19 @@ class Line:
     def _shut(self) -> None:
         os.close(self._host)
         os.close(self._device)
-        self._late.clear()
 
     def _serve(self) -> None:
         while not self._ends.is_set():
-            readable, _, _ = select.select([self._host], [], [], self._patience())
+            # The boards' own timeouts are looked at every 10 ms.
+            readable, _, _ = select.select([self._host], [], [], 0.01)
             if readable:
-                with suppress(OSError):
-                    self._receive(os.read(self._host, 4096))
-            self.advance()
-            while self._late and self._late[0][0] <= self._clock():
                 with suppress(OSError):  # nobody reads, and the line is full
-                    os.write(self._host, self._late.popleft()[1])
-
-    def _patience(self) -> float:
-        return max(0.0, min(TICK, self._late[0][0] - self._clock())) if self._late else TICK
-
-    def _receive(self, data: bytes) -> None:
-        now, faults = self._clock(), self.faults
-        if faults.deaf:
-            return
-        data = self._lossy(data, "in", faults.lose_in)
-        with self.lock:
-            answers = [b.receive(data, now) for b in self.boards if b.address not in faults.mute]
-        for answer in answers:
-            if answer and not faults.silent:
-                self._late.append((now + faults.lateness, self._distorted(answer)))
-
-    def _distorted(self, answer: bytes) -> bytes:
-        if self.faults.garbage:
-            answer = self._random.randbytes(len(answer) + 3)
-        if self.faults.wrong_checksum:
-            answer = answer[:-1] + bytes((answer[-1] ^ 1,))
-        return self._lossy(answer, "out", self.faults.lose_out)
-
-    def _lossy(self, data: bytes, way: str, each: int) -> bytes:
-        if not each:
-            return data
-        first = self._counts[way]
-        self._counts[way] = first + len(data)
-        return bytes(byte for at, byte in enumerate(data, first + 1) if at % each)
+                    data, now = os.read(self._host, 4096), time.monotonic()
+                    with self.lock:
+                        answers = [board.receive(data, now) for board in self.boards]
+                    for answer in filter(None, answers):
+                        os.write(self._host, answer)
+            self.advance()
 
 
 def board_addresses(boards: int) -> list[int]:
@@ -557,7 +437,7 @@ class StageProcess:
             GraphError: the process ended.
         """
         with suppress(BrokenPipeError):  # reading tells
-            cast(BinaryIO, self._running().stdin).write(ASK)
+            cast(BinaryIO, self._running().stdin).write(b"?")
         return np.frombuffer(self._read(self._bytes))
 
     def _read(self, size: int | None = None) -> bytes:

@@ -17,17 +17,24 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
 from magnetosuture_thread.geometry.obstacles.distances import pack_obstacles
-from magnetosuture_thread.safety.barriers import SURE, AddedRows, nearest_clear, no_rows
 from magnetosuture_thread.safety.certificate import NOTHING, BodyData, FilterData, PosedNeedle, safe_time
-from magnetosuture_thread.safety.motion import STUCK, NeedleKinematics, limit_velocity, needle_margin, pose_needle
+from magnetosuture_thread.safety.motion import (
+    STUCK,
+    SURE,
+    AddedRows,
+    NeedleKinematics,
+    limit_velocity,
+    nearest_clear,
+    needle_margin,
+    no_rows,
+    pose_needle,
+)
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
 
 EAST = np.array([1.0, 0.0])
 FINITE = Quantity("", "m/s")
-POSITION = bounded("m", -1.0, 1.0)  # no dish is larger
-COARSEST = 5e-4  # m; distance at most between the points that stand for the needle, where that are not too many
 MAX_POINTS = 129
 SIDESTEP_MARGIN = 2e-4  # m; beyond keep_out, within which the needle is taken off sideways
 SIDESTEP_RATE, MAX_SIDESTEP = 10.0, 2e-3  # 1/s and m/s
@@ -219,7 +226,7 @@ class NeedleSafetyFilter:
             raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
         points, turning, spacing = np.zeros((1, 2)), np.array([[0.0, 1.0]]), 0.0
         if needle_length > 0.0:
-            spacing = max(min(COARSEST, 0.5 * keep_out), needle_length / (MAX_POINTS - 1))
+            spacing = max(min(5e-4, 0.5 * keep_out), needle_length / (MAX_POINTS - 1))
             points, turning = needle_points(needle_length, needle_curvature, spacing)
             spacing = needle_length / (len(points) - 1)
         x, y = self.kinematics.chord_direction(EAST).tolist()
@@ -397,10 +404,9 @@ class NeedleSafetyFilter:
 
     def _at(self, tail: Vector, heading: Vector) -> PosedNeedle:
         """Return the needle in a pose, with its distances measured; the last pose is remembered."""
-        tail, heading = (
-            finite_array("tail", tail, (2,), POSITION),
-            finite_array("heading", heading, (2,), FINITE),
-        )
+        # No dish is larger than 1 m.
+        tail = finite_array("tail", tail, (2,), bounded("m", -1.0, 1.0))
+        heading = finite_array("heading", heading, (2,), FINITE)
         key = (*tail.tolist(), *heading.tolist())
         last = self._pose  # read once, as forecasts have the same filter in a thread of their own
         if last is not None and last[0] == key:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -80,26 +78,6 @@ def test_saturation_is_reported_with_the_velocity_really_reached():
     assert found.saturated
     assert np.abs(found.currents).max() == pytest.approx(0.5)
     assert 0.0 < found.velocity[0] < 0.01
-
-
-@pytest.mark.parametrize("pulled", [None, MotionDisturbance(0.0005, 0.001)])
-def test_a_gain_is_a_factor_on_the_field_of_its_coil(pulled: MotionDisturbance | None):
-    gains, heading = np.array([1.1, 0.9, 0.95, 1.2]), turned(EAST, 0.4)
-    coils = [
-        dataclasses.replace(coil, field_per_current=float(gain) * coil.field_per_current)
-        for coil, gain in zip(
-            coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3), gains, strict=True
-        )
-    ]
-    made, expected = allocation(), CoilAllocation(LoopCoils(coils), NEEDLE, 0.008, 10.0)
-    made.gains = gains
-    found, wanted = (
-        one.allocate(0.004 * heading, np.array([0.003, -0.002]), heading, disturbance=pulled, age=0.05)
-        for one in (made, expected)
-    )
-    np.testing.assert_allclose(found.currents, wanted.currents, rtol=1e-9)
-    np.testing.assert_allclose(found.velocity, wanted.velocity, rtol=1e-9)
-    assert found.drift == pytest.approx(wanted.drift, rel=1e-9)
 
 
 @given(vx=st.floats(-1.0, 1.0), vy=st.floats(-1.0, 1.0), x=st.floats(-0.017, 0.017), angle=st.floats(-np.pi, np.pi))

@@ -83,23 +83,6 @@ def test_where_currents_are_not_certified_with_what_is_measured_they_are_without
     assert max(shares) >= MIN_SHARE
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_it_is_not_taken_off_sideways_where_less_is_certified_with_it(seed: int):
-    """The needle is beside a block, with another on the other side, and pulled."""
-    random = np.random.default_rng(seed)
-    left, right = random.uniform(2.4e-4, 6e-4, 2)
-    safety = SETTINGS.safety_filter(blocks(left, -right))
-    coils = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
-    pose = Pose(-1.25e-3 * E, E)
-    disturbance = MotionDisturbance(*random.uniform(-1e-3, 1e-3, 2))
-    wanted, shares = random.uniform(-2e-3, 2e-3, 2), []
-    for limit in (0.0, 2e-3):
-        found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, disturbance, limit)
-        motion, drift = found.velocity + disturbance.velocity(E), found.drift + disturbance.drift
-        shares.append(safety.safe_share(motion, pose.tail, pose.heading, drift)[0])
-    assert shares[1] >= min(shares[0], MIN_SHARE) - 1e-9
-
-
 @pytest.mark.parametrize(("place", "gap"), [(-0.089, 3.56e-4), (-0.07, 3.91e-4)])
 def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to_the_wall(place: float, gap: float):
     """Their drift cannot be avoided close to a coil's axis: the needle turns away from the wall by as much."""

@@ -46,15 +46,6 @@ def test_the_field_at_the_centre_is_each_coils_own_and_points_away_where_it_is_n
         np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
-def test_in_the_dish_plane_it_has_no_curl():
-    field, point, step = LoopCoils(UNLIKE), np.array([0.007, 0.005]), 1e-6
-    by_x, by_y = (
-        (field.per_current(point + step * way) - field.per_current(point - step * way)) / (2.0 * step)
-        for way in np.eye(2)
-    )
-    np.testing.assert_allclose(by_x[1], by_y[0], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -18,19 +18,6 @@ def armed() -> ArmingLatch:
     return latch
 
 
-def test_latch_stops_until_active_and_armed():
-    latch = ArmingLatch()
-    assert (latch.stop_reason, latch.state) == ("inactive", ArmingState.INACTIVE)
-    with pytest.raises(InvalidInputError, match="an inactive bridge"):
-        latch.arm("")
-    latch.activate()
-    assert (latch.stop_reason, latch.state) == ("disarmed", ArmingState.ACTIVE)
-    latch.arm("")
-    assert (latch.stop_reason, latch.armed) == ("", True)
-    latch.disarm()
-    assert latch.stop_reason == "disarmed"
-
-
 @pytest.mark.parametrize("activate_first", [True, False])
 def test_emergency_stop_is_latched_until_a_reset_which_does_not_arm(activate_first: bool):
     latch = armed() if activate_first else ArmingLatch()
@@ -85,14 +72,6 @@ def test_whatever_is_pressed_in_whatever_order_nothing_passes_without_an_arm_aft
             assert not (latched and latch.stop_reason == "")
             assert latch.ready_to_arm == (active and not latched and not allowed)
         assert (latch.stop_reason == "") == (allowed and active and not latched), sequence
-
-
-def test_deactivation_disarms():
-    latch = armed()
-    latch.deactivate()
-    assert latch.stop_reason == "inactive"
-    latch.activate()
-    assert latch.stop_reason == "disarmed"
 
 
 def test_first_fault_is_latched():

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -64,18 +61,3 @@ def test_where_its_motion_is_compensated_a_needle_has_drag_beside_that_of_the_th
     CoilBridgeSettings(motion_compensation=True, needle_drag=0.02, thread_drag=0.0179)
     with pytest.raises(ConfigurationError, match=r"thread_drag: got 0\.0181, expected at most 0\.018 N s/m, 0\.9 of"):
         CoilBridgeSettings(motion_compensation=True, needle_drag=0.02, thread_drag=0.0181)
-
-
-SIZES = """
-command_timeout pose_timeout driver_timeout roboclaw_answer_timeout rate max_speed
-max_acceleration max_current max_current_slew keep_out approach_rate field_per_current
-coil_distance coil_radius coil_resistance aligning_field needle_length needle_moment
-needle_drag needle_drag_across needle_turning_drag
-"""
-
-
-def test_sizes_are_positive():
-    for name, value in itertools.product(SIZES.split(), (0.0, -1e-3)):
-        change: dict[str, Any] = {name: value}
-        with pytest.raises(ConfigurationError, match=rf"coil_bridge\.{name}: got {value}, expected .*from "):
-            CoilBridgeSettings(**change)

@@ -72,27 +72,6 @@ def test_time_set_back_does_not_make_every_command_stale():
     assert watchdog.stale_reason(5.0, 1.0) == ""
 
 
-def test_two_publishers_are_a_conflict_until_one_is_silent():
-    watchdog = make_watchdog()
-    for k in range(10):
-        at = 0.02 * (k + 1)
-        watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        watchdog.update(-EAST, stamp=0.205, number=1, now=0.205, arrival=0.205)
-    assert watchdog.velocity.tolist() == EAST.tolist()
-    assert watchdog.stale_reason(0.206, 0.206) == "several publishers of needle/servo_cv at once"
-    with pytest.raises(InvalidInputError, match="2 publishers at once"):
-        watchdog.update(EAST, stamp=0.22, number=510, now=0.22, arrival=0.22)
-    for k in range(11, 40):
-        at = 0.02 * (k + 1)
-        if at < 0.7:
-            with pytest.raises(InvalidInputError, match="publishers"):
-                watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
-        elif at > 0.72:
-            watchdog.update(EAST, stamp=at, number=500 + k, now=at, arrival=at)
-            assert watchdog.stale_reason(at, at) == ""
-
-
 def test_the_minimum_age_of_the_last_seconds_is_kept_for_each_topic():
     ages = StampAges()
     for arrival, age in ((0.0, 0.004), (1.0, 0.050), (2.0, 0.020), (3.0, 0.030)):

@@ -11,7 +11,7 @@ import pytest
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
-from magnetosuture_thread.planning.session import NOT_HELD, LoopState, NeedlePlannerSettings, ProcedureSession
+from magnetosuture_thread.planning.session import LoopState, NeedlePlannerSettings, ProcedureSession
 from magnetosuture_thread.scene import Dish, Scene
 
 SCENE = Scene(Dish(0.035))
@@ -170,15 +170,6 @@ def test_only_one_procedure_at_a_time_and_none_of_an_unknown_needle():
     assert not run.abort("given up")
     with pytest.raises(InvalidInputError, match="a procedure that is failed"):
         run.resume()
-
-
-def test_a_page_has_to_be_held_within_the_timeout():
-    state = known(settle=0.0)
-    state.hold_to_run = True
-    assert state.condition(0.0).problem == NOT_HELD
-    state.on_hold(0.0)
-    assert not state.condition(0.3).problem
-    assert state.condition(0.31).problem == NOT_HELD
 
 
 def test_another_scene_ends_what_was_only_planned():

@@ -164,39 +164,3 @@ def test_inside_a_shape_no_point_of_a_needle_that_turns_gets_deeper():
         assert (np.array(heights) <= heights[0] + 1e-9).all()
         limited += 0.02 < share < 0.98
     assert limited > 3
-
-
-def test_a_turning_needle_is_stopped_by_what_its_tip_meets():
-    """A quarter of a turn away from the tip, and beyond half a turn from the tail."""
-    post = SceneShape("post", "instrument", Disc((0.0, 0.0051), 0.001))
-    filtered = safety(Scene(Dish(0.05), (post,)), 0.007)
-    lever = 0.0035
-    assert filtered.safe_share(np.array([0.0, 0.05]), np.array([-lever, 0.0]), EAST)[0] == 1.0
-    near = SceneShape("near", "instrument", Disc((0.0, 0.0045), 0.001))
-    share, name = safety(Scene(Dish(0.05), (near,)), 0.007).safe_share(
-        np.array([0.0, 0.05]), np.array([-lever, 0.0]), EAST
-    )
-    # The tip is at the distance of 1.5 mm from the centre at (0, 4.5 mm).
-    keep = math.hypot(5e-4, 0.5 * 0.007 / 28)
-    c = (lever**2 + 0.0045**2 - (0.001 + keep) ** 2) / (2.0 * lever * 0.0045)
-    assert name == "near"
-    assert share * HOLD * 0.05 / lever == pytest.approx(math.asin(c), rel=1e-6)
-
-
-def test_one_who_is_too_near_to_a_post_or_the_wall_may_leave_and_goes_no_nearer():
-    post = SceneShape("post", "instrument", Disc((0.002, 0.0), 0.001))
-    filtered = safety(Scene(Dish(0.05), (post,)), 0.0)
-    for at in ((0.0007, 0.0), (0.0015, 0.0), (-0.0248, 0.0)):  # before the post, inside, and before the wall
-        inwards = 0.001 * EAST if at[0] > 0.0 else -0.001 * EAST
-        assert filtered.safe_share(inwards, np.array(at), EAST)[0] < 1e-6
-        assert filtered.safe_share(-inwards, np.array(at), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.0007, 0.0]), EAST)[0] == 1.0
-    assert filtered.safe_share(np.array([0.0, 0.001]), np.array([0.002, 0.0]), EAST)[0] == 1.0
-
-
-def test_a_point_that_comes_from_beyond_an_edges_end_meets_the_edge():
-    wall = SceneShape("block", "wall", Polygon(((0.0, 0.001), (0.01, 0.001), (0.01, 0.003), (0.0, 0.003))))
-    share, _ = safety(Scene(Dish(0.05), (wall,)), 0.0).safe_share(
-        np.array([0.03, 0.005]), np.array([-0.002, 0.0]), EAST
-    )
-    assert share * HOLD == pytest.approx(0.1, rel=1e-6)

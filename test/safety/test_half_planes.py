@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.safety.barriers import ROUNDING, project_onto_half_planes
+from magnetosuture_thread.safety.motion import ROUNDING, project_onto_half_planes
 
 NUMBERS = st.floats(-1.0, 1.0)
 

@@ -114,14 +114,6 @@ def test_the_share_that_the_bridge_asks_for_knows_added_barriers():
     assert safety.safe_share(np.array([0.0, -0.02]), np.array([0.0, 0.0]), np.array([0.0, 1.0])) == (1.0, "")
 
 
-def test_the_share_that_keeps_an_added_barrier_includes_the_drift():
-    safety = needle(HalfPlane(0.001))
-    tail, east, drift = np.array([0.0, 0.0008]), np.array([1.0, 0.0]), 2e-3
-    share, name = safety.safe_share(np.zeros(2), tail, east, drift)  # the tip stays, and the tail moves twice as fast
-    assert name == "half_plane"
-    assert share == pytest.approx(2e-4 / (2.0 * drift * HOLD), abs=0.01)
-
-
 @pytest.mark.parametrize("unit", [1.0, 250.0])
 def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit: float):
     class Slow(HalfPlane):
@@ -137,28 +129,6 @@ def test_a_gain_limits_how_fast_an_added_barrier_is_approached_in_any_unit(unit:
     found = needle(Slow(0.001), length=0.0).filter(np.array([0.0, 0.01]), np.array([0.0, -0.002]), EAST)
     assert found.filtered.tolist() == pytest.approx([0.0, 2.0 * 0.003])
     assert found.active == ("half_plane",)
-
-
-class Appearing(MovingHalfPlane):
-    """The same bound, which there is only from a time on."""
-
-    def value(self, positions: np.ndarray) -> np.ndarray:
-        """Return a row for each point, or none."""
-        return super().value(positions)[: len(positions) if self.time > 0.1 else 0]
-
-    def gradient(self, positions: np.ndarray) -> Gradient:
-        """Return its gradient."""
-        found = super().gradient(positions)
-        count = len(self.value(positions))
-        return Gradient(found.nodes[:count], found.values[:count])
-
-
-def test_a_barrier_that_appears_within_the_hold_is_kept_too():
-    safety, tail = needle(Appearing(0.0), length=0.0), np.array([0.0, -0.001])
-    assert safety.filter(np.array([0.01, 0.0]), tail, EAST, time=0.0).active == ()
-    found = safety.filter(np.array([0.0, 0.01]), tail, EAST, time=0.0)  # 2 mm in the hold
-    assert found.active == ("half_plane",)
-    assert found.filtered.tolist() == pytest.approx([0.0, 0.005], abs=2e-5)
 
 
 PERIOD, CLEARANCE = 0.05, 1e-4  # s and m

@@ -80,48 +80,6 @@ class CoilDriver(Protocol):
         ...
 
 
-class RecordingDriver:
-    """Records currents where no hardware is configured: in tests, and in replays of bags.
-
-    Args:
-        coils: number of coils.
-
-    Attributes:
-        applied: the last currents that were applied, oldest first, each of shape (coils,) [A].
-    """
-
-    def __init__(self, coils: int) -> None:
-        self._coils = coils
-        self._open = False
-        self.applied: deque[Vector] = deque(maxlen=10_000)
-
-    def open(self) -> None:
-        """Accept currents from now on."""
-        self._open = True
-
-    def apply(self, currents: Vector, computed: float) -> None:
-        """Record the currents of all coils, shape (coils,) [A], whenever they were computed.
-
-        Raises:
-            ValueError: the number of currents is wrong.
-        """
-        if not self._open:
-            return
-        if currents.shape != (self._coils,):
-            raise ValueError(f"{self._coils} currents expected, got shape {currents.shape}")
-        self.applied.append(currents.copy())
-
-    def state(self) -> DriverState:
-        """Return that the driver is ready while open."""
-        return DriverState(self._open, "" if self._open else "not open")
-
-    def close(self) -> None:
-        """Record zero currents and accept no more."""
-        if self._open:
-            self.applied.append(np.zeros(self._coils))
-        self._open = False
-
-
 class SimulatedDriver:
     """Sends currents to the simulated rig; not ready without a subscriber.
 
@@ -132,9 +90,7 @@ class SimulatedDriver:
     """
 
     def __init__(self, coils: int, send: Callable[[Vector], None], listeners: Callable[[], int]) -> None:
-        self._coils = coils
-        self._send = send
-        self._listeners = listeners
+        self._coils, self._send, self._listeners = coils, send, listeners
         self._open = self._ready = False
         self._losses = 0
 
@@ -143,9 +99,15 @@ class SimulatedDriver:
         self._open = True
 
     def apply(self, currents: Vector, computed: float) -> None:
-        """Send the currents of all coils, shape (coils,) [A], whenever they were computed."""
+        """Send the currents of all coils, shape (coils,) [A], whenever they were computed.
+
+        Raises:
+            ValueError: the number of currents is wrong.
+        """
+        if currents.shape != (self._coils,):
+            raise ValueError(f"{self._coils} currents expected, got shape {currents.shape}")
         if self.state().ready:
-            self._send(currents)
+            self._send(currents.copy())
 
     def state(self) -> DriverState:
         """Return whether there is a subscriber."""
@@ -153,12 +115,28 @@ class SimulatedDriver:
         if self._ready and not ready:
             self._losses += 1
         self._ready = ready
-        return DriverState(ready, "" if ready else "no rig_simulator subscribed", self._losses)
+        problem = "no rig_simulator subscribed" if self._open else "not open"
+        return DriverState(ready, "" if ready else problem, self._losses)
 
     def close(self) -> None:
         """Send zero currents, and no more after that."""
         self.apply(np.zeros(self._coils), math.inf)
         self._open = False
+
+
+class RecordingDriver(SimulatedDriver):
+    """Records currents where no hardware is configured: in tests, and in replays of bags.
+
+    Args:
+        coils: number of coils.
+
+    Attributes:
+        applied: the last currents that were applied, oldest first, each of shape (coils,) [A].
+    """
+
+    def __init__(self, coils: int) -> None:
+        self.applied: deque[Vector] = deque(maxlen=10_000)
+        super().__init__(coils, self.applied.append, lambda: 1)
 
 
 def make_driver(

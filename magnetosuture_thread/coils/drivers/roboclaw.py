@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import errno
+import itertools
 import logging
 import math
 import os
@@ -14,12 +15,13 @@ import select
 import termios
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import serial
@@ -31,19 +33,23 @@ from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import DriverError
 
 FULL_DUTY = 32767  # duty of the full supply voltage
-MIN_RETRY_DELAY, MAX_RETRY_DELAY = 0.1, 2.0  # s between two attempts to connect
+MAX_RETRY_DELAY = 2.0  # s between two attempts to connect
 DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the supply
-MAX_OVERCURRENTS = 3  # consecutive measurements that are a fault
-# Consecutive measurements below that ratio: a fifth of a second and more at 200 Hz, so that neither a change of
+MAX_MISMATCHES, MAX_OVERCURRENTS = 2, 3  # consecutive answers that are a fault; the first may be a lost packet
+# Consecutive measurements of a missing current: a fifth of a second and more at 200 Hz, so that neither a change of
 # the current nor the coil's L / R looks like a broken wire.
 MAX_SHORTFALLS = 12
 
 # Errors in the boards' manual that the manufacturer's library lacks.
 DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
+OPEN_PROBLEMS = {
+    errno.EAGAIN: "{0} is held by another process",
+    errno.EBUSY: "{0} is held by another process",
+    errno.ENOENT: "there is no {0}",
+    errno.EACCES: "no permission for {0}; its group is usually dialout",
+}
 ACK = b"\xff"
 MAX_ATTEMPTS = 2
-# Pause after a failure, in which the board drops a partial packet.
-RETRY_DELAY = 0.015  # s
 
 
 def retry_delay(failures: int) -> float:
@@ -52,7 +58,7 @@ def retry_delay(failures: int) -> float:
     >>> [retry_delay(failures) for failures in (1, 2, 5, 6, 10**6)]
     [0.1, 0.2, 1.6, 2.0, 2.0]
     """
-    return min(MAX_RETRY_DELAY, MIN_RETRY_DELAY * 2.0 ** min(failures - 1, 10))
+    return min(MAX_RETRY_DELAY, 0.1 * 2.0 ** min(failures - 1, 10))
 
 
 def duties_for(currents: Vector, resistances: Vector, voltage: float) -> tuple[tuple[int, ...], bool]:
@@ -72,17 +78,6 @@ def duties_for(currents: Vector, resistances: Vector, voltage: float) -> tuple[t
     share = currents * resistances / voltage
     too_low = bool(np.any(np.abs(share) > 1.0))
     return tuple(np.trunc(FULL_DUTY * np.clip(share, -1.0, 1.0)).astype(int).tolist()), too_low
-
-
-def steady_currents(duties: Sequence[int], resistances: Vector, voltage: float) -> tuple[float, ...]:
-    """Return the steady-state currents of given duties [A].
-
-    I = d U / R, see `duties_for`.
-
-    >>> steady_currents((32767, 0), np.array([1.0, 2.0]), 24.0)
-    (24.0, 0.0)
-    """
-    return tuple((np.array(duties) / FULL_DUTY * voltage / resistances).tolist())
 
 
 def is_short(expected: float, measured: float) -> bool:
@@ -140,27 +135,6 @@ def duties_match(
     return True
 
 
-class ConsecutiveCounter:
-    """Counts consecutive events.
-
-    >>> counter = ConsecutiveCounter(2)
-    >>> [counter.update(bad) for bad in (True, False, True, True)]
-    [False, False, False, True]
-
-    Args:
-        limit: number of consecutive events to report.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self.count = 0
-
-    def update(self, event: bool) -> bool:
-        """Register one observation, and return whether the limit is reached."""
-        self.count = self.count + 1 if event else 0
-        return self.count >= self._limit
-
-
 # `os.write` lets another thread have the interpreter first, and may wait for it there for longer than a board waits for
 # the next byte of a packet.
 _write = ctypes.PyDLL(None).write
@@ -198,7 +172,8 @@ class ExchangePort(serial.Serial):
             # The lock comes first, so that a process that holds the port is not disturbed.
             super().__init__(path, baud_rate, timeout=answer_timeout, exclusive=True)
         except (serial.SerialException, ValueError) as error:
-            raise DeviceError(_open_problem(path, error)) from error
+            number = getattr(error, "errno", None) or 0
+            raise DeviceError(OPEN_PROBLEMS.get(number, "cannot open {0}: {1}").format(path, error)) from error
 
     def begin(self, expires: float = math.inf) -> None:
         """Begin an exchange; discard late bytes of the last one.
@@ -257,22 +232,22 @@ class ExchangePort(serial.Serial):
             raise serial.SerialTimeoutException("a packet was written in part")
 
 
-def _open_problem(path: str, error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    if number in (errno.EAGAIN, errno.EBUSY):
-        return f"{path} is held by another process"
-    if number == errno.ENOENT:
-        return f"there is no {path}"
-    if number == errno.EACCES:
-        return f"no permission for {path}; its group is usually dialout"
-    return f"cannot open {path}: {error}"
-
-
 # The library logs every missing byte, a hundred times a second for a dead board; the driver reports the problem
 # in its state. A level that was set before is kept.
 _library = logging.getLogger("basicmicro")
 if _library.level == logging.NOTSET:
     _library.setLevel(logging.CRITICAL)
+
+
+class Stored(NamedTuple):
+    """A setting that a board keeps: its name, how it is written and read, its value in units of 1 / scale."""
+
+    name: str
+    write: Callable[..., Any]
+    values: tuple[float, ...]
+    read: Callable[..., Any]
+    scale: float
+    expected: int
 
 
 class Board:
@@ -309,14 +284,13 @@ class Board:
         no_retry: Callable[[], bool],
     ) -> None:
         self._port, self._address, self._name, self._no_retry = port, address, name, no_retry
-        self.number, self._coils = number, (2 * number, 2 * number + 1)
-        self._timeout = round(10.0 * settings.driver_timeout)  # in tenths of a second
-        self._max_current, self._limit = settings.max_current, round(100.0 * settings.max_current)
+        self.number = number
+        self._max_current = settings.max_current
         self._resistances = np.array(settings.resistances()[2 * number : 2 * number + 2])
-        self._device: Any = Basicmicro(port.name, port.baudrate, retries=1)
+        device: Any = Basicmicro(port.name, port.baudrate, retries=1)
         # Its own Open makes a port without a lock, and one that may keep its caller for a second.
-        self._device._port = port
-        self._device._connected = True
+        device._port, device._connected = port, True
+        self._device = device
         self.version = ""
         self.voltage = 0.0
         self.currents = (0.0, 0.0)
@@ -324,25 +298,33 @@ class Board:
         self._expires = math.inf  # of the values of an exchange
         self._written = (0, 0)
         self._signs = [1, 1]
-        limits = (self._device.ReadM1MaxCurrent, self._device.ReadM2MaxCurrent)
-        # Settings that a board loses with its supply; after a short loss, nothing else shows it.
-        limit_checks = [partial(self._check_limit, read) for read in limits]
-        self._setting_checks: tuple[Callable[[], None], ...] = (self._check_timeout, *limit_checks)
-        # With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
-        always = (self._check_duties, self._check_currents)
-        self._polls = [
-            check
-            for setting in self._setting_checks
-            for check in (*always, self._check_status, *always, self._check_voltage, setting)
-        ]
-        self._poll_index = 0
+        self._counts: Counter[str] = Counter()  # of consecutive answers that are wrong, by what is
         self._supply_too_low = self._limited = False
         self._conditions: tuple[str, ...] = ()
-        # Two in a row: the first may be a lost packet.
-        self._mismatches = ConsecutiveCounter(2)
-        self._excesses = ConsecutiveCounter(MAX_OVERCURRENTS)
-        self._shortfalls = [ConsecutiveCounter(MAX_SHORTFALLS) for _ in self._coils]
         self._coil_warnings = ["", ""]
+        # Settings that a board loses with its supply; after a short loss, nothing else shows it. Half a tenth is added,
+        # as the library truncates; zero would disable the timeout.
+        tenths, limit = round(10.0 * settings.driver_timeout), round(100.0 * settings.max_current)
+        names, timeout = ("serial timeout in tenths of a second", "current limit in 10 mA"), 0.1 * (tenths + 0.5)
+        self._stored = (
+            Stored(names[0], device.SetTimeout, (timeout,), device.GetTimeout, 10.0, tenths),
+            Stored(names[1], device.SetM1MaxCurrent, (limit, 0), device.ReadM1MaxCurrent, 1.0, limit),
+            Stored(names[1], device.SetM2MaxCurrent, (limit, 0), device.ReadM2MaxCurrent, 1.0, limit),
+        )
+        # With a query each 20 to 25 ms, two boards on a line are polled completely within about a second.
+        always = (self._check_duties, self._check_currents)
+        self._polls: Iterator[Callable[[], None]] = itertools.cycle(
+            check
+            for stored in self._stored
+            for check in (
+                *always,
+                self._check_status,
+                *always,
+                self._check_voltage,
+                partial(self._check_stored, stored),
+            )
+        )
+        self._poll = next(self._polls)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -380,13 +362,13 @@ class Board:
             DeviceError: a value cannot be set or verified.
         """
         self.write_zero()
-        self._verify("duties", self._query(self._device.ReadPWMs), (0, 0))
-        # Half a tenth is added, as the library truncates; zero would disable the timeout.
-        self._set(self._device.SetTimeout, 0.1 * (self._timeout + 0.5))
-        self._set(self._device.SetM1MaxCurrent, self._limit, 0)
-        self._set(self._device.SetM2MaxCurrent, self._limit, 0)
+        if (duties := self._query(self._device.ReadPWMs)) != (0, 0):
+            raise DeviceError(f"{self._name}: duties {duties[0]} and {duties[1]} instead of 0 and 0")
+        for stored in self._stored:
+            self._exchange(stored.write, lambda values=stored.values: values, self._acknowledged)
         currents = [self._check_currents] * MAX_OVERCURRENTS
-        for check in (*self._setting_checks, self._check_status, *currents, self._check_voltage):
+        checks: list[Callable[[], None]] = [partial(self._check_stored, stored) for stored in self._stored]
+        for check in (*checks, self._check_status, *currents, self._check_voltage):
             check()
 
     def write(self, latest: Callable[[], tuple[Vector | None, float]]) -> None:
@@ -429,16 +411,19 @@ class Board:
         Raises:
             DeviceError: the board does not answer or reports a fault.
         """
-        self._polls[self._poll_index]()
-        if not self._mismatches.count:  # else the same query again, at once
-            self._poll_index = (self._poll_index + 1) % len(self._polls)
+        self._poll()
+        if not self._counts["mismatches"]:  # else the same query again, at once
+            self._poll = next(self._polls)
 
-    def _check_timeout(self) -> None:
-        tenths = tuple(round(10.0 * seconds) for seconds in self._query(self._device.GetTimeout))
-        self._verify("serial timeout in tenths of a second", tenths, (self._timeout,))
+    def _check_stored(self, stored: Stored) -> None:
+        value = round(stored.scale * self._query(stored.read)[0])
+        if value != stored.expected:
+            raise DeviceError(f"{self._name}: {stored.name} {value} instead of {stored.expected}")
 
-    def _check_limit(self, read: Callable[..., Any]) -> None:
-        self._verify("current limit in 10 mA", self._query(read)[:1], (self._limit,))
+    def _is_repeated(self, what: str, is_wrong: bool, limit: int) -> bool:
+        """Register an answer, and return whether the last ones, as many as the limit, were wrong."""
+        self._counts[what] = self._counts[what] + 1 if is_wrong else 0
+        return self._counts[what] >= limit
 
     def _check_voltage(self) -> None:
         self.voltage = self._query(self._device.GetVolts)[0] / 10.0
@@ -456,7 +441,7 @@ class Board:
         self._limited = matches and any(
             abs(w - r) > DUTY_TOLERANCE for w, r in zip(self._written, reported, strict=True)
         )
-        if self._mismatches.update(not matches):
+        if self._is_repeated("mismatches", not matches, MAX_MISMATCHES):
             raise DeviceError(f"{self._name}: has duties {tuple(reported)} instead of {self._written}")
 
     def _check_currents(self) -> None:
@@ -467,12 +452,12 @@ class Board:
         self.currents = (first, second)
         worst = max(self.currents, key=abs)
         # A board may exceed the maximum current by 20 % for a moment.
-        if self._excesses.update(abs(worst) > 1.2 * self._max_current):
+        if self._is_repeated("excesses", abs(worst) > 1.2 * self._max_current, MAX_OVERCURRENTS):
             raise DeviceError(f"{self._name}: a current of {worst:.2f} A, more than {self._max_current:g} A")
-        expected = steady_currents(self._written, self._resistances, self.voltage)
-        for channel, (coil, counter) in enumerate(zip(self._coils, self._shortfalls, strict=True)):
-            measured, commanded = self.currents[channel], self._commanded[channel]
-            if not counter.update(is_short(expected[channel], measured)):
+        expected = np.array(self._written) / FULL_DUTY * self.voltage / self._resistances
+        for channel, (measured, commanded) in enumerate(zip(self.currents, self._commanded, strict=True)):
+            coil = 2 * self.number + channel
+            if not self._is_repeated(f"coil {coil}", is_short(float(expected[channel]), measured), MAX_SHORTFALLS):
                 self._coil_warnings[channel] = ""
             elif not self._coil_warnings[channel]:  # keeps the first text, which would change with every answer
                 self._coil_warnings[channel] = f"coil {coil}: {measured:.2f} A measured, {commanded:.2f} A commanded"
@@ -484,14 +469,6 @@ class Board:
         if errors:
             raise DeviceError(f"{self._name}: {', '.join(errors)}")
         self._conditions = describe_bits(bits >> 16, Basicmicro.WARNING_DESCRIPTIONS, "warning")
-
-    def _verify(self, what: str, got: tuple[Any, ...], expected: tuple[int, ...]) -> None:
-        if got != expected:
-            shown = [" and ".join(str(value) for value in values) for values in (got, expected)]
-            raise DeviceError(f"{self._name}: {what} {shown[0]} instead of {shown[1]}")
-
-    def _set(self, call: Callable[..., Any], *values: float) -> None:
-        self._exchange(call, lambda: values, self._acknowledged)
 
     def _acknowledged(self, result: Any) -> bool:
         return bool(result) and self._port.answer == ACK and self._port.is_drained  # the library accepts any byte
@@ -528,7 +505,7 @@ class Board:
 
     def _drain(self) -> bool:
         """Return whether all earlier answers of the board have come."""
-        time.sleep(RETRY_DELAY)
+        time.sleep(0.015)  # in which the board drops a partial packet
         self._expires = math.inf
         result = self._attempt(self._device.ReadMainBatteryVoltage, self._address)  # no such answer begins with an ACK
         self._port.is_drained = result is not None and bool(result[0])
@@ -615,7 +592,7 @@ class Mailbox:
             wake.set()
 
 
-class LineThread:
+class LineThread(threading.Thread):
     """Connects to the boards of a port, writes duties and polls the boards; reconnects until it is stopped.
 
     This is where the driver waits for hardware, so it reads the clock itself.
@@ -638,33 +615,24 @@ class LineThread:
         mailbox: Mailbox,
         others: Sequence[int] = (),
     ) -> None:
+        super().__init__(name=f"roboclaw {path}", daemon=True)
         self._number, self._path, self._addresses, self._others = number, path, boards, others
         self._settings, self._mailbox = settings, mailbox
         self._wake = mailbox.wake_events[number]
         self._stopping = threading.Event()
         self._boards: dict[int, Board] = {}
         self._leaving = False
-        self._thread = threading.Thread(target=self._run, name=f"roboclaw {path}", daemon=True)
-
-    def start(self) -> None:
-        """Start to connect."""
-        self._thread.start()
 
     def stop(self) -> None:
         """Request the end of the thread, with all currents at zero."""
         self._stopping.set()
         self._wake.set()
 
-    def join(self, timeout: float) -> None:
-        """Wait for the end of the thread, for at most a time [s]."""
-        self._thread.join(timeout)
-
-    def _run(self) -> None:
+    def run(self) -> None:
+        """Connect and serve the boards, again after each failure, until `stop`."""
         failures = 0
         while not self._stopping.is_set():
-            ready_at = None
-            problem = "closed"
-            port = None
+            ready_at, problem, port = None, "closed", None
             try:
                 port = ExchangePort(
                     self._path, self._settings.roboclaw_baud_rate, self._settings.roboclaw_answer_timeout
@@ -686,17 +654,10 @@ class LineThread:
 
     def _connect(self, port: ExchangePort) -> None:
         self._leaving = False
-        self._boards = {
-            number: Board(
-                port,
-                number,
-                address,
-                f"board {number} ({self._path}, address {address})",
-                self._settings,
-                self._no_retry,
-            )
-            for number, address in self._addresses.items()
-        }
+        self._boards = {}
+        for number, address in self._addresses.items():
+            name = f"board {number} ({self._path}, address {address})"
+            self._boards[number] = Board(port, number, address, name, self._settings, self._no_retry)
         for board in self._boards.values():  # all, before any can acknowledge
             board.identify(self._others)
         for board in self._boards.values():
@@ -726,7 +687,10 @@ class LineThread:
         remaining, until = list(self._boards.values()), time.monotonic() + 0.12
         self._leaving = True
         while remaining and time.monotonic() < until:
-            remaining = [board for board in remaining if not _set_zero(board)]
+            for board in remaining.copy():
+                with suppress(Exception):
+                    board.write_zero()
+                    remaining.remove(board)
         self._boards = {}
         with suppress(Exception):
             port.reset_output_buffer()  # or closing may wait for the output
@@ -735,15 +699,6 @@ class LineThread:
 
     def _no_retry(self) -> bool:
         return self._leaving or self._stopping.is_set()
-
-
-def _set_zero(board: Board) -> bool:
-    """Set a board to zero, and return whether it acknowledged."""
-    try:
-        board.write_zero()
-    except Exception:
-        return False
-    return True
 
 
 class RoboClawDriver:
@@ -842,19 +797,21 @@ def _boards_by_port(settings: CoilBridgeSettings, coils: int) -> dict[str, dict[
         DriverError: the settings are invalid.
     """
     ports, addresses = settings.roboclaw_ports, settings.roboclaw_addresses
-    if not ports:
-        raise DriverError("roboclaw", "roboclaw_ports is empty, expected the serial port of each board")
-    if 2 * len(ports) != coils:
-        raise DriverError("roboclaw", f"roboclaw_ports has {len(ports)}, expected one for two of the {coils} coils")
-    if addresses and len(addresses) != len(ports):
-        expected = f"one for each of the {len(ports)} roboclaw_ports, or none"
-        raise DriverError("roboclaw", f"roboclaw_addresses has {len(addresses)}, expected {expected}")
     tenths = 10.0 * settings.driver_timeout
-    if abs(tenths - round(tenths)) > 1e-6:
-        raise DriverError("roboclaw", f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second")
-    if settings.roboclaw_baud_rate < MIN_BAUD_RATE:
-        expected = f"at least {MIN_BAUD_RATE}, so that answers come in time"
-        raise DriverError("roboclaw", f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected {expected}")
+    refusals = {
+        "roboclaw_ports is empty, expected the serial port of each board": not ports,
+        f"roboclaw_ports has {len(ports)}, expected one for two of the {coils} coils": 2 * len(ports) != coils,
+        f"roboclaw_addresses has {len(addresses)}, expected one for each of the {len(ports)} roboclaw_ports, or none": (
+            len(addresses) not in (0, len(ports))
+        ),
+        f"driver_timeout is {settings.driver_timeout:g}, expected tenths of a second": abs(tenths - round(tenths))
+        > 1e-6,
+        f"roboclaw_baud_rate is {settings.roboclaw_baud_rate}, expected at least {MIN_BAUD_RATE}, "
+        "so that answers come in time": settings.roboclaw_baud_rate < MIN_BAUD_RATE,
+    }
+    for problem, is_so in refusals.items():
+        if is_so:
+            raise DriverError("roboclaw", problem)
     found: dict[str, dict[int, int]] = {}
     # A board is delivered with the address 128.
     for number, (path, address) in enumerate(zip(ports, addresses or [128] * len(ports), strict=True)):

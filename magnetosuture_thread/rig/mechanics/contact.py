@@ -17,6 +17,8 @@ from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
 
+Vector = NDArray[np.float64]
+
 MIN_APOTHEM = 0.6  # of a disc's radius, where segments are longer than the disc
 GRID = 128  # cells along the longer side of all that can be touched
 
@@ -38,13 +40,13 @@ class Shapes(NamedTuple):
         self_contact: whether the thread touches itself; else it passes over itself.
     """
 
-    discs: NDArray[np.float64]
-    corners: NDArray[np.float64]
-    convex: NDArray[np.float64]
+    discs: Vector
+    corners: Vector
+    convex: Vector
     starts: NDArray[np.int64]
-    boxes: NDArray[np.float64]
-    grid: NDArray[np.float64]
-    clearances: NDArray[np.float64]
+    boxes: Vector
+    grid: Vector
+    clearances: Vector
     wall: float
     stiffness: float
     friction: float
@@ -67,7 +69,7 @@ class Surface:
     """
 
     discs: tuple[Disc, ...] = ()
-    polygons: tuple[NDArray[np.float64], ...] = ()
+    polygons: tuple[Vector, ...] = ()
     wall_radius: float | None = None
     stiffness: float = 500.0
     skin: float = 1.5e-6
@@ -107,7 +109,7 @@ class Surface:
         return shapes
 
 
-def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
+def _directed(given: Vector) -> Vector:
     """Return a ring counter-clockwise and open."""
     ring = np.array(given, dtype=np.float64)
     ring = ring[:-1] if (ring[0] == ring[-1]).all() else ring
@@ -118,7 +120,7 @@ def _directed(given: NDArray[np.float64]) -> NDArray[np.float64]:
     return ring if area > 0.0 else np.ascontiguousarray(ring[::-1])
 
 
-def _convex(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+def _convex(ring: Vector) -> Vector:
     before, after = ring - np.roll(ring, 1, axis=0), np.roll(ring, -1, axis=0) - ring
     return np.where(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0.0, 1.0, 0.0)
 
@@ -182,7 +184,7 @@ def _find_clearances(shapes: Shapes) -> None:
 
 
 @compiled_inline
-def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: NDArray[np.float64]) -> int:
+def point_contacts(x: float, y: float, radius: float, shapes: Shapes, rows: Vector) -> int:
     """Write what a round point sinks into; return how many.
 
     Args:
@@ -234,9 +236,7 @@ def _segment_gap(ax: float, ay: float, bx: float, by: float, cx: float, cy: floa
 
 
 @compiled_inline
-def segment_contacts(
-    q: NDArray[np.float64], a: int, length: float, radius: float, shapes: Shapes, rows: NDArray[np.float64]
-) -> int:
+def segment_contacts(q: Vector, a: int, length: float, radius: float, shapes: Shapes, rows: Vector) -> int:
     """Write what the inner part of a segment sinks into: discs, and corners that stick out; return how many.
 
     Against a disc of reach r, a chain of chords D that all touch the circle of radius (D / 2) / tan(D / 2 r) from

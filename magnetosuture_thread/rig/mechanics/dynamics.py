@@ -10,12 +10,12 @@ import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.polyline import Points, chain_along
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, Vector
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, add_clamp, add_needle
 from magnetosuture_thread.rig.mechanics.rod import (
     SLIP_SPEED,
@@ -27,18 +27,20 @@ from magnetosuture_thread.rig.mechanics.rod import (
     add_contact,
     add_drag,
     add_friction,
+    add_pairs,
     add_stretching,
     back_substitute,
+    couple,
+    crosses_anew,
     drag_matrices,
     factor,
     find_contacts,
     find_friction,
+    find_pairs,
 )
-from magnetosuture_thread.rig.mechanics.self_contact import add_pairs, couple, crosses_anew, find_pairs
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 
-MAX_STEP = 2e-3  # s
 TOLERANCE = 1e-9  # m; the last move of Newton's iteration, which then converges quadratically
 MAX_HALVINGS = 8
 MAX_ITERATIONS = 60  # of Newton in a step
@@ -58,7 +60,7 @@ class Bodies(NamedTuple):
 class Field(Protocol):
     """The flux density of coils."""
 
-    def per_current(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_current(self, point: Vector) -> Vector:
         """Return that at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
 
 
@@ -76,29 +78,27 @@ class StepTerms(NamedTuple):
         pairs: see `find_pairs`.
     """
 
-    begin: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    drag: NDArray[np.float64]
-    turned: NDArray[np.float64]
-    field: NDArray[np.float64]
-    friction: NDArray[np.float64]
+    begin: Vector
+    rest: Vector
+    drag: Vector
+    turned: Vector
+    field: Vector
+    friction: Vector
     slip: float
-    pairs: NDArray[np.float64]
+    pairs: Vector
 
 
 class System(NamedTuple):
     """Gradient, band of second derivatives, and second derivatives of the rows of self-contact; rows to work in."""
 
-    gradient: NDArray[np.float64]
-    band: NDArray[np.float64]
-    second: NDArray[np.float64]
-    rows: NDArray[np.float64]
+    gradient: Vector
+    band: Vector
+    second: Vector
+    rows: Vector
 
 
 @compiled
-def _assemble_energy(
-    q: NDArray[np.float64], bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool
-) -> float:
+def _assemble_energy(q: Vector, bodies: Bodies, terms: StepTerms, system: System, driven: bool, convex: bool) -> float:
     """Write gradient and band of what a step makes least, and return its value [J].
 
     Where the needle is driven, its three unknowns are known: they get no force and no coupling.
@@ -114,7 +114,7 @@ def _assemble_energy(
     energy += add_clamp(q, needle, rod.segment, g, band, convex)
     energy += add_pairs(q, terms.begin, terms.slip, 2.0 * rod.radius, shapes.stiffness, terms.pairs, second, g)
     if not driven:
-        return energy + add_needle(q, terms.field, needle, shapes, terms.rest, terms.turned, g, band, convex)
+        return energy + add_needle(q, terms.field, needle, shapes, terms.rest, terms.turned, rows, g, band, convex)
     for i in range(3):
         g[i] = 0.0
         band[i, :] = 0.0
@@ -125,7 +125,7 @@ def _assemble_energy(
 
 
 @compiled
-def minimise(trial: NDArray[np.float64], bodies: Bodies, terms: StepTerms, driven: bool) -> tuple[int, float, float]:
+def minimise(trial: Vector, bodies: Bodies, terms: StepTerms, driven: bool) -> tuple[int, float, float]:
     """Move a state to where a step's value is least.
 
     Newton with a line search, and with the convex part of the second derivatives where they are not positive definite.
@@ -221,9 +221,9 @@ class RigDynamics:
         heading: float,
         thread_points: Points,
         *,
-        largest_step: float = MAX_STEP,
+        largest_step: float = 2e-3,
     ) -> None:
-        self.needle, self.properties, self.field = needle, thread, field
+        self.field = field
         length = thread.length / thread.segments
         nodes = chain_along(np.asarray(thread_points, dtype=np.float64), thread.segments, length)
         self._q = np.concatenate([[heading], nodes.ravel()])
@@ -257,7 +257,7 @@ class RigDynamics:
         self.iterations = self.halvings = 0
 
     @property
-    def tail(self) -> NDArray[np.float64]:
+    def tail(self) -> Vector:
         """The needle's tail, shape (2,) [m]."""
         return np.array(self._q[1:3])
 
@@ -267,7 +267,7 @@ class RigDynamics:
         return float(self._q[0])
 
     @property
-    def tip(self) -> NDArray[np.float64]:
+    def tip(self) -> Vector:
         """The needle's tip, shape (2,) [m]."""
         return self._tip_of(self._q)
 
@@ -282,13 +282,13 @@ class RigDynamics:
         return np.array(self._q[1:].reshape(-1, 2))
 
     @property
-    def tension(self) -> NDArray[np.float64]:
+    def tension(self) -> Vector:
         """Tension of each segment, positive when pulled, shape (n,) [N]."""
         chords = np.linalg.norm(np.diff(self._q[1:].reshape(-1, 2), axis=0), axis=1)
         return np.asarray(self._rod.stretching * (chords / self._rod.segment - 1.0))
 
     @property
-    def thread_pull(self) -> NDArray[np.float64]:
+    def thread_pull(self) -> Vector:
         """Force of the thread on the needle, at the tail, shape (2,) [N]: of stretching, bending and the clamp."""
         rod, edges = self._rod, np.diff(self.thread[:3], axis=0)
         stretch = self.tension[0] * edges[0] / np.linalg.norm(edges[0])
@@ -344,11 +344,7 @@ class RigDynamics:
         self._integrate(dt, None, np.array([turned, *np.asarray(tail)]))
 
     def _integrate(
-        self,
-        dt: float,
-        currents: NDArray[np.float64] | None,
-        goal: NDArray[np.float64] | None,
-        max_iterations: float = math.inf,
+        self, dt: float, currents: Vector | None, goal: Vector | None, max_iterations: float = math.inf
     ) -> float:
         """Take steps until dt is over, or the iterations are used up; a step that does not converge is halved."""
         regular = dt / max(math.ceil(dt / self._largest_step - 1e-9), 1)
@@ -376,7 +372,7 @@ class RigDynamics:
             h *= 0.5
         return dt
 
-    def _take(self, h: float, currents: NDArray[np.float64] | None, pose: NDArray[np.float64] | None) -> bool:
+    def _take(self, h: float, currents: Vector | None, pose: Vector | None) -> bool:
         """Take one step of the second backward difference formula; return whether it converged.
 
             Z(q*) (q - rest) / (beta dt) + dE/dq = 0,    w = dt / dt_before
@@ -405,13 +401,16 @@ class RigDynamics:
         pairs = find_pairs(q, rod, shapes, self._pairs) if shapes.self_contact else 0
         if pairs < 0:
             return False
+        friction = np.empty((0, 5))
+        if shapes.friction > 0.0:
+            friction = find_friction(self._rows[: find_contacts(q, rod, shapes, self._rows)], shapes)
         terms = StepTerms(
             begin=q,
             rest=((1.0 + w) ** 2 * q - w**2 * before) / (1.0 + 2.0 * w),
             drag=drag_matrices(trial, rod, scale),
             turned=scale * turn @ needle.resistance @ turn.T,
             field=flux,
-            friction=find_friction(self._rows[: find_contacts(q, rod, shapes, self._rows)], shapes),
+            friction=friction,
             slip=SLIP_SPEED * h,
             pairs=self._pairs[:pairs],
         )
@@ -422,10 +421,10 @@ class RigDynamics:
         self.time, self.residual, self.iterations = self.time + h, residual, self.iterations + iterations
         return True
 
-    def _tip_of(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(q[1:3] + self._turned(q, self.needle.tip))
+    def _tip_of(self, q: Vector) -> Vector:
+        return np.asarray(q[1:3] + self._turned(q, self._needle.tip))
 
     @staticmethod
-    def _turned(q: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _turned(q: Vector, vector: Vector) -> Vector:
         c, s = math.cos(q[0]), math.sin(q[0])
         return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])

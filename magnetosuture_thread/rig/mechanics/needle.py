@@ -9,12 +9,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import fields_per_current
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts
 
 NODES = 16  # of the integration along the body
 MU_0 = 4e-7 * math.pi  # T m/A
@@ -47,7 +46,7 @@ class CoilField:
         self._numbers = np.tile(np.array([away, np.full(len(nodes), radius), field]), len(angles))
         self._shape = 2, len(angles), len(nodes)
 
-    def per_current(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    def per_current(self, point: Vector) -> Vector:
         """Return the flux density at a point of shape (2,) [m] for one ampere in each coil, shape (2, m) [T/A]."""
         found = fields_per_current(float(point[0]), float(point[1]), self._axes, self._numbers)
         return np.asarray(found.reshape(self._shape).sum(axis=2))
@@ -80,11 +79,11 @@ class NeedleBody:
         return self.magnetisation * math.pi * self.diameter**2 / 4.0
 
     @cached_property
-    def tip(self) -> NDArray[np.float64]:
+    def tip(self) -> Vector:
         """The tip in the needle's frame, shape (2,) [m]."""
         return np.asarray(self.outline(2)[1])
 
-    def outline(self, count: int) -> NDArray[np.float64]:
+    def outline(self, count: int) -> Vector:
         """Return equally spaced points of the body in its frame, tail first, shape (count, 2) [m]."""
         return needle_axis(np.zeros(2), 0.0, self.length, self.curvature, np.linspace(0.0, 1.0, count))[0]
 
@@ -107,7 +106,7 @@ class NeedleBody:
         return along, across, turn
 
     @cached_property
-    def resistance(self) -> NDArray[np.float64]:
+    def resistance(self) -> Vector:
         """Resistance to (omega, v_x, v_y) of the tail in the needle's frame, shape (3, 3).
 
             R = integral over s of J' (along / L t t' + across / L n n') J,    J = [-y, 1, 0; x, 0, 1]
@@ -140,24 +139,25 @@ class Needle(NamedTuple):
         clamp: stiffness d of a clamped thread's d |x_1 - x_0 + R (D, 0)|^2, 0 when pinned [N/m].
     """
 
-    resistance: NDArray[np.float64]
-    tip: NDArray[np.float64]
+    resistance: Vector
+    tip: Vector
     pole: float
-    outline: NDArray[np.float64]
+    outline: Vector
     radius: float
     clamp: float
 
 
 @compiled
 def add_needle(
-    q: NDArray[np.float64],
-    field: NDArray[np.float64],
+    q: Vector,
+    field: Vector,
     needle: Needle,
     shapes: Shapes,
-    rest: NDArray[np.float64],
-    turned: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
+    rest: Vector,
+    turned: Vector,
+    rows: Vector,
+    gradient: Vector,
+    band: Vector,
     convex: bool,
 ) -> float:
     """Add the needle's terms: drag, poles in a given field, contact of its outline.
@@ -171,6 +171,7 @@ def add_needle(
         shapes: what can be touched.
         rest: state from which the drag is counted.
         turned: resistance of a step to (theta, x, y) in the dish's frame, shape (3, 3).
+        rows: to work in, shape (k, 6).
         gradient: added to.
         band: added to.
         convex: whether to leave out what makes second derivatives indefinite.
@@ -194,7 +195,7 @@ def add_needle(
     gradient[1] -= lx
     gradient[2] -= ly
     band[0, 0] += max(fx * tx + fy * ty, 0.0) if convex else fx * tx + fy * ty
-    k, rows = shapes.stiffness, np.empty((shapes.discs.shape[0] + shapes.boxes.shape[0] + 1, 6))
+    k = shapes.stiffness
     for i in range(needle.outline.shape[0]):
         ox = c * needle.outline[i, 0] - s * needle.outline[i, 1]
         oy = s * needle.outline[i, 0] + c * needle.outline[i, 1]
@@ -222,14 +223,7 @@ def add_needle(
 
 
 @compiled
-def add_clamp(
-    q: NDArray[np.float64],
-    needle: Needle,
-    segment: float,
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
+def add_clamp(q: Vector, needle: Needle, segment: float, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add d |x_1 - x_0 + R (D, 0)|^2, the half cell of bending at a clamped tail.
 
     With d = EI / D^3 that is EI D / 4 curvature^2, the curvature from a mirrored node before the tail: of second order

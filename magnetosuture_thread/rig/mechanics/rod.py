@@ -3,6 +3,18 @@
 Unknowns are q = [theta, x_0, y_0, x_1, y_1, ... x_n, y_n]: the needle's heading, its tail, which is node 0, and the
 thread's nodes. Every term touches three nodes in a row at most, so second derivatives have the half-width 5. They
 are kept as B[i, k] = d2E / dq_i dq_{i-k}, shape (2n + 3, 6).
+
+**Contact of the thread with itself** in the plane, as in a film of liquid too thin for it to pass over itself.
+A node near a segment of the same thread is kept on its side by the gap
+
+    g(q) = n . (x_k - (1 - s) x_j - s x_{j+1}) - diameter,    energy k / 2 g^2 below 0
+
+whose place s and normal n are those of the start of a step, as the node is not far from there at its end: so g is
+linear. With friction, the slip of the two along the tangent adds what `friction` has for other contacts. These terms
+couple nodes far apart, which is beyond the band of second derivatives: Newton's step is corrected for them by solving
+for their forces first, as many unknowns as there are contacts.
+
+Source: Sherman and Morrison 1950, Woodbury 1950. Deviation: none.
 """
 
 from __future__ import annotations
@@ -13,13 +25,13 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.rig.mechanics.contact import Shapes, clear, point_contacts, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts, segment_contacts
 
 SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this
 WIDTH = 6  # of the band: half-width and diagonal
+NORMAL = -1.0  # in place of a limit of friction, of a row that is a gap
 
 
 class NeedleJoint(str, Enum):
@@ -74,7 +86,8 @@ class Rod(NamedTuple):
     radius: float
 
 
-def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float) -> NDArray[np.float64]:
+@compiled
+def drag_matrices(q: Vector, rod: Rod, scale: float) -> Vector:
     """Return each node's drag: half of each segment beside it, so that a free end carries half a cell.
 
         Z_i = scale sum D / 2 (across I - (across - along) t t')
@@ -87,25 +100,20 @@ def drag_matrices(q: NDArray[np.float64], rod: Rod, scale: float) -> NDArray[np.
     Returns:
         Z_xx, Z_xy, Z_yy, shape (n + 1, 3).
     """
-    t = np.diff(q[1:].reshape(-1, 2), axis=0)
-    t /= np.hypot(t[:, 0], t[:, 1])[:, None]
-    xx, xy, yy = t[:, 0] ** 2, t[:, 0] * t[:, 1], t[:, 1] ** 2
-    less = rod.across - rod.along
-    each = 0.5 * rod.segment * scale * np.column_stack([rod.across - less * xx, -less * xy, rod.across - less * yy])
-    drag = np.zeros((len(each) + 1, 3))
-    drag[:-1] += each
-    drag[1:] += each
+    drag = np.zeros(((q.shape[0] - 1) // 2, 3))
+    half, less = 0.5 * rod.segment * scale, rod.across - rod.along
+    for i in range(drag.shape[0] - 1):
+        ex, ey = q[2 * i + 3] - q[2 * i + 1], q[2 * i + 4] - q[2 * i + 2]
+        square = ex * ex + ey * ey
+        for node in (i, i + 1):
+            drag[node, 0] += half * (rod.across - less * ex * ex / square)
+            drag[node, 1] -= half * less * ex * ey / square
+            drag[node, 2] += half * (rod.across - less * ey * ey / square)
     return drag
 
 
 @compiled
-def add_drag(
-    q: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    drag: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-) -> float:
+def add_drag(q: Vector, rest: Vector, drag: Vector, gradient: Vector, band: Vector) -> float:
     """Add sum (x_i - rest_i)' Z_i (x_i - rest_i) / 2, the work of a step against the liquid."""
     energy = 0.0
     for i in range(drag.shape[0]):
@@ -122,13 +130,7 @@ def add_drag(
 
 
 @compiled
-def add_stretching(
-    q: NDArray[np.float64],
-    rod: Rod,
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
+def add_stretching(q: Vector, rod: Rod, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add sum EA / (2 D) (l_i - D)^2; `convex` leaves out what makes second derivatives indefinite."""
     energy = 0.0
     k = rod.stretching / rod.segment
@@ -158,7 +160,7 @@ def add_stretching(
 
 
 @compiled
-def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64], band: NDArray[np.float64]) -> float:
+def add_bending(q: Vector, rod: Rod, gradient: Vector, band: Vector) -> float:
     """Add sum EI / D (1 - cos(phi_i)) at inner nodes, phi_i the turn from segment to segment.
 
         = EI / (2 D^3) sum |x_{i+1} - 2 x_i + x_{i-1}|^2
@@ -184,7 +186,7 @@ def add_bending(q: NDArray[np.float64], rod: Rod, gradient: NDArray[np.float64],
 
 
 @compiled
-def find_contacts(q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArray[np.float64]) -> int:
+def find_contacts(q: Vector, rod: Rod, shapes: Shapes, rows: Vector) -> int:
     """Write what nodes 1 ... n and segments sink into; return how many.
 
     Args:
@@ -215,14 +217,7 @@ def find_contacts(q: NDArray[np.float64], rod: Rod, shapes: Shapes, rows: NDArra
 
 
 @compiled
-def add_contact(
-    q: NDArray[np.float64],
-    k: float,
-    rows: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-    convex: bool,
-) -> float:
+def add_contact(q: Vector, k: float, rows: Vector, gradient: Vector, band: Vector, convex: bool) -> float:
     """Add k / 2 depth^2 of every contact, the rows of `find_contacts`.
 
     For a segment the gap's second derivative is that of the distance between a point and a line.
@@ -257,7 +252,7 @@ def add_contact(
     return energy
 
 
-def find_friction(contacts: NDArray[np.float64], shapes: Shapes) -> NDArray[np.float64]:
+def find_friction(contacts: Vector, shapes: Shapes) -> Vector:
     """Return where friction acts in a step, by Coulomb's law with the normal forces at the start of the step.
 
     A contact that pushes with the force N at the start of a step adds, for its slip s = t . (x - x_start) along it,
@@ -274,29 +269,16 @@ def find_friction(contacts: NDArray[np.float64], shapes: Shapes) -> NDArray[np.f
         Index of the first unknown, place on the segment (0 at a node), t_x, t_y and mu N [N], shape (k, 5).
     """
     a, s, depth, nx, ny, _ = contacts.T
-    found = np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
-    return found if shapes.friction > 0.0 else found[:0]
+    return np.column_stack([a, np.maximum(s, 0.0), -ny, nx, shapes.friction * shapes.stiffness * depth])
 
 
 @compiled
-def add_friction(
-    q: NDArray[np.float64],
-    start: NDArray[np.float64],
-    slip: float,
-    friction: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-    band: NDArray[np.float64],
-) -> float:
+def add_friction(q: Vector, start: Vector, slip: float, friction: Vector, gradient: Vector, band: Vector) -> float:
     """Add the friction of a step from `start` to q; `slip` is e [m]."""
     energy = 0.0
     for row in range(friction.shape[0]):
-        a, s, tx, ty, limit = (
-            int(friction[row, 0]),
-            friction[row, 1],
-            friction[row, 2],
-            friction[row, 3],
-            friction[row, 4],
-        )
+        a, s, limit = int(friction[row, 0]), friction[row, 1], friction[row, 4]
+        tx, ty = friction[row, 2], friction[row, 3]
         w = ((1.0 - s) * tx, (1.0 - s) * ty, s * tx, s * ty)
         count = 2 if s == 0.0 else 4
         along = 0.0
@@ -313,7 +295,7 @@ def add_friction(
 
 
 @compiled
-def factor(band: NDArray[np.float64]) -> bool:
+def factor(band: Vector) -> bool:
     """Replace a band by its Cholesky factor, row by row; return whether it was positive definite."""
     for i in range(band.shape[0]):
         low = max(0, i - WIDTH + 1)
@@ -331,7 +313,7 @@ def factor(band: NDArray[np.float64]) -> bool:
 
 
 @compiled
-def back_substitute(band: NDArray[np.float64], right: NDArray[np.float64]) -> None:
+def back_substitute(band: Vector, right: Vector) -> None:
     """Solve in place with the factor that `factor` left."""
     size = band.shape[0]
     for i in range(size):
@@ -344,3 +326,165 @@ def back_substitute(band: NDArray[np.float64], right: NDArray[np.float64]) -> No
         for j in range(i + 1, min(size, i + WIDTH)):
             total -= band[j, j - i] * right[j]
         right[i] = total / band[i, 0]
+
+
+@compiled
+def _side(q: Vector, a: int, b: int, c: int) -> float:
+    """Return twice the area of the triangle of three nodes, by their first unknowns, positive counter-clockwise."""
+    return float((q[b] - q[a]) * (q[c + 1] - q[a + 1]) - (q[b + 1] - q[a + 1]) * (q[c] - q[a]))
+
+
+@compiled
+def _cross(q: Vector, a: int, b: int) -> bool:
+    """Return whether the segments from two nodes on cross, by the nodes' first unknowns; one that is none does not."""
+    if min(a, b) < 1 or max(a, b) + 3 >= q.shape[0] or abs(a - b) < 4:
+        return False
+    return bool(
+        _side(q, a, a + 2, b) * _side(q, a, a + 2, b + 2) < 0.0
+        and _side(q, b, b + 2, a) * _side(q, b, b + 2, a + 2) < 0.0
+    )
+
+
+@compiled
+def crosses_anew(start: Vector, end: Vector) -> bool:
+    """Return whether two segments cross at the end of a step that did not at its start."""
+    for a in range(1, end.shape[0] - 6, 2):
+        for b in range(a + 4, end.shape[0] - 2, 2):
+            if max(end[a], end[a + 2]) < min(end[b], end[b + 2]) or max(end[b], end[b + 2]) < min(end[a], end[a + 2]):
+                continue
+            if _cross(end, a, b) and not _cross(start, a, b):
+                return True
+    return False
+
+
+@compiled
+def find_pairs(q: Vector, rod: Rod, shapes: Shapes, pairs: Vector) -> int:
+    """Write what of the thread is near itself at the start of a step.
+
+    What crosses itself already is free to move apart.
+
+    Args:
+        q: state at the start, shape (N,) [rad, m].
+        rod: the thread.
+        shapes: stiffness and friction.
+        pairs: gets the first unknown of the node and of the segment, place on it, direction, and `NORMAL` or the
+            limit of friction [N], shape (p, 6).
+
+    Returns:
+        How many there are, -1 if there is no room.
+    """
+    count, size, diameter = 0, q.shape[0], 2.0 * rod.radius
+    for a in range(1, size - 1, 2):
+        for b in range(1, size - 3, 2):
+            between = min(abs(a - b), abs(a - b - 2)) // 2
+            # Places less than half a circle of thread apart cannot touch.
+            if a == b or a == b + 2 or between * rod.segment <= 0.5 * math.pi * diameter:
+                continue
+            ex, ey, dx, dy = q[b + 2] - q[b], q[b + 3] - q[b + 1], q[a] - q[b], q[a + 1] - q[b + 1]
+            square = ex * ex + ey * ey
+            s = min(max((dx * ex + dy * ey) / square, 0.0), 1.0)
+            nx, ny = dx - s * ex, dy - s * ey
+            gap = math.sqrt(nx * nx + ny * ny)
+            # A node that is farther than half a segment from touching has no gap in a step.
+            if not 0.0 < gap < diameter + 0.5 * rod.segment or _cross(q, a, b) or _cross(q, a - 2, b):
+                continue
+            if count + 2 > pairs.shape[0]:
+                return -1
+            nx, ny = nx / gap, ny / gap
+            _write(pairs[count], a, b, s, nx, ny, NORMAL)
+            count += 1
+            if gap < diameter and shapes.friction > 0.0:
+                _write(pairs[count], a, b, s, -ny, nx, shapes.friction * shapes.stiffness * (diameter - gap))
+                count += 1
+    return count
+
+
+@compiled
+def _write(row: Vector, a: int, b: int, s: float, x: float, y: float, limit: float) -> None:
+    row[0], row[1], row[2], row[3], row[4], row[5] = a, b, s, x, y, limit
+
+
+@compiled
+def _place(row: Vector, r: int) -> tuple[int, float]:
+    """Return one of the six unknowns of a row, by its number, and the derivative of the row's gap or slip by it."""
+    s, weight = row[2], row[3 + r % 2]
+    if r < 2:
+        return int(row[0]) + r, weight
+    return int(row[1]) + r - 2, -weight * (1.0 - s if r < 4 else s)
+
+
+@compiled
+def add_pairs(
+    q: Vector,
+    start: Vector,
+    slip: float,
+    diameter: float,
+    stiffness: float,
+    pairs: Vector,
+    second: Vector,
+    gradient: Vector,
+) -> float:
+    """Add energy and gradient of all rows, and write the second derivative of each by its gap or slip.
+
+    Args:
+        q: state, shape (N,).
+        start: at the start of the step.
+        slip: that smooths friction [m].
+        diameter: of the thread [m].
+        stiffness: k [N/m].
+        pairs: of `find_pairs`, shape (p, 6).
+        second: written, shape (p,).
+        gradient: added to, shape (N,).
+    """
+    energy = 0.0
+    for row in range(pairs.shape[0]):
+        along, limit = 0.0, pairs[row, 5]
+        for r in range(6):
+            at, weight = _place(pairs[row], r)
+            along += weight * (q[at] - (start[at] if limit != NORMAL else 0.0))
+        if limit == NORMAL:
+            depth = max(diameter - along, 0.0)
+            energy += 0.5 * stiffness * depth * depth
+            force, second[row] = -stiffness * depth, stiffness if depth > 0.0 else 0.0
+        else:
+            root = math.sqrt(along * along + slip * slip)
+            energy += limit * (root - slip)
+            force, second[row] = limit * along / root, limit * slip * slip / root**3
+        if force != 0.0:
+            for r in range(6):
+                at, weight = _place(pairs[row], r)
+                gradient[at] += force * weight
+    return energy
+
+
+@compiled
+def couple(chol: Vector, pairs: Vector, second: Vector, first_free: int, step: Vector) -> None:
+    """Correct a step, found with the factor of the band alone, for the rows' second derivatives.
+
+    Args:
+        chol: the factor.
+        pairs: of `find_pairs`.
+        second: of `add_pairs`.
+        first_free: the first unknown; those before are given.
+        step: corrected, shape (N,).
+    """
+    rows = np.flatnonzero(second > 0.0)
+    if len(rows) == 0:
+        return
+    size = len(rows)
+    columns, matrix, force = np.zeros((size, step.shape[0])), np.zeros((size, size)), np.zeros(size)
+    for i in range(size):
+        for r in range(6):
+            at, weight = _place(pairs[rows[i]], r)
+            if at >= first_free:
+                columns[i, at] += weight
+        back_substitute(chol, columns[i])
+    for i in range(size):
+        matrix[i, i] = 1.0 / second[rows[i]]
+        for r in range(6):
+            at, weight = _place(pairs[rows[i]], r)
+            if at >= first_free:
+                force[i] += weight * step[at]
+                for j in range(size):
+                    matrix[i, j] += weight * columns[j, at]
+    step -= np.linalg.solve(matrix, force) @ columns

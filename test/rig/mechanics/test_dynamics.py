@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties, minimise
+from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 
 Vector = NDArray[np.float64]
@@ -196,49 +194,3 @@ def test_the_thread_goes_round_an_obstacle(kind: str):
     assert np.abs(made.tension).max() / POLYAMIDE.stretching_stiffness < 1e-3
     # It hangs over the far side.
     assert made.thread[:, 0].max() > 2e-3
-
-
-def test_what_a_needle_lies_against_pushes_it_away():
-    post = Surface((Disc((4e-3, -1.3e-3), 1e-3),))
-    made = rig(SLIGHT, surface=post, field=PlainField((0.0, -0.02), 0.0))
-    for _ in range(60):
-        made.step([1.0], FRAME)
-    body = made.tail + np.linspace(0.0, 1.0, 400)[:, None] * (made.tip - made.tail)
-    gap = np.linalg.norm(body - [4e-3, -1.3e-3], axis=1).min() - 1e-3 - 2e-4
-    # Discs along the body, half a radius apart, are its side.
-    assert -1.5e-5 < gap < 2e-6
-    assert abs(made.heading) > 0.1
-
-
-def test_a_step_that_fails_is_halved_and_the_time_is_kept(monkeypatch: pytest.MonkeyPatch):
-    made, plain, calls = rig(), rig(), [0]
-
-    def sometimes(*arguments: Any) -> tuple[int, float, float]:
-        calls[0] += 1
-        return (-1, 1.0, 1.0) if calls[0] in (3, 4) else minimise(*arguments)
-
-    steered(plain, 2.0 * FRAME)
-    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.minimise", sometimes)
-    steered(made, FRAME)
-    assert made.halvings == 2
-    steered(made, FRAME)
-    assert made.time == pytest.approx(2.0 * FRAME)
-    np.testing.assert_allclose(made.thread, plain.thread, atol=1e-4)
-
-
-def test_a_call_takes_no_more_iterations_than_it_may_and_says_how_far_it_came(monkeypatch: pytest.MonkeyPatch):
-    made = rig()
-
-    def wedged(trial: Vector, bodies: Any, terms: Any, driven: bool) -> tuple[int, float, float]:
-        return minimise(trial, bodies, terms, driven) if terms.slip < 2e-6 * 1e-4 else (-1, 1.0, 1.0)
-
-    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.minimise", wedged)
-    moved = made.step(np.zeros(4), 60.0, 1000)
-    assert 0.0 < moved < 0.01
-    assert made.time == pytest.approx(moved)
-    assert made.step(np.zeros(4), 1e-3, 1) > 0.0  # however few
-    monkeypatch.setattr("magnetosuture_thread.rig.mechanics.dynamics.minimise", lambda *arguments: (-1, 1.0, 1.0))
-    before = made.thread
-    with pytest.raises(SolverError, match="no convergence"):
-        made.step(np.zeros(4), FRAME)
-    np.testing.assert_array_equal(made.thread, before)

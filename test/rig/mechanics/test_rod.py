@@ -6,12 +6,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, polygon_gap, segment_contacts
+from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface
 from magnetosuture_thread.rig.mechanics.needle import Needle, add_clamp, add_needle
 from magnetosuture_thread.rig.mechanics.rod import (
     WIDTH,
@@ -26,7 +24,6 @@ Vector = NDArray[np.float64]
 Term = Callable[[Vector, Vector, Vector, bool], float]
 SEGMENTS, D = 7, 1e-3
 ROD = Rod(D, 5.0, 1.3e-9, 0.97, 0.48, 3e-5)
-L_SHAPE = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 3.0]]) * 1e-3
 
 
 def bent_state(seed: int = 0, turn: float = 0.3) -> Vector:
@@ -97,9 +94,10 @@ def test_the_needles_terms_have_their_derivatives():
     outline = np.column_stack([np.linspace(0.0, 7e-3, 9), np.zeros(9)])
     needle = Needle(resistance, np.array([7e-3, 1e-4]), 0.13, outline, 2e-4, 1.3)
     shapes = Surface((Disc((4e-3, 1.6e-3), 1.1e-3),), wall_radius=7.1e-3).packed()
-    q, field = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]])
+    q, field, rows = bent_state(), np.array([[1e-2, -2e-2], [2e-2, -3e-2]]), np.zeros((3, 6))
     rest = q - np.concatenate([[1e-2], np.full(len(q) - 1, 1e-5)])
-    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, 500.0 * resistance, g, b, c), q)
+    turned = 500.0 * resistance
+    check_derivatives(lambda q, g, b, c: add_needle(q, field, needle, shapes, rest, turned, rows, g, b, c), q)
     check_derivatives(lambda q, g, b, c: add_clamp(q, needle, D, g, b, c), q, 1e-7)
 
 
@@ -118,46 +116,3 @@ def test_contact_of_a_disc_the_wall_and_corners_has_its_derivatives():
         corner = middle - depth * away
         wedge = np.array([corner, corner + 2e-3 * away + 5e-4 * away[::-1], corner + 2e-3 * away - 5e-4 * away[::-1]])
         check_derivatives(contact_term(Surface(polygons=(wedge,)).packed()), q)
-
-
-@compiled
-def gap_to(x: float, y: float, shapes: Shapes) -> tuple[float, float, float, float]:
-    return polygon_gap(x, y, shapes, 0)  # which is for compiled code alone, as the next
-
-
-@compiled
-def contacts_of(q: Vector, shapes: Shapes, rows: Vector) -> int:
-    length = math.sqrt((q[3] - q[1]) ** 2 + (q[4] - q[2]) ** 2)
-    return segment_contacts(q, 1, length, 3e-5, shapes, rows)
-
-
-def test_the_distance_from_a_polygon():
-    shapes = Surface(polygons=(L_SHAPE[::-1],)).packed()
-    cases = [
-        ((2e-3, -1e-3), 1e-3, (0.0, -1.0), 0.0),
-        ((5e-3, -1e-3), math.sqrt(2.0) * 1e-3, (math.sqrt(0.5), -math.sqrt(0.5)), math.sqrt(0.5) * 1e3),
-        ((3e-3, 0.8e-3), -0.2e-3, (0.0, 1.0), 0.0),
-        ((1.3e-3, 1.2e-3), 0.2e-3, (0.0, 1.0), 0.0),
-        ((0.9e-3, 0.8e-3), -math.hypot(0.1e-3, 0.2e-3), (0.1 / math.hypot(0.1, 0.2), 0.2 / math.hypot(0.1, 0.2)), None),
-    ]
-    for point, gap, normal, curvature in cases:
-        found = gap_to(*point, shapes)
-        assert found[0] == pytest.approx(gap, rel=1e-12)
-        assert found[1:3] == pytest.approx(normal, abs=1e-12)
-        assert found[3] == pytest.approx(1.0 / gap if curvature is None else curvature, abs=1e-9)
-    assert gap_to(2e-3, 0.0, shapes)[:3] == pytest.approx((0.0, 0.0, -1.0))
-    np.testing.assert_array_equal(np.flatnonzero(shapes.convex == 0.0), [np.argmin(abs(shapes.corners - 1e-3).sum(1))])
-
-
-def test_a_segment_touches_only_corners_that_stick_out():
-    shapes, rows = Surface(polygons=(L_SHAPE,)).packed(), np.zeros((9, 6))
-
-    def contacts(*ends: float) -> int:
-        return contacts_of(np.array([0.0, *ends]), shapes, rows)
-
-    # Across the corner at (4, 1) mm, at 45 degrees, 10 um off; and the same beside the reflex corner (1, 1) mm.
-    for gap in (1e-5, -1e-5):
-        off = gap * math.sqrt(0.5)
-        assert contacts(3.7e-3 + off, 1.3e-3 + off, 4.3e-3 + off, 0.7e-3 + off) == 1
-        np.testing.assert_allclose(rows[0, 1:], [0.5, 3e-5 - gap, math.sqrt(0.5), math.sqrt(0.5), gap], rtol=1e-9)
-    assert contacts(1.005e-3, 1.3e-3, 1.3e-3, 1.005e-3) == 0

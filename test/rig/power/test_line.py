@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.rig.power import Line, PowerStage, RoboClawBoard, checksum
+from magnetosuture_thread.rig.power import Line, RoboClawBoard, checksum
 
 QUESTION = bytes((128, 24))
 ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")
@@ -70,25 +70,3 @@ def test_what_a_killed_simulation_left_is_replaced_and_anything_else_stays(tmp_p
     assert (tmp_path / "file").read_text() == "mine"
     with pytest.raises(ConfigurationError, match="No such file"):
         Line(tmp_path / "nowhere" / "board", [RoboClawBoard()]).plug()
-
-
-def test_a_stage_has_two_coils_on_each_board_in_order(tmp_path):
-    paths = [str(tmp_path / name) for name in ("a", "b", "a")]
-    stage = PowerStage(paths, 24.0, 1.0, 0.01)
-    assert [board.address for board in stage.boards] == [128, 129, 130]
-    assert [line.boards for line in stage.lines] == [(stage.boards[0], stage.boards[2]), (stage.boards[1],)]
-    stage.open()
-    for number, board in enumerate(stage.boards):
-        board.inductance = 1e9
-        board.advance(time.monotonic())
-        board.currents = (number + 0.25, number + 0.5)
-    assert stage.currents() == pytest.approx([0.25, 0.5, 1.25, 1.5, 2.25, 2.5], rel=1e-3)
-    stage.close()
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_stage_that_cannot_open_leaves_nothing(tmp_path):
-    stage = PowerStage([str(tmp_path / "a"), str(tmp_path / "nowhere" / "b")], 24.0, 1.0, 0.01)
-    with pytest.raises(ConfigurationError):
-        stage.open()
-    assert not list(tmp_path.iterdir())

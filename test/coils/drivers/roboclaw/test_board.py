@@ -149,14 +149,6 @@ def test_an_acknowledgement_is_not_taken_for_that_of_the_next_request(peer, port
         board(port).configure()
 
 
-def test_one_packet_may_get_lost(peer, port):
-    wait_for(port, 2.0)
-    replies = iter([b"", SUPPLY, b"\xff"])
-    peer.answer(lambda _: next(replies))
-    board(port).write_zero()
-    assert len(peer.heard) == 3
-
-
 @pytest.mark.parametrize("stopped_before", [8, 7, 1], ids=["the clock", "the first bytes", "the last byte"])
 def test_a_process_that_is_stopped_while_it_writes_currents_drives_no_board_later(
     peer, port, monkeypatch, stopped_before: int

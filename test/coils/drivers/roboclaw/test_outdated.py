@@ -24,16 +24,12 @@ def duties_during(bench, seconds: float) -> set[tuple[int, int]]:
     return found
 
 
-def test_currents_that_were_computed_long_ago_are_zero(bench):
-    """As where the bridge is stopped between a command and the driver."""
-    driver = bench.open(apply_timeout=0.1)
-    driver.apply(CURRENTS, time.monotonic() - 0.45)
-    assert duties_during(bench, 0.3) == {(0, 0)}
-
-
-def test_currents_older_than_the_boards_own_timeout_are_zero_however_long_commands_last(bench):
-    """The boards have stopped by themselves meanwhile, and must not start again."""
-    driver = bench.open(command_timeout=1.0, driver_timeout=0.2)
+@pytest.mark.parametrize(
+    "timeouts", [{"apply_timeout": 0.1}, {"command_timeout": 1.0, "driver_timeout": 0.2}], ids=["command", "board"]
+)
+def test_currents_that_were_computed_long_ago_are_zero(bench, timeouts: dict[str, float]):
+    """As where the bridge is stopped before the driver; boards that have stopped by themselves must not start again."""
+    driver = bench.open(**timeouts)
     driver.apply(CURRENTS, time.monotonic() - 0.45)
     assert duties_during(bench, 0.3) == {(0, 0)}
 
