@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
 from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
+from magnetosuture_thread.estimator.estimator import ONE_SIDED_99
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.cdr import Stamp, pack

@@ -10,15 +10,13 @@ import pytest
 from magnetosuture_thread import Disc
 from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.estimator.correction import (
-    CORRECTED,
-    CorrectionBuffers,
     Corrector,
     Prior,
-    correct,
     normals_of,
     prior_information,
     robust_weights,
 )
+from magnetosuture_thread.estimator.estimator import clearance_bound
 from magnetosuture_thread.thread.program import StepBuffers, program_of
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import as_quadratic_program
@@ -77,11 +75,10 @@ def test_prior_information_is_the_one_that_is_documented(clamped: bool) -> None:
     rng = np.random.default_rng(1)
     nodes, known = bent_chain(rng), np.zeros(NODES, dtype=np.bool_)
     density, noise = rng.uniform(0.5, 2.0, NODES), rng.uniform(0.5, 2.0, NODES)
-    normals, buffers = np.zeros((NODES, 2)), StepBuffers.of(NODES, 2, 1)
-    normals_of(nodes, normals)
+    normals, buffers = normals_of(nodes), StepBuffers.of(NODES, 2, 1)
     length, stiffness, scale = 2.0, 0.7, 3.0
     prior = Prior(nodes, np.array([1.0, 0.0]), density, noise, length, stiffness)
-    prior_information(prior, scale, clamped, normals, buffers)
+    prior_information(prior, scale, clamped, buffers)
     found = dense_of(buffers, known, 0)
     for _ in range(5):
         d = rng.normal(0.0, 1.0, (NODES, 2))
@@ -104,25 +101,23 @@ def test_correction_agrees_with_a_dense_kalman_filter() -> None:
     rng = np.random.default_rng(4)
     points = measured(rng, 40)
     points = points._replace(innovation=1e-3 * points.innovation, variance=np.full(40, 1e-4), share=np.ones(40))
-    formulation, memory = predictor_of(thread_of(NODES - 1)).formulation, CorrectionBuffers.of(NODES)
-    assert isinstance(formulation, RodFormulation)
-    memory.known[0] = True
+    predictor = predictor_of(thread_of(NODES - 1))
+    assert isinstance(predictor.formulation, RodFormulation)
+    corrector = Corrector(predictor, predictor.formulation)
     prior = Prior(STRAIGHT, np.array([1.0, 0.0]), np.full(NODES, 3e-4), np.ones(NODES), 2.0, 0.5)
-    code, _, off, residual, _ = correct(formulation.rod, formulation.workspace.data, memory, prior, points)
-    assert code == CORRECTED
-    assert off <= 1.0
-    assert residual < 1e-6
+    assert not corrector.solve(prior, points)
+    assert corrector.residual < 1e-6
     check = StepBuffers.of(NODES, 2, 1)
-    prior_information(prior, 1.0, False, memory.normals, check)
+    prior_information(prior, 1.0, False, check)
     information = dense_of(check, np.zeros(NODES, dtype=np.bool_), 0)[2:, 2:][1::2, 1::2]
     rows = dense_rows(points, STRAIGHT)[:, 3::2]
     covariance = np.linalg.inv(information)
     spread = rows @ covariance @ rows.T + np.diag(points.variance)
     gain = covariance @ rows.T @ np.linalg.inv(spread)
-    np.testing.assert_allclose(memory.moved[1:, 1], gain @ points.innovation, rtol=1e-3, atol=1e-8)
+    np.testing.assert_allclose(corrector.work.moved[1:, 1], gain @ points.innovation, rtol=1e-3, atol=1e-8)
     left = covariance - gain @ rows @ covariance
-    np.testing.assert_allclose(memory.covariance[1:, 1, 1], np.diag(left), rtol=1e-3)
-    assert np.abs(memory.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
+    np.testing.assert_allclose(corrector.work.covariance[1:, 1, 1], np.diag(left), rtol=1e-3)
+    assert np.abs(corrector.work.moved[:, 0]).max() < 1e-6  # the chords hold it along the thread
 
 
 def test_a_point_that_errs_alone_counts_little_and_one_that_errs_with_its_neighbours_counts_fully() -> None:
@@ -156,10 +151,9 @@ def test_sensitivity_information_and_score_are_those_of_a_dense_filter(end: tupl
     other = corrector.sensitivity(derivative)
     score, square = 0.5 * (found.score - other.score), 0.5 * (found.square + other.square)
 
-    normals, buffers = np.zeros((NODES, 2)), StepBuffers.of(NODES, 2, 1)
-    normals_of(start, normals)
+    buffers = StepBuffers.of(NODES, 2, 1)
     scale = max((1.0 / density[1:]).max(), (points.share / points.variance).max())
-    prior_information(prior, scale, False, normals, buffers)
+    prior_information(prior, scale, False, buffers)
     information = scale * dense_of(buffers, np.zeros(NODES, dtype=np.bool_), 0)
     along = np.diff(start, axis=0)
     for i in range(NODES - 1):  # chords that do not change
@@ -191,7 +185,7 @@ def test_deviation_matches_the_spread_of_estimates() -> None:
     found, told = [], []
     for seed in range(40):
         estimator = estimator_of(thread)
-        estimator.start(rest[0], truth, deviation=1e-4)
+        estimator.start(rest[0], truth)
         estimate = estimator.step(rest[1], ThreadObservation((piece_of(truth, seed),), True))
         found.append(estimate.positions[5:, 1])
         told.append(estimate.deviation[5:])
@@ -242,8 +236,9 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     estimator = estimator_of(thread_of(), (disc,))
     estimator.start(way[0])
     estimate = estimator.step(way[1], whole(true_shapes(thread_of(), way)[1], 1))
-    rows = {each.name: each for each in estimate.compute_rows()}["obstacle"]
-    bound = estimate.clearance_bounds["obstacle"]
+    formulation = estimator.predictor.formulation
+    rows = {each.name: each for each in formulation.margins(estimate.positions, way[1].heading)}["obstacle"]
+    bound = estimate.margins["obstacle"].bound
     node, last = rows.nodes[:, -1], len(estimate.positions) - 1
     beside = [np.clip(node + apart, 0, last) for apart in (-1, 0, 1)]  # the half segments' clearance is of these too
     deviations = [
@@ -254,5 +249,4 @@ def test_bound_of_clearance_is_below_the_clearance_by_the_deviation() -> None:
     np.testing.assert_allclose(bound, expected, rtol=1e-4)
     assert (bound < rows.clearance)[node > 0].all()
     flat = replace(rows, gradient=np.zeros_like(rows.gradient))  # which no motion of a node changes
-    constant = replace(estimate, compute_rows=lambda: [flat])
-    np.testing.assert_array_equal(constant.clearance_bounds["obstacle"], rows.clearance)
+    np.testing.assert_array_equal(clearance_bound(flat, estimate.covariance), rows.clearance)

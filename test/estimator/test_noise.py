@@ -42,7 +42,8 @@ def test_errors_of_all_windows_together_raise_the_noise_of_all(side: float) -> N
 def test_each_intensity_has_a_kalman_filter_and_the_likelihood_of_its_innovation() -> None:
     rng, interval, model = np.random.default_rng(2), 0.03, NoiseModel.new()
     error, variance = 1e-5 * rng.normal(size=(2, 12)), 1e-10 * rng.uniform(0.5, 2.0, (2, 12))
-    before = model._replace(error=error, variance=variance)
+    known = model.likelihood[:2], model.intensity[:2]
+    before = model._replace(error=error, variance=variance, likelihood=known[0], intensity=known[1])
     innovation, own = np.array([3e-5, np.nan]), np.array([2e-10, np.inf])
     after = learn_intensity(before, innovation, own, interval)
     prior = variance + GRID * interval
@@ -68,10 +69,10 @@ def test_of_the_first_frame_no_noise_is_known_and_later_ones_count_by_the_time_b
         innovation = np.full(count, (-1.0) ** k * np.sqrt(10.0 * camera / 2.0 / 3.0))  # 3 points in a window
         variance = np.full(count, camera * model.scale)
         points = MeasuredPoints(place, innovation, variance, np.ones(count), np.ones(count))
-        model, _, expected, _ = learn(model, points, np.full((2, 13), 1e-9), unit, 0.03, 1.0)
+        model, innovations, _ = learn(model, points, np.full((2, 13), 1e-9), unit, 0.03, 1.0)
         if k == 0:
             assert model.ratio == 1.0
-            np.testing.assert_allclose(expected, (model.sums.own + model.sums.known) * unit**2)
+            np.testing.assert_allclose(innovations.variance, (model.sums.own + model.sums.known) * unit**2)
         else:
             scale += 0.03 / (0.03 * k + LEARNING_PRIOR) * (10.0 - scale)
             assert model.ratio != 1.0
