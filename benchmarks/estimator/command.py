@@ -273,7 +273,9 @@ def measure_case(case: Case, count: int, seed: int, segments: int, advance: Call
 
 def errors_of(errors: NDArray[np.float64]) -> dict[str, float]:
     """Return mean and maximum of errors in % of the length."""
-    return {"mean": float(errors.mean()), "maximum": float(errors.max())} if errors.size else {"mean": 0, "maximum": 0}
+    return (
+        {"mean": float(errors.mean()), "maximum": float(errors.max())} if errors.size else {"mean": 0.0, "maximum": 0.0}
+    )
 
 
 def measure_cost(segments: int, seed: int) -> dict[str, float]:
@@ -282,11 +284,11 @@ def measure_cost(segments: int, seed: int) -> dict[str, float]:
     estimator, (first, *seen) = estimator_of(run, case, segments), observations(case, run, seed)
     assert first is not None
     figures = {"points": float(len(first.pieces[0].points))}
-    for name, shown in (("estimate_s", seen), ("prediction_s", [None] * len(seen))):
+    for name, measured in (("estimate_s", True), ("prediction_s", False)):
         estimator.start_observed(run.poses[0], first)
         times = [time.process_time()]
-        for pose, each in zip(run.poses[1:], shown, strict=True):
-            estimator.step(pose, each)
+        for pose, each in zip(run.poses[1:], seen, strict=True):
+            estimator.step(pose, each if measured else None)
             times.append(time.process_time())
         figures[name] = float(np.median(np.diff(times)))
     return figures
@@ -318,7 +320,10 @@ def play_rendered(run: Run, case: Case, seed: int, frames: int) -> tuple[dict[in
 
 def measure_rendered(count: int, seed: int) -> dict[str, Any]:
     """Return how many unknown contacts were found in time, and false reports, with a post and without."""
-    errors, names = [], ("runs", "found", "late", "untracked_at_contact", "early", "runs_without_post", "false_reports")
+    errors, names = (
+        list[Points](),
+        ("runs", "found", "late", "untracked_at_contact", "early", "runs_without_post", "false_reports"),
+    )
     figures: dict[str, Any] = dict.fromkeys(names, 0)
     for number in range(seed, seed + count):
         for material, attachment in THREADS:

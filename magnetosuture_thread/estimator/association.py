@@ -108,8 +108,8 @@ def read_piece(piece: ThreadPiece, unit: float, max_points: int) -> tuple[Points
     """
     points, deviation = np.asarray(piece.points, dtype=np.float64), np.asarray(piece.deviation, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
-        expected = f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
-        raise PieceRefusedError(expected)
+        shapes = f"{points.shape} and {deviation.shape}"
+        raise PieceRefusedError(f"a piece of shapes {shapes}, expected (m, 2) and (m,)")
     inside = (np.abs(points) <= MAX_COORDINATE).all(axis=1) & (deviation >= 0.0) & (deviation <= MAX_COORDINATE)
     finite = np.flatnonzero(inside)
     taken = -(-len(finite) // max(1, -(-len(finite) // max_points)))
@@ -147,18 +147,16 @@ def search_start(
     # So many points are enough to find where a piece begins.
     stride, numbers = max(1, len(points) // 24), np.arange(len(nodes))
     some, at = points[::stride], arcs[::stride]
-
-    def squares(starts: Vector) -> Vector:
-        places = starts[:, None] + at
-        x, y = (np.interp(places, numbers, nodes[:, axis]) - some[:, axis] for axis in (0, 1))
-        return np.asarray(np.minimum(x * x + y * y, cap).mean(axis=1))
-
     steps = max(1, math.ceil(2.0 * (high - low)))
     starts = np.linspace(low, high, steps + 1)
-    best = starts[squares(starts).argmin()]
-    starts = np.clip(best + np.linspace(-0.5, 0.5, 11) * (high - low) / steps, low, high)
-    found = squares(starts)
-    return float(starts[found.argmin()]), float(found.min())
+    for _ in range(2 if high > low else 1):  # then finer about the best
+        places = starts[:, None] + at
+        x, y = [np.interp(places, numbers, nodes[:, axis]) - some[:, axis] for axis in (0, 1)]
+        squares = np.minimum(x * x + y * y, cap).mean(axis=1)
+        best = int(squares.argmin())
+        found = float(starts[best]), float(squares[best])
+        starts = np.clip(starts[best] + np.linspace(-0.5, 0.5, 11) * (high - low) / steps, low, high)
+    return found
 
 
 @compiled
@@ -293,7 +291,7 @@ def place_piece(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float
     attached, known = first is PieceEnd.TAIL, bool(np.isfinite(piece.arc_length).all())
     low, high = 0.0, 0.0 if attached else max(segments - float(arcs[-1]), 0.0)
     if known:
-        low, high = sorted(value / unit for value in piece.arc_length)
+        low, high = np.clip(np.sort(piece.arc_length) / unit, -segments, 2 * segments)
     cap = (0.25 * segments) ** 2
     start, square = search_start(nodes, points, arcs, low, high, cap)
     if not piece.direction_known:

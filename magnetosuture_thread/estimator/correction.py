@@ -77,7 +77,7 @@ class CorrectionBuffers(NamedTuple):
         about: where the nodes are, shape (n + 1, 2) [D].
         moved: d, shape (n + 1, 2) [D].
         known: nodes that are no unknowns, shape (n + 1,).
-        covariance: of each node, shape (n + 1, 2, 2) [D^2].
+        covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
     """
 
     program: StepBuffers
@@ -98,7 +98,8 @@ class CorrectionBuffers(NamedTuple):
 def normals_of(positions: Points) -> Points:
     """Return each node's unit normal, to the left of the way from the node before to the node after."""
     along = np.gradient(positions, axis=0)
-    return np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    return np.asarray(left / np.maximum(np.hypot(*along.T), 1e-12)[:, None])
 
 
 @compiled

@@ -15,25 +15,10 @@ from numpy.typing import NDArray
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.estimator.association import (
-    MIN_DEVIATION,
-    POINT_CORRELATION,
-    MeasuredPoints,
-    PlacedPiece,
-    measured_points,
-    place_pieces,
-)
+from magnetosuture_thread.estimator import association, noise
 from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
-from magnetosuture_thread.estimator.noise import (
-    Innovations,
-    NoiseModel,
-    at_nodes,
-    learn,
-    propagate_errors,
-    take_correction,
-    weigh,
-)
+from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
 from magnetosuture_thread.estimator.stiffness import (
     AUTOMATIC,
     STIFFNESS_OVER_DRAG,
@@ -264,7 +249,7 @@ class ThreadEstimator:
         self._forget()
         now, seen = self._now, 0.0 if centreline is None else float(arc_lengths(centreline)[-1])
         now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
-        known = 0.0 if centreline is None else LAID_DEVIATION * MIN_DEVIATION
+        known = 0.0 if centreline is None else LAID_DEVIATION * association.MIN_DEVIATION
         now.errors = self._errors_of(seen / self._unit, (known / self._unit) ** 2)
         return self._estimate([])
 
@@ -295,10 +280,10 @@ class ThreadEstimator:
         now.prediction = prediction = self._stiffness.step(pose)
         now.converged = prediction.converged
         assert before is not None
-        noise = at_nodes(now.noise.intensity, self.thread.segments + 1)
-        noise[0] = 0.0
-        added = np.outer((1.0, 2.0 * self._length), noise) * (prediction.interval / self._unit**2)
-        now.errors = propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
+        intensity = noise.at_nodes(now.noise.intensity, self.thread.segments + 1)
+        intensity[0] = 0.0
+        added = np.outer((1.0, 2.0 * self._length), intensity) * (prediction.interval / self._unit**2)
+        now.errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
         now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
         return self.correct(observation) if observation is not None else self._estimate([])
 
@@ -307,16 +292,16 @@ class ThreadEstimator:
         now, state, pose, unit = self._now, self.predictor.state, self.predictor.pose, self._unit
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
-        placed, problems = place_pieces(observation, state.positions / unit, now.errors[0], unit)
+        placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
         if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
             state = laid
-            placed, problems = place_pieces(observation, state.positions / unit, now.errors[0], unit)
+            placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
         points, refused = self._points_of(placed, state)
         if points is None:
             return self._estimate(problems + refused)
         learner, corrector, work = self._stiffness, self._corrector, self._corrector.work
         if learner.state.active:
-            weigh(points, now.errors[0])
+            noise.weigh(points, now.errors[0])
             if not corrector.solve(self._prior(state, pose), points):
                 state = learner.learn(corrector, state, pose.stamp)
                 again, refused = self._points_of(placed, state)
@@ -324,12 +309,14 @@ class ThreadEstimator:
         problems, count = problems + refused, len(points.place)
         measured = math.isfinite(now.measured_at)
         elapsed = pose.stamp - now.measured_at if measured else 0.0
-        now.noise, innovations, now.errors = learn(now.noise, points, now.errors, unit, elapsed, 2.0 * self._length)
+        now.noise, innovations, now.errors = noise.learn(
+            now.noise, points, now.errors, unit, elapsed, 2.0 * self._length
+        )
         prior = self._prior(state, pose)
         if problem := corrector.solve(prior, points):
             return self._estimate([*problems, problem], innovations, count)
         normals = normals_of(prior.positions)
-        now.errors, applied, hidden = take_correction(points, normals, work.moved, work.covariance, prior.density)
+        now.errors, applied, hidden = noise.take_correction(points, normals, work.moved, work.covariance, prior.density)
         now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
         if learner.state.active:
             learner.correct(corrector, float(now.errors[0].mean()))
@@ -344,10 +331,14 @@ class ThreadEstimator:
         now.converged, now.unknown, now.measured_at = True, False, pose.stamp
         return self._estimate(problems, innovations, count, hidden)
 
-    def _points_of(self, placed: list[PlacedPiece], state: ThreadState) -> tuple[MeasuredPoints | None, list[str]]:
+    def _points_of(
+        self, placed: list[association.PlacedPiece], state: ThreadState
+    ) -> tuple[association.MeasuredPoints | None, list[str]]:
         now, nodes = self._now, state.positions / self._unit
         obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
-        return measured_points(placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles)
+        return association.measured_points(
+            placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles
+        )
 
     def _prior(self, state: ThreadState, pose: NeedlePose) -> Prior:
         unit, rod = self._unit, self._formulation.rod
@@ -355,12 +346,12 @@ class ThreadEstimator:
             np.ascontiguousarray(state.positions / unit),
             np.ascontiguousarray(pose.heading, dtype=np.float64),
             np.maximum(self._now.errors[1], 1e-12),
-            at_nodes(self._now.noise.raised, self.thread.segments + 1) / unit**2,
+            noise.at_nodes(self._now.noise.raised, self.thread.segments + 1) / unit**2,
             self._length,
             rod.bending_stiffness / (rod.drag_across * unit**4),
         )
 
-    def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
+    def _laid_along(self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
         At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
@@ -376,7 +367,7 @@ class ThreadEstimator:
         measured = math.isfinite(now.measured_at)
         if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
             return None
-        seen = smoothed_line(piece.points, piece.arcs, 2.0 * POINT_CORRELATION / unit) * unit
+        seen = smoothed_line(piece.points, piece.arcs, 2.0 * association.POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))

@@ -119,11 +119,6 @@ class NoiseModel(NamedTuple):
         return cls(filters, filters, likelihood, quiet, quiet, 1.0, 1.0, 0.0, sums, nothing, nothing)
 
 
-def windows_of(points: MeasuredPoints, segments: int) -> NDArray[np.int64]:
-    """Return the window that each point lies in, shape (m,)."""
-    return np.minimum(points.place * WINDOWS / segments, WINDOWS - 1).astype(np.int64)
-
-
 @np.errstate(divide="ignore", invalid="ignore")
 def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
     """Write the robust weights of the points against the prior; return the sums of the windows.
@@ -134,10 +129,11 @@ def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
     """
     prior = np.interp(points.place, np.arange(len(variance)), variance)
     robust_weights(points.innovation, points.variance + prior, points.weight)
-    window, information = windows_of(points, len(variance) - 1), points.weight * points.share
+    window = (points.place * WINDOWS / (len(variance) - 1)).astype(np.int64).clip(max=WINDOWS - 1)
+    information = points.weight * points.share
     precision = information / points.variance
     of_points = (precision, precision * points.innovation, precision * prior, information)
-    own, mean, known, independent = (np.bincount(window, each, WINDOWS) for each in of_points)
+    own, mean, known, independent = [np.bincount(window, each, WINDOWS) for each in of_points]
     return WindowSums(mean / own, 1.0 / own, known / own, independent)
 
 
@@ -162,7 +158,7 @@ def propagate_errors(positions: Points, before: Points, unit: float, added: Poin
     """
     nodes, (x, y), normals = np.arange(len(positions)), (positions - before).T, normals_of(before)
     slid = (x * normals[:, 1] - y * normals[:, 0]) / unit  # away from the needle
-    return added + np.array([np.interp(nodes + slid, nodes, each) for each in errors])
+    return np.asarray(added + [np.interp(nodes + slid, nodes, each) for each in errors])
 
 
 def learn(
@@ -285,7 +281,8 @@ def take_correction(
         covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
         density: v of each node before, shape (n + 1,) [D^2].
     """
-    segments, window = len(density) - 1, windows_of(points, len(density) - 1)
+    segments = len(density) - 1
+    window = (points.place * WINDOWS / segments).astype(np.int64).clip(max=WINDOWS - 1)
     low = np.minimum(points.place.astype(np.int64), segments - 1)
     part, precision = points.place - low, points.weight * points.share / points.variance
     gained = np.bincount(low, precision * (1.0 - part), segments + 1)

@@ -13,12 +13,9 @@ from magnetosuture_thread.estimator.disturbance import BendingRelaxation, Distur
 from magnetosuture_thread.estimator.noise import (
     GRID,
     NOISE_TIME,
-    SURE,
     SWITCHING,
-    WINDOWS,
     NoiseModel,
     learn_intensity,
-    raised_intensity,
 )
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
@@ -218,17 +215,6 @@ def test_deviation_matches_the_spread_of_estimates() -> None:
         told.append(estimate.deviation[5:])
     ratio = np.sqrt(np.square(found).mean() / np.square(told).mean())
     assert 0.5 < ratio < 1.5
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_errors_of_all_windows_together_raise_the_noise_of_all(side: float) -> None:
-    """None of them alone would be sure: the thread as a whole is wrong by little."""
-    errors, model, shape = side * np.linspace(0.5, 2.5, WINDOWS), NoiseModel.new(), (WINDOWS, len(GRID))
-    assert np.abs(errors).max() < SURE
-    known = np.broadcast_to(1e-5 * errors[:, None], shape), np.full(shape, 1e-10)  # and filters expect 10 um
-    everywhere = np.ones(WINDOWS, dtype=np.bool_)
-    raised = raised_intensity(*known, model.likelihood, model.intensity, everywhere, 0.1, True)
-    np.testing.assert_allclose(raised, 1e-10 * np.maximum(errors**2 - 1.0, 0.0).mean() / 0.1, rtol=1e-12)
 
 
 def test_each_intensity_has_a_kalman_filter_and_the_likelihood_of_its_innovation() -> None:
