@@ -145,7 +145,7 @@ def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vecto
 
 @dataclass
 class FilterState:
-    """Everything that the next step and correction depend on.
+    """What the next step and correction depend on, besides the predictor.
 
     Attributes:
         errors: variance and density of each node, see `noise`, shape (2, n + 1) [D^2].
@@ -156,7 +156,6 @@ class FilterState:
         unknown: whether nobody has seen the thread's shape.
         converged: whether the barriers themselves hold.
         prediction: the last step.
-        pose, thread, warm_start, learned: of predictor, formulation and `StiffnessLearner`; set in a snapshot.
     """
 
     errors: Points
@@ -167,10 +166,10 @@ class FilterState:
     unknown: bool = True
     converged: bool = False
     prediction: Prediction | None = None
-    pose: NeedlePose | None = None
-    thread: ThreadState | None = None
-    warm_start: WarmStart | None = None
-    learned: LearnedState | None = None
+
+
+Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart, LearnedState]
+"""Everything that the next step depends on: of the filter, predictor, formulation and stiffness."""
 
 
 class ThreadEstimator:
@@ -432,25 +431,17 @@ class ThreadEstimator:
             compute_margins=compute_margins,
         )
 
-    def snapshot(self) -> FilterState:
+    def snapshot(self) -> Snapshot:
         """Return everything that the next step depends on."""
-        return replace(
-            self._now,
-            test=copy(self._now.test),
-            pose=self.predictor.pose,
-            thread=self.predictor.state,
-            warm_start=self._formulation.warm_start(),
-            learned=self._stiffness.state,
-        )
+        now, predictor = replace(self._now, test=copy(self._now.test)), self.predictor
+        return now, predictor.pose, predictor.state, self._formulation.warm_start(), self._stiffness.state
 
-    def restore(self, kept: FilterState) -> None:
+    def restore(self, kept: Snapshot) -> None:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
-        assert kept.warm_start is not None
-        assert kept.learned is not None
-        self._now = replace(kept, test=copy(kept.test))
-        self.predictor.pose, self.predictor.state = kept.pose, kept.thread
-        self._formulation.restore(kept.warm_start)
-        self._stiffness.restore(kept.learned)
+        now, self.predictor.pose, self.predictor.state, warm_start, learned = kept
+        self._now = replace(now, test=copy(now.test))
+        self._formulation.restore(warm_start)
+        self._stiffness.restore(learned)
 
     def follow_on(self, other: ThreadEstimator) -> None:
         """Continue from the estimate of another thread, in another scene or with other options; a step comes next.
@@ -459,14 +450,13 @@ class ThreadEstimator:
         """
         self.reset()
         self.predictor.follow_on(other.predictor)
-        kept, (old, new) = other.snapshot(), (other._unit, self._unit)
+        (kept, *_, learned), (old, new) = other.snapshot(), (other._unit, self._unit)
         at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
         errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
         test = kept.test if self.thread == other.thread else self._now.test
         self._now = replace(kept, errors=errors, test=test, prediction=None)
-        same = self.thread == other.thread and self.options.slow_parameters == other.options.slow_parameters
-        if same and kept.learned is not None:
-            self._stiffness.restore(kept.learned)
+        if self.thread == other.thread and self.options.slow_parameters == other.options.slow_parameters:
+            self._stiffness.restore(learned)
 
 
 def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:

@@ -9,7 +9,7 @@ import numpy as np
 from magnetosuture_thread.arguments import checked_arguments
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.estimator.association import LENGTH_ERROR
-from magnetosuture_thread.estimator.estimator import FilterState, ThreadEstimate, ThreadEstimator
+from magnetosuture_thread.estimator.estimator import Snapshot, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -23,7 +23,7 @@ class _Moment:
 
     pose: NeedlePose
     observation: ThreadObservation | None
-    after: FilterState
+    after: Snapshot
 
 
 @dataclass(frozen=True)
