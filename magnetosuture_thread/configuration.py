@@ -38,7 +38,7 @@ class Quantity:
         unit: SI unit, empty for text and switches.
         minimum: minimum value accepted, also of each entry of a list.
         maximum: maximum value accepted, also of each entry of a list.
-        choices: the texts accepted, empty for any.
+        choices: the texts accepted, also in a list; empty for any.
         multiple: a list's length must be a multiple of this.
         unlimited: whether inf is accepted too, as no limit.
     """
@@ -86,32 +86,20 @@ class Quantity:
         Raises:
             ConfigurationError: it is of another type, or out of bounds.
         """
-
-        def refuse() -> ConfigurationError:
+        entries = value if kind is tuple else [value]
+        good = isinstance(entries, Sequence) and not isinstance(entries, str) and len(entries) % self.multiple == 0
+        if not (good and all(self._fits(each, entry if kind is tuple else kind) for each in entries)):
             of = {int: "a list of whole numbers", str: "a list of texts"}.get(entry, "a list")
-            return ConfigurationError(name, value, self.expectation(kind, value).replace("a list", of), source)
-
+            raise ConfigurationError(name, value, self.expectation(kind, value).replace("a list", of), source)
         if kind is tuple:
-            if isinstance(value, str) or not isinstance(value, Sequence) or len(value) % self.multiple:
-                raise refuse()
-            if not all(self._fits(each, entry) for each in value):
-                raise refuse()
             return tuple(entry(each) for each in value)
-        if kind is float:
-            if not self.within(value):
-                raise refuse()
-            return float(value)
-        if not isinstance(value, kind) or (kind is int and (isinstance(value, bool) or not self.within(value))):
-            raise refuse()
-        if self.choices and value not in self.choices:
-            raise refuse()
-        return value
+        return float(value) if kind is float else value
 
-    def _fits(self, each: Any, entry: type) -> bool:
-        """Return whether a list may have this entry."""
-        if entry is str:
-            return isinstance(each, str)
-        return self.within(each) and (entry is float or isinstance(each, int))
+    def _fits(self, value: Any, kind: type) -> bool:
+        """Return whether a value, or an entry of a list, is of a kind and accepted."""
+        if kind in (str, bool):
+            return isinstance(value, kind) and (not self.choices or value in self.choices)
+        return self.within(value) and (kind is float or isinstance(value, int))
 
     def within(self, number: Any) -> bool:
         """Return whether something is a number, finite and within the bounds."""
@@ -128,10 +116,10 @@ class Quantity:
 def quantity(
     default: Any,
     description: str,
-    *,
     unit: str = "",
     minimum: float | None = None,
     maximum: float | None = None,
+    *,
     choices: Sequence[str] = (),
     multiple: int = 1,
 ) -> Any:
@@ -166,7 +154,8 @@ class Configuration:
 
     def refused(self, name: str, expected: str) -> ConfigurationError:
         """Return the error of a field whose value does not fit the others."""
-        return ConfigurationError(f"{self.GROUP}.{name}", getattr(self, name), expected)
+        value = getattr(self, name)
+        return ConfigurationError(f"{self.GROUP}.{name}", list(value) if isinstance(value, tuple) else value, expected)
 
 
 @dataclass(frozen=True)
@@ -189,15 +178,11 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
+@cache  # to read type hints takes longer than to check a value
 def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
     """Return the fields of a configuration class."""
-    return _fields_of(cast(Any, cls))
-
-
-@cache  # to read type hints takes longer than to check a value
-def _fields_of(cls: Any) -> tuple[ConfigurationField, ...]:
     hints, found = get_type_hints(cls), []
-    for entry in fields(cls):
+    for entry in fields(cast(Any, cls)):
         hint = hints[entry.name]
         kind, entries = getattr(hint, "__origin__", hint), getattr(hint, "__args__", (float,))[0]
         assert entry.default is not MISSING, f"{cls.__name__}.{entry.name} has no default"

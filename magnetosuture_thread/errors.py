@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from typing import Any
 
 from magnetosuture_thread.texts import shortened
@@ -24,13 +25,7 @@ class MagnetosutureError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what it is unpickled from, as from a worker: `__init__` takes others than what is in `args`."""
-        return _unpickled, (type(self), self.args, vars(self))
-
-
-def _unpickled(kind: type[MagnetosutureError], args: tuple[Any, ...], attributes: dict[str, Any]) -> MagnetosutureError:
-    error = kind.__new__(kind, *args)
-    vars(error).update(attributes)
-    return error
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
 
 class ConfigurationError(MagnetosutureError):

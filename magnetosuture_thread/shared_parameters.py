@@ -14,43 +14,35 @@ from magnetosuture_thread.configuration import quantity
 
 _PARAMETERS: dict[str, Any] = {
     "scene": quantity("", "scene file: a path, or the name of one in config/scenes; none waits for the topic scene"),
-    "needle_length": quantity(0.007, "length of the needle along its body", unit="m", minimum=0.001, maximum=0.05),
-    "needle_width": quantity(0.0004, "width of the needle's body", unit="m", minimum=5e-5, maximum=0.005),
+    "needle_length": quantity(0.007, "length of the needle along its body", "m", 0.001, 0.05),
+    "needle_width": quantity(0.0004, "width of the needle's body", "m", 5e-5, 0.005),
     "needle_curvature": quantity(
-        0.0,
-        "curvature of the needle's arc, positive to the left of its heading",
-        unit="1/m",
-        minimum=-1000.0,
-        maximum=1000.0,
+        0.0, "curvature of the needle's arc, positive to the left of its heading", "1/m", -1000.0, 1000.0
     ),
     "keep_out": quantity(
         0.0005,
         "minimum clearance of the needle's axis to wall and obstacles, half of its width included",
-        unit="m",
-        minimum=2.5e-5,
-        maximum=0.05,
+        "m",
+        2.5e-5,
+        0.05,
     ),
     "pose_margin": quantity(
         0.0,
         "clearance kept in addition to keep_out, for the error of a needle pose that is extrapolated to the present",
-        unit="m",
-        minimum=0.0,
-        maximum=0.005,
+        "m",
+        0.0,
+        0.005,
     ),
-    "thread_length": quantity(0.019, "rest length of the thread", unit="m", minimum=0.001, maximum=2.0),
+    "thread_length": quantity(0.019, "rest length of the thread", "m", 0.001, 2.0),
     "viscosity": quantity(
-        1.0,
-        "dynamic viscosity of the liquid; glycerin at room temperature is about 1",
-        unit="Pa s",
-        minimum=1e-4,
-        maximum=100.0,
+        1.0, "dynamic viscosity of the liquid; glycerin at room temperature is about 1", "Pa s", 1e-4, 100.0
     ),
     "coil_angles": quantity(
         (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi),
         "direction of each coil from the dish's centre, against the x axis",
-        unit="rad",
-        minimum=-2.0 * math.pi,
-        maximum=2.0 * math.pi,
+        "rad",
+        -2.0 * math.pi,
+        2.0 * math.pi,
     ),
     "friction_feedback": quantity(
         "all",
@@ -62,9 +54,9 @@ _PARAMETERS: dict[str, Any] = {
         0.2,
         "without new currents for this long the coil drivers switch off by themselves; "
         "whole tenths for RoboClaw boards",
-        unit="s",
-        minimum=0.05,
-        maximum=1.0,
+        "s",
+        0.05,
+        1.0,
     ),
 }
 

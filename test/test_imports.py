@@ -15,18 +15,7 @@ PACKAGE = Path(magnetosuture_thread.__file__).parent
 # Imports run one way: a module imports from its own layer and the layers before it, not from those after it. Below
 # all are `geometry` and the modules at the top level.
 LAYERS = (
-    {
-        "scene",
-        "thread",
-        "estimator",
-        "thread_model",
-        "forecast",
-        "safety",
-        "vision",
-        "coils",
-        "planning",
-        "rig",
-    },  # the core
+    {"scene", "thread", "estimator", "thread_model", "forecast", "safety", "vision", "coils", "planning", "rig"},
     {"messages", "bags", "setups", "console", "workers"},
     {"evaluation", "calibration", "campaign"},
     {"nodes"},
@@ -36,53 +25,30 @@ LAYERS = (
 )
 
 # Third-party packages that only some subpackages may import.
-OWNERS = {
-    "aiohttp": {"console"},
-    "basicmicro": {"coils"},
-    "serial": {"coils"},
-    "cv2": {"vision", "rig"},
-    "mcap": {"bags"},
-    "rosbags": {"bags"},
-    "zstandard": {"bags"},
-    "numba": {"compiled"},
-    "playwright": set(),
-    "osqp": {"thread"},
-    "dask": {"workers"},
-    "distributed": {"workers"},
-    "pyarrow": {"commands"},
-    "upath": {"files"},
-    "shapely": {"geometry", "scene"},
-    "jinja2": {"evaluation"},
-    "matplotlib": {"evaluation", "calibration", "reproduce"},
-    "plotly": {"evaluation"},
-    "rich": {"commands", "evaluation", "calibration", "reproduce"},
-    "rclpy": {"nodes"},
-    "rcl_interfaces": {"nodes"},
-    "builtin_interfaces": {"nodes"},
-    "diagnostic_msgs": {"nodes"},
-    "geometry_msgs": {"nodes"},
-    "lifecycle_msgs": {"nodes"},
-    "magnetosuture_msgs": {"nodes"},
-    "nav_msgs": {"nodes"},
-    "rosgraph_msgs": {"nodes"},
-    "sensor_msgs": {"nodes"},
-    "std_msgs": {"nodes"},
-    "std_srvs": {"nodes"},
-    "visualization_msgs": {"nodes"},
-}
+OF_ROS = "rclpy rcl_interfaces builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs magnetosuture_msgs"
+OWNED = (
+    ("aiohttp", {"console"}),
+    ("basicmicro serial", {"coils"}),
+    ("cv2", {"vision", "rig"}),
+    ("mcap rosbags zstandard", {"bags"}),
+    ("numba", {"compiled"}),
+    ("playwright", set[str]()),
+    ("osqp", {"thread"}),
+    ("dask distributed", {"workers"}),
+    ("pyarrow", {"commands"}),
+    ("upath", {"files"}),
+    ("shapely", {"geometry", "scene"}),
+    ("jinja2 plotly", {"evaluation"}),
+    ("matplotlib", {"evaluation", "calibration", "reproduce"}),
+    ("rich", {"commands", "evaluation", "calibration", "reproduce"}),
+    (f"{OF_ROS} nav_msgs rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs", {"nodes"}),
+)
+OWNERS = {package: owners for packages, owners in OWNED for package in packages.split()}
 
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
-def _public() -> dict[str, str]:
-    """Return the module of each name of the public API, from its imports for type checkers."""
-    tree = ast.parse((PACKAGE / "__init__.py").read_text())
-    found = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level == 0]
-    own = [node for node in found if str(node.module).startswith("magnetosuture_thread.")]
-    return {alias.name: str(node.module) for node in own for alias in node.names}
-
-
-PUBLIC = _public()
+PUBLIC = {name: f"magnetosuture_thread.{module}" for name, module in magnetosuture_thread._MODULES.items()}
 
 
 @cache

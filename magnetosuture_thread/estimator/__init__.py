@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from magnetosuture_thread.estimator.disturbance import Disturbance
-from magnetosuture_thread.estimator.estimate import ThreadEstimate
-from magnetosuture_thread.estimator.estimator import EstimatorOptions, ThreadEstimator
+from magnetosuture_thread.estimator.estimator import EstimatorOptions, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.estimator.session import EstimatorSession
 from magnetosuture_thread.estimator.stiffness import SlowParameter
 

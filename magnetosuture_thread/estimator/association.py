@@ -91,107 +91,76 @@ def path_lengths(points: Points, spacing: float) -> Vector:
     return arcs
 
 
-@compiled
-def read_piece(
-    points: Points, deviation: Vector, unit: float, max_points: int
-) -> tuple[Points, Vector, Vector, Vector]:
+class PieceRefusedError(Exception):
+    """A piece that is not of the thread; its text is the reason."""
+
+
+def read_piece(piece: ThreadPiece, unit: float, max_points: int) -> tuple[Points, Vector, Vector, Vector]:
     """Return the points of a piece that lie on its path, their deviations, arc lengths and shares of information.
 
     Args:
-        points: shape (m, 2) [m]; those that are not finite or out of bounds are left out.
-        deviation: of each, shape (m,) [m].
+        piece: as the camera gives it; points that are not finite or out of bounds are left out.
         unit: D, the unit of what is returned [m].
         max_points: that are returned; of more, so many are taken evenly, with both ends.
+
+    Raises:
+        PieceRefusedError: the shapes do not agree, or no path is left.
     """
-    finite = np.empty(len(points), dtype=np.int64)
-    count = 0
-    for p in range(len(points)):
-        inside = abs(points[p, 0]) <= MAX_COORDINATE and abs(points[p, 1]) <= MAX_COORDINATE
-        if inside and 0.0 <= deviation[p] <= MAX_COORDINATE:
-            finite[count] = p
-            count += 1
-    taken = -(-count // max(1, -(-count // max_points)))
-    chosen = finite[np.arange(taken) * (count - 1) // max(taken - 1, 1)]
+    points, deviation = np.asarray(piece.points, dtype=np.float64), np.asarray(piece.deviation, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
+        shapes = f"{points.shape} and {deviation.shape}"
+        raise PieceRefusedError(f"a piece of shapes {shapes}, expected (m, 2) and (m,)")
+    inside = (np.abs(points) <= MAX_COORDINATE).all(axis=1) & (deviation >= 0.0) & (deviation <= MAX_COORDINATE)
+    finite = np.flatnonzero(inside)
+    taken = -(-len(finite) // max(1, -(-len(finite) // max_points)))
+    chosen = finite[np.arange(taken) * (len(finite) - 1) // max(taken - 1, 1)]
     path, deviations = points[chosen] / unit, np.maximum(deviation[chosen], MIN_DEVIATION) / unit
     if taken >= MIN_POINTS:
-        spacing = np.hypot(path[1:, 0] - path[:-1, 0], path[1:, 1] - path[:-1, 1])
-        usual = np.median(spacing)
+        spacing = np.hypot(*np.diff(path, axis=0).T)
+        usual = float(np.median(spacing))
         if spacing.max() > 2.0 * usual:  # else the path through all points costs nothing
             # Noise lengthens the path at a point by eight standard deviations at most.
-            kept = path_without_outliers(path, usual, 8.0 * np.median(deviations))
+            kept = path_without_outliers(path, usual, 8.0 * float(np.median(deviations)))
             path, deviations = path[kept], deviations[kept]
-    last = len(path) - 1
-    if last < 1:
-        return path, deviations, np.zeros(last + 1), np.ones(last + 1)
+    if len(path) < MIN_POINTS:
+        raise PieceRefusedError("a piece has fewer than two finite points on a path")
     # Length is measured over steps of 20 standard deviations.
-    arcs, share = path_lengths(path, 20.0 * np.median(deviations)), np.empty(last + 1)
-    for k in range(last + 1):
-        own = 0.5 * (arcs[min(k + 1, last)] - arcs[max(k - 1, 0)]) * (2.0 if k in (0, last) else 1.0)
-        share[k] = min(1.0, own * unit / POINT_CORRELATION)
-    return path, deviations, arcs, share
+    arcs = path_lengths(path, 20.0 * float(np.median(deviations)))
+    if not arcs[-1] > 0.0:
+        raise PieceRefusedError("a piece has no length")
+    return path, deviations, arcs, np.minimum(1.0, np.gradient(arcs) * unit / POINT_CORRELATION)
 
 
-@compiled
-def points_at_nodes(nodes: Points, arcs: Vector) -> Points:
-    """Return the thread's points at arc lengths [D], those beyond an end at that end, shape (m, 2)."""
-    at, result = np.arange(len(nodes)) * 1.0, np.empty((len(arcs), 2))
-    for a in range(2):
-        result[:, a] = np.interp(arcs, at, nodes[:, a])
-    return result
-
-
-@compiled
-def mean_square_at(nodes: Points, points: Points, arcs: Vector, start: float, cap: float) -> float:
-    """Return the mean squared distance of points from the thread at their arc lengths, each at most `cap`.
-
-    Args:
-        nodes: of the thread, shape (n + 1, 2) [D].
-        points: shape (m, 2) [D].
-        arcs: of the points from the first, shape (m,) [D].
-        start: arc length of the first [D].
-        cap: [D^2]
-    """
-    off = points_at_nodes(nodes, start + arcs) - points
-    return float(np.minimum(off[:, 0] ** 2 + off[:, 1] ** 2, cap).mean())
-
-
-@compiled
 def search_start(
     nodes: Points, points: Points, arcs: Vector, low: float, high: float, cap: float
 ) -> tuple[float, float]:
-    """Return the arc length at which a piece best begins, between two bounds, and its mean squared distance there.
+    """Return the arc length at which a piece best begins, and its mean squared distance from the thread there.
 
     Args:
-        nodes: see `mean_square_at`, as are the others.
-        points: shape (m, 2) [D].
-        arcs: shape (m,) [D].
-        low: [D]
-        high: [D]
-        cap: [D^2]
+        nodes: of the thread, shape (n + 1, 2) [D].
+        points: of the piece, shape (m, 2) [D].
+        arcs: of the points from the first, shape (m,) [D].
+        low: least arc length of the first point [D].
+        high: greatest [D].
+        cap: of each point's squared distance [D^2].
     """
     # So many points are enough to find where a piece begins.
-    stride = max(1, len(points) // 24)
-    some, at = points[::stride].copy(), arcs[::stride].copy()
-    steps = max(1, int(np.ceil(2.0 * (high - low))))
-    best, found = np.inf, low
-    for k in range(steps + 1):
-        start = low + (high - low) * k / steps
-        value = mean_square_at(nodes, some, at, start, cap)
-        if value < best:
-            best, found = value, start
-    step = (high - low) / steps
-    middle = found
-    for k in range(-5, 6):
-        start = middle + 0.1 * k * step
-        if step > 0.0 and low <= start <= high:
-            value = mean_square_at(nodes, some, at, start, cap)
-            if value < best:
-                best, found = value, start
-    return found, best
+    stride, numbers = max(1, len(points) // 24), np.arange(len(nodes))
+    some, at = points[::stride], arcs[::stride]
+    steps = max(1, math.ceil(2.0 * (high - low)))
+    starts = np.linspace(low, high, steps + 1)
+    for _ in range(2 if high > low else 1):  # then finer about the best
+        places = starts[:, None] + at
+        x, y = [np.interp(places, numbers, nodes[:, axis]) - some[:, axis] for axis in (0, 1)]
+        squares = np.minimum(x * x + y * y, cap).mean(axis=1)
+        best = int(squares.argmin())
+        found = float(starts[best]), float(squares[best])
+        starts = np.clip(starts[best] + np.linspace(-0.5, 0.5, 11) * (high - low) / steps, low, high)
+    return found
 
 
 @compiled
-def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: float) -> tuple[Vector, Vector, int]:
+def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: float) -> tuple[Vector, Vector]:
     """Project a piece's points onto the thread, each next to where its arc length says.
 
         place_p = i + t,    innovation_p = m_i . (y_p - (1 - t) x_i - t x_{i+1} + t (1 - t) (c_i + c_{i+1}) / 4)
@@ -207,10 +176,10 @@ def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: fl
         slack: how far from its arc length the first point may lie; those after by `PATH_ERROR` more [D].
 
     Returns:
-        The arc length of each point, nan of one that lies beyond an end, shape (m,) [D]; its innovation, shape (m,)
-        [D]; and how many points lie on the thread.
+        The arc length of each point, nan of one that lies beyond an end, shape (m,) [D]; and its innovation, shape
+        (m,) [D].
     """
-    segments, count = len(nodes) - 1, 0
+    segments = len(nodes) - 1
     place, innovation = np.empty(len(points)), np.zeros(len(points))
     for p in range(len(points)):
         low, high = start + arcs[p] * (1.0 - PATH_ERROR) - slack, start + arcs[p] * (1.0 + PATH_ERROR) + slack
@@ -241,8 +210,7 @@ def project(nodes: Points, points: Points, arcs: Vector, start: float, slack: fl
                 if cx * cx + cy * cy < 1.0:
                     value += 0.25 * t * (1.0 - t) * (mx * cx + my * cy)
         innovation[p] = value
-        count += 1
-    return place, innovation, count
+    return place, innovation
 
 
 class PlacedPiece(NamedTuple):
@@ -289,10 +257,12 @@ def place_pieces(
     if len(pieces) > MAX_PIECES:
         problems.append(f"{len(pieces)} pieces, more than {MAX_PIECES}; the others are ignored")
     # Pieces whose place is known come first, whatever the order in which they were given.
-    for piece in sorted(pieces[:MAX_PIECES], key=_order):
-        found = _place(piece, nodes, variance, unit)
-        if isinstance(found, str):
-            problems.append(found)
+    order = [(piece.first_end is not PieceEnd.TAIL, np.nan_to_num(piece.arc_length[0], nan=np.inf)) for piece in pieces]
+    for index in sorted(range(min(len(pieces), MAX_PIECES)), key=order.__getitem__):
+        try:
+            found = place_piece(pieces[index], nodes, variance, unit)
+        except PieceRefusedError as error:
+            problems.append(str(error))
             continue
         low, high = max(int(found.start), 0), min(math.ceil(found.start + found.arcs[-1]), segments)
         if placed and high > low and np.count_nonzero(covered[low:high]) > 0.5 * (high - low):
@@ -303,63 +273,46 @@ def place_pieces(
     return placed, problems
 
 
-def _order(piece: ThreadPiece) -> tuple[bool, bool, float]:
-    known = _known(piece)
-    return piece.first_end is not PieceEnd.TAIL, not known, piece.arc_length[0] if known else math.inf
+def place_piece(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float) -> PlacedPiece:
+    """Return a piece on the thread; see `place_pieces`.
 
-
-def _known(piece: ThreadPiece) -> bool:
-    return math.isfinite(piece.arc_length[0]) and math.isfinite(piece.arc_length[1])
-
-
-def _place(piece: ThreadPiece, nodes: Points, variance: Vector, unit: float) -> PlacedPiece | str:
-    """Return a piece on the thread, or why it is none of it."""
-    points, segments = np.ascontiguousarray(piece.points, dtype=np.float64), len(nodes) - 1
-    deviation = np.ascontiguousarray(piece.deviation, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 2 or deviation.shape != (len(points),):
-        return f"a piece of shapes {points.shape} and {deviation.shape}, expected (m, 2) and (m,)"
+    Raises:
+        PieceRefusedError: it is none of this thread.
+    """
+    segments = len(nodes) - 1
     # Of four points for each segment that it could cover, every so many is taken.
-    points, deviation, arcs, share = read_piece(points, deviation, unit, 4 * segments)
-    if len(points) < MIN_POINTS:
-        return "a piece has fewer than two finite points on a path"
+    points, deviation, arcs, share = read_piece(piece, unit, 4 * segments)
     length = float(arcs[-1])
-    if not length > 0.0:
-        return "a piece has no length"
     if length * (1.0 - WHOLE) > segments:
-        return f"a piece {length * unit * 1e3:.1f} mm long, longer than the thread"
+        raise PieceRefusedError(f"a piece {length * unit * 1e3:.1f} mm long, longer than the thread")
     first, last = piece.first_end, piece.last_end
     if {first, last} == {PieceEnd.TAIL, PieceEnd.FREE} and abs(length / segments - 1.0) < WHOLE:
         arcs *= segments / length
-    attached, known = first is PieceEnd.TAIL, _known(piece)
+    attached, known = first is PieceEnd.TAIL, bool(np.isfinite(piece.arc_length).all())
     low, high = 0.0, 0.0 if attached else max(segments - float(arcs[-1]), 0.0)
     if known:
-        low, high = sorted(value / unit for value in piece.arc_length)
+        low, high = np.clip(np.sort(piece.arc_length) / unit, -segments, 2 * segments)
     cap = (0.25 * segments) ** 2
     start, square = search_start(nodes, points, arcs, low, high, cap)
     if not piece.direction_known:
-        turned = np.ascontiguousarray(points[::-1]), np.ascontiguousarray(arcs[-1] - arcs[::-1])
+        turned = np.ascontiguousarray(points[::-1]), arcs[-1] - arcs[::-1]
         other, other_square = search_start(nodes, *turned, low, high, cap)
         if other_square < square:
-            (points, arcs), deviation, share, last = turned, deviation[::-1].copy(), share[::-1].copy(), first
+            (points, arcs), deviation, share, last = turned, deviation[::-1], share[::-1], first
             start, square = other, other_square
     # A place that was searched for is as good as the prior lets it be.
     slack = 2.0 * float(deviation.mean()) + (0.25 if high > low else 0.0)
-    found = PlacedPiece(points, deviation**2, share, arcs, start, slack, attached, last is PieceEnd.FREE, square)
-    return found if known or attached else _problem_of(found, nodes, variance) or found
-
-
-def _problem_of(piece: PlacedPiece, nodes: Points, variance: Vector) -> str:
-    """Return why a piece of unknown arc length cannot be of this thread, or nothing."""
-    place, innovation, _ = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
-    on = np.isfinite(place)
-    if on.sum() < max(MIN_POINTS, 0.5 * len(place)):
-        return "a piece lies beyond the thread's ends"
-    prior = np.interp(place[on], np.arange(len(nodes)), variance)
-    # Whether as much of it as could be is in the gate: one or two far points are outliers.
-    off = innovation[on] ** 2 / (prior + piece.variance[on])
-    if float(np.median(off)) > GATE**2 or float((off > GATE**2).mean()) > 0.3:
-        return "a piece lies too far from the predicted thread: it is of another one"
-    return ""
+    if not known and not attached:
+        place, innovation = project(nodes, points, arcs, start, slack)
+        on = np.isfinite(place)
+        if on.sum() < max(MIN_POINTS, 0.5 * len(place)):
+            raise PieceRefusedError("a piece lies beyond the thread's ends")
+        prior = np.interp(place[on], np.arange(len(nodes)), variance)
+        # Whether as much of it as could be is in the gate: one or two far points are outliers.
+        off = innovation[on] ** 2 / (prior + deviation[on] ** 2)
+        if float(np.median(off)) > GATE**2 or float((off > GATE**2).mean()) > 0.3:
+            raise PieceRefusedError("a piece lies too far from the predicted thread: it is of another one")
+    return PlacedPiece(points, deviation**2, share, arcs, start, slack, attached, last is PieceEnd.FREE, square)
 
 
 class MeasuredPoints(NamedTuple):
@@ -396,35 +349,26 @@ def measured_points(
         obstacles: and how deep the way from a point to the thread must lead into one to be refused [m].
     """
     workspace, margin = obstacles
-    found, problems = [], []
+    segments, found, problems, end = len(nodes) - 1, [np.empty((4, 0))], [], (0.0, math.inf)
     for piece in placed:
-        place, innovation, count = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
+        place, innovation = project(nodes, piece.points, piece.arcs, piece.start, piece.slack)
         good = np.isfinite(place)
         far = np.flatnonzero(good & (np.abs(innovation) > 0.5)) if len(workspace.shapes) else ()
         if len(far):
-            start = points_at_nodes(nodes, place[far]) * unit
+            start = np.column_stack([np.interp(place[far], np.arange(segments + 1), axis) for axis in nodes.T]) * unit
             for share in (0.25, 0.5, 0.75):  # of the way from the thread to the point
                 near = workspace.near(start + share * (piece.points[far] * unit - start))
                 good[far[near.node[near.distance < -margin]]] = False
-            if (refused := count - int(good.sum())) > 0:
+            if (refused := int(np.isfinite(place).sum() - good.sum())) > 0:
                 problems.append(f"{refused} points lie beyond an obstacle")
-        if good.any():
-            found.append([each[good] for each in (place, innovation, scale * piece.variance, piece.share)])
-    if not found:
+        found.append(np.array([place, innovation, scale * piece.variance, piece.share])[:, good])
+        if piece.free_end and end[1] == math.inf:  # by how much farther along the thread its free end is seen
+            along = nodes[-1] - nodes[-2]
+            off = float((piece.points[-1] - nodes[-1]) @ along / np.hypot(*along))
+            deviation = LENGTH_ERROR * segments
+            if abs(off) < 6.0 * (deviation + math.sqrt(end_variance)):
+                end = off, deviation**2 + float(piece.variance[-1])
+    columns = np.concatenate(found, axis=1)
+    if not columns.size:
         return None, problems
-    place, innovation, variance, shares = (np.concatenate(each) for each in zip(*found, strict=True))
-    end = _free_end(placed, nodes, end_variance)
-    return MeasuredPoints(place, innovation, variance, shares, np.ones(len(place)), end), problems
-
-
-def _free_end(placed: list[PlacedPiece], nodes: Points, variance: float) -> tuple[float, float]:
-    """Return by how much farther along the thread its free end is seen [D], and the variance of it [D^2]."""
-    for piece in placed:
-        if piece.free_end:
-            (ax, ay), (bx, by) = nodes[-2:].tolist()
-            px, py = piece.points[-1].tolist()
-            off = ((px - bx) * (bx - ax) + (py - by) * (by - ay)) / math.hypot(bx - ax, by - ay)
-            deviation = LENGTH_ERROR * (len(nodes) - 1)
-            if abs(off) < 6.0 * (deviation + math.sqrt(variance)):
-                return off, deviation**2 + float(piece.variance[-1])
-    return 0.0, math.inf
+    return MeasuredPoints(*columns, np.ones(columns.shape[1]), end), problems

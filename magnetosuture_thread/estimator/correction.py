@@ -74,54 +74,32 @@ class CorrectionBuffers(NamedTuple):
     Attributes:
         program: of the program, with room for two rows a segment besides those of the rod.
         solver: of the structured solver, with the factors of the last matrix.
-        normals: of the nodes, shape (n + 1, 2).
-        gram: normal equations of each segment's points, shape (n, 5).
         about: where the nodes are, shape (n + 1, 2) [D].
         moved: d, shape (n + 1, 2) [D].
         known: nodes that are no unknowns, shape (n + 1,).
-        inverse: see `selected_inverse`.
-        covariance: of each node, shape (n + 1, 2, 2) [D^2].
+        covariance: of each node after it, shape (n + 1, 2, 2) [D^2].
     """
 
     program: StepBuffers
     solver: banded.SolverBuffers
-    normals: Points
-    gram: NDArray[np.float64]
     about: Points
     moved: Points
     known: NDArray[np.bool_]
-    inverse: NDArray[np.float64]
     covariance: NDArray[np.float64]
 
     @classmethod
     def of(cls, nodes: int) -> CorrectionBuffers:
         """Return buffers for a thread of so many nodes."""
-        program = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1)
-        return cls(
-            program,
-            BandedSolver().buffers(nodes, 2, len(program.first)),
-            np.zeros((nodes, 2)),
-            np.zeros((nodes - 1, 5)),
-            np.zeros((nodes, 2)),
-            np.zeros((nodes, 2)),
-            np.zeros(nodes, dtype=np.bool_),
-            np.zeros((2 * nodes + 6, 7)),
-            np.zeros((nodes, 2, 2)),
-        )
+        program, (about, moved) = StepBuffers.of(nodes, 2, 3 * (nodes - 1) + 1), np.zeros((2, nodes, 2))
+        solver = BandedSolver().buffers(nodes, 2, len(program.first))
+        return cls(program, solver, about, moved, np.zeros(nodes, dtype=np.bool_), np.zeros((nodes, 2, 2)))
 
 
-@compiled
-def normals_of(positions: Points, normals: Points) -> None:
-    """Write each node's normal, to the left of the way from the node before to the node after."""
-    last = len(positions) - 1
-    for i in range(last + 1):
-        before, after = max(i - 1, 0), min(i + 1, last)
-        x, y = positions[after, 0] - positions[before, 0], positions[after, 1] - positions[before, 1]
-        size = np.hypot(x, y)
-        if size > 0.0:
-            normals[i, 0], normals[i, 1] = -y / size, x / size
-        else:
-            normals[i, 0], normals[i, 1] = 0.0, 1.0
+def normals_of(positions: Points) -> Points:
+    """Return each node's unit normal, to the left of the way from the node before to the node after."""
+    along = np.gradient(positions, axis=0)
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    return np.asarray(left / np.maximum(np.hypot(*along.T), 1e-12)[:, None])
 
 
 @compiled
@@ -156,55 +134,41 @@ def robust_weights(residual: Vector, variance: Vector, weights: Vector) -> float
     return change
 
 
-@compiled
-def prior_information(prior: Prior, scale: float, clamped: bool, normals: Points, buffers: StepBuffers) -> None:
+def prior_information(prior: Prior, scale: float, clamped: bool, buffers: StepBuffers) -> None:
     """Write Lambda over a scale into the program.
 
     Args:
-        prior: v, q, l and k.
+        prior: the predicted thread, with v, q, l and k.
         scale: by which all is divided.
         clamped: whether the thread's direction at the needle is known.
-        normals: n_i, shape (n + 1, 2).
         buffers: written: blocks, couplings, linear.
     """
-    density, noise, length, stiffness = prior.density, prior.noise, prior.length, prior.stiffness
-    nodes = len(density)
-    # More, on the thread's longest bending wave, than the points have changes nothing.
-    stiffest = 10.0 * (nodes / np.pi) ** 4
-    blocks, couplings = buffers.blocks, buffers.couplings
+    density, normals, couplings = scale * prior.density, normals_of(prior.positions), buffers.couplings
     buffers.linear[:], couplings[:] = 0.0, 0.0
-    for i in range(nodes):
-        across = 1.0 / (scale * density[i])
-        for a in range(2):
-            for b in range(2):
-                blocks[i, a, b] = across * normals[i, a] * normals[i, b]
-            # The chords hold it along the thread.
-            blocks[i, a, a] += 1e-6 * across
-    for i in range(nodes - 1):
-        weight = length * length / (scale * 0.5 * (density[i] + density[i + 1]))
-        for a in range(2):
-            blocks[i, a, a] += weight
-            blocks[i + 1, a, a] += weight
-        couplings[0, i] -= weight
-    for i in range(0 if clamped else 1, nodes - 1):
-        weight = min(2.0 * stiffness / (scale * noise[i]), stiffest)
-        before, here, after = (1.0, -2.0, 1.0) if i > 0 else (0.0, -2.0, 2.0)
-        weight *= 1.0 if i > 0 else 0.5
-        for a in range(2):
-            if i > 0:
-                blocks[i - 1, a, a] += before * before * weight
-            blocks[i, a, a] += here * here * weight
-            blocks[i + 1, a, a] += after * after * weight
-        couplings[0, i] += here * after * weight
-        if i > 0:
-            couplings[0, i - 1] += before * here * weight
-            couplings[1, i - 1] += before * after * weight
+    alike = prior.length**2 / (0.5 * (density[:-1] + density[1:]))
+    # More, on the thread's longest bending wave, than the points have changes nothing.
+    stiffest = 10.0 * (len(density) / np.pi) ** 4
+    bending = np.minimum(2.0 * prior.stiffness / (scale * prior.noise), stiffest)[:-1]
+    # Half a segment of curvature 2 (d_1 - d_0) at a clamp.
+    clamp, bending = 2.0 * bending[0] if clamped else 0.0, bending[1:]
+    own = 1e-6 / density  # the chords hold it along the thread
+    own[:-1] += alike
+    own[1:] += alike
+    own[:2] += clamp
+    own[:-2] += bending
+    own[1:-1] += 4.0 * bending
+    own[2:] += bending
+    couplings[0, :-1] -= alike
+    couplings[0, 0] -= clamp
+    couplings[0, :-2] -= 2.0 * bending
+    couplings[0, 1:-1] -= 2.0 * bending
+    couplings[1, :-2] += bending
+    across = normals[:, :, None] * normals[:, None, :] / density[:, None, None]
+    buffers.blocks[:] = across + own[:, None, None] * np.eye(2)
 
 
 @compiled
-def measured_rows(
-    points: MeasuredPoints, scale: float, about: Points, row: int, gram: NDArray[np.float64], buffers: StepBuffers
-) -> int:
+def measured_rows(points: MeasuredPoints, scale: float, about: Points, row: int, buffers: StepBuffers) -> int:
     """Write the points of each segment as at most two rows, with the compliance as their variance; return the end.
 
     Points p of one segment have a_p in the span of two vectors, so that sum_p w_p (a_p' d - nu_p)^2 is, up to a
@@ -216,11 +180,10 @@ def measured_rows(
         scale: by which information is divided.
         about: where segments' normals are taken, shape (n + 1, 2).
         row: the first row.
-        gram: written, shape (n, 5).
         buffers: written from that row on.
     """
-    gram[:] = 0.0
-    segments = len(gram)
+    segments = len(about) - 1
+    gram = np.zeros((segments, 5))
     for p in range(len(points.place)):
         i = min(int(points.place[p]), segments - 1)
         t = points.place[p] - i
@@ -236,17 +199,16 @@ def measured_rows(
             continue
         ex, ey = about[i + 1, 0] - about[i, 0], about[i + 1, 1] - about[i, 1]
         size = np.hypot(ex, ey)
-        normal = (-ey / size, ex / size)
-        k = 0 if gram[i, 0] >= gram[i, 2] else 1  # the larger one of both pivots first
-        root = np.sqrt(gram[i, 2 * k])
-        low, value = gram[i, 1] / root, gram[i, 3 + k] / root
-        rest = gram[i, 2 - 2 * k] - low * low
-        _write_row(buffers, row, i, (root, low) if k == 0 else (low, root), value, normal)
-        row += 1
+        low, value = 0.0, 0.0
+        if gram[i, 0] > 0.0:
+            root = np.sqrt(gram[i, 0])
+            low, value = gram[i, 1] / root, gram[i, 3] / root
+            _write_row(buffers, row, i, (root, low), value, (-ey / size, ex / size))
+            row += 1
+        rest = gram[i, 2] - low * low
         if rest > 1e-9 * total:
             root = np.sqrt(rest)
-            value = (gram[i, 4 - k] - low * value) / root
-            _write_row(buffers, row, i, (0.0, root) if k == 0 else (root, 0.0), value, normal)
+            _write_row(buffers, row, i, (0.0, root), (gram[i, 4] - low * value) / root, (-ey / size, ex / size))
             row += 1
     if np.isfinite(points.end[1]):
         ex, ey = about[segments, 0] - about[segments - 1, 0], about[segments, 1] - about[segments - 1, 1]
@@ -301,53 +263,54 @@ def selected_inverse(width: int, unknowns: int, band: NDArray[np.float64], inver
             inverse[j, a] = value
 
 
-CORRECTED, NO_ROOM, FAILED = range(3)
-
-
 @compiled
 def correct(
-    rod: RodProperties, workspace: WorkspaceData, work: CorrectionBuffers, prior: Prior, points: MeasuredPoints
-) -> tuple[int, int, float, float, float]:
+    rod: RodProperties,
+    workspace: WorkspaceData,
+    work: CorrectionBuffers,
+    start: Points,
+    heading: Points,
+    scale: float,
+    points: MeasuredPoints,
+) -> tuple[int, float, float]:
     """Correct a thread by measured points.
 
     Args:
         rod: the thread.
         workspace: obstacles and wall [m].
-        work: `known` is read; `about` gets the corrected thread, `moved` the correction, `covariance` what is left.
-        prior: the predicted thread.
+        work: the program holds Lambda and `known` is read; `about` gets the corrected thread, `moved` the correction,
+            `covariance` what is left.
+        start: the predicted nodes, shape (n + 1, 2) [D].
+        heading: of the needle, shape (2,).
+        scale: of the program.
         points: the points, with robust weights to begin with; in the end those used.
 
     Returns:
-        `CORRECTED`, `NO_ROOM` for contacts, or `FAILED`; number of solves; the largest error of the hard constraints
-        over what is allowed, at most 1 where they hold; the largest residual of the last solve; the program's scale.
+        Number of contacts, -1 where there is no room for them; the largest error of the hard constraints over what is
+        allowed, at most 1 where they hold; the largest residual of the last solve.
     """
-    buffers, start, segments = work.program, prior.positions, len(prior.positions) - 1
+    buffers, segments, contacts = work.program, len(start) - 1, 0
     known, about, moved = work.known, work.about, work.moved
-    normals_of(start, work.normals)
-    scale = max((1.0 / prior.density[1:]).max(), (points.share / points.variance).max())
     about[:], moved[:], buffers.multipliers[:], buffers.push[:] = start, 0.0, 0.0, 0.0
     residual = np.empty(len(points.place))
     solves, change, off, largest, row = 0, 1.0, np.inf, 0.0, segments
     while True:
         if change > CHANGED:
-            row = measured_rows(points, scale, start, segments, work.gram, buffers)
-        mechanics.chord_lengths(about, prior.heading, rod.clamped, buffers.chords)
+            row = measured_rows(points, scale, start, segments, buffers)
+        mechanics.chord_lengths(about, heading, rod.clamped, buffers.chords)
         strain = segment_rows(buffers, about, start, known, 1.0)
         contacts, depth = contact_rows(buffers, row, workspace, about, start, known, 1.0, rod.unit, rod.radius, True)
-        if contacts < 0:
-            return NO_ROOM, solves, off, largest, scale
         off = max(strain / STRAIN_TOLERANCE, depth / DEPTH_TOLERANCE)
         done = off <= 1.0 and change <= CHANGED and largest <= RESIDUAL_TOLERANCE
-        if solves > 0 and (done or solves >= MAX_SOLVES):
+        if contacts < 0 or (solves > 0 and (done or solves >= MAX_SOLVES)):
             break
-        prior_information(prior, scale, rod.clamped, work.normals, buffers)
         rows = row + contacts
         u, multipliers = moved.copy(), buffers.multipliers[:rows].copy()
         program = program_of(buffers, known, rows)
         banded.solve(program, u, multipliers, work.solver)
         solves, largest = solves + 1, max(compiled_residuals(program, u, multipliers))
         if not largest < np.inf:
-            return FAILED, solves, off, largest, scale
+            break
         moved[:], about[:] = u, start + u
         buffers.multipliers[:segments] = multipliers[:segments]
         change = 0.0
@@ -359,15 +322,15 @@ def correct(
                 dx, dy = (1.0 - t) * u[i, 0] + t * u[i + 1, 0], (1.0 - t) * u[i, 1] + t * u[i + 1, 1]
                 residual[p] = points.innovation[p] - (ex * dy - ey * dx) / np.hypot(ex, ey)
             change = robust_weights(residual, points.variance, points.weight)
-    if not largest <= RESIDUAL_TOLERANCE:
-        return FAILED, solves, off, largest, scale
-    selected_inverse(6, 2 * segments + 2, work.solver.band, work.inverse)
-    for i in range(segments + 1):
-        for a in range(2):
-            for b in range(2):
-                value = work.inverse[2 * i + min(a, b), abs(a - b)] / scale
-                work.covariance[i, a, b] = 0.0 if known[i] else value
-    return CORRECTED, solves, off, largest, scale
+    if contacts >= 0 and largest <= RESIDUAL_TOLERANCE:
+        inverse = np.zeros((2 * segments + 8, 7))
+        selected_inverse(6, 2 * segments + 2, work.solver.band, inverse)
+        for i in range(segments + 1):
+            for a in range(2):
+                for b in range(2):
+                    value = inverse[2 * i + min(a, b), abs(a - b)] / scale
+                    work.covariance[i, a, b] = 0.0 if known[i] else value
+    return contacts, off, largest
 
 
 class Sensitivity(NamedTuple):
@@ -397,15 +360,13 @@ class Corrector:
 
     Attributes:
         work: the last correction; where it moved the thread is in it.
-        solves: number of its programs.
         residual: the largest of its last solve.
     """
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation) -> None:
-        nodes = predictor.thread.segments + 1
-        self._formulation, self.work = formulation, CorrectionBuffers.of(nodes)
+        self._formulation, self.work = formulation, CorrectionBuffers.of(predictor.thread.segments + 1)
         self.work.known[[0, *predictor.fixed_nodes]] = True
-        self.solves, self.residual = 0, 0.0
+        self.residual = 0.0
         self._last: tuple[Prior, MeasuredPoints, float]
 
     def solve(self, prior: Prior, points: MeasuredPoints) -> str:
@@ -415,11 +376,14 @@ class Corrector:
             Why the thread is not corrected; empty where the program was solved and the constraints hold.
         """
         rod, workspace = self._formulation.rod, self._formulation.workspace.data
-        code, self.solves, off, self.residual, scale = correct(rod, workspace, self.work, prior, points)
+        scale = float(max((1.0 / prior.density[1:]).max(), (points.share / points.variance).max()))
+        prior_information(prior, scale, rod.clamped, self.work.program)
+        found = correct(rod, workspace, self.work, prior.positions, prior.heading, scale, points)
+        contacts, off, self.residual = found
         self._last = (prior, points, scale)
-        if code == NO_ROOM:
+        if contacts < 0:
             return f"the correction has more than {CONTACTS_PER_NODE} contacts a node"
-        if code != CORRECTED or off > 1.0:
+        if not self.residual <= RESIDUAL_TOLERANCE or off > 1.0:
             return f"the correction was not solved: residual {self.residual:.1e}, off by {off:.1g}"
         return ""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.estimator.correction import normals_of
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.material import Attachment, Thread
 
@@ -104,7 +104,7 @@ class BendingRelaxation:
         return np.vstack([displacement[:1], self._modes @ modes])
 
 
-@compiled
+@np.errstate(divide="ignore", invalid="ignore")
 def significance(
     displacement: Points, normals: Points, variance: Vector, response: Points, deviations: Vector
 ) -> float:
@@ -123,25 +123,15 @@ def significance(
         deviations: s, standard deviation of each error of the pose, shape (2,).
     """
     windows, nodes = len(variance), len(displacement)
-    sums, count = np.zeros((windows, 3)), np.zeros(windows)
-    for i in range(1, nodes):
-        w = i * windows // nodes
-        sums[w, 0] += normals[i, 0] * displacement[i, 0] + normals[i, 1] * displacement[i, 1]
-        sums[w, 1] += response[i, 0] * deviations[0]
-        sums[w, 2] += response[i, 1] * deviations[1]
-        count[w] += 1.0
-    largest = 0.0
-    for w in range(windows):
-        if count[w] > 0.0:
-            mean = sums[w] / count[w]
-            largest = max(largest, abs(mean[0]) / np.sqrt(2.0 * variance[w] + mean[1] ** 2 + mean[2] ** 2))
-    return largest
+    across = np.column_stack([np.einsum("ia,ia->i", normals, displacement), response * deviations])[1:]
+    window = np.arange(1, nodes) * windows // nodes
+    sums = np.array([np.bincount(window, each, windows) for each in across.T])
+    mean, *posed = sums / np.bincount(window, minlength=windows)
+    return float(np.nanmax(np.abs(mean) / np.sqrt(2.0 * variance + posed[0] ** 2 + posed[1] ** 2)))
 
 
-def force_density(
-    rate: Points, positions: Points, drag_across: float, drag_along: float, bending: float = 0.0
-) -> Vector:
-    """Return the normal force on each node that explains a velocity that the model does not predict [N].
+def strongest(rate: Points, positions: Points, thread: Thread, significance: float, since: float) -> Disturbance:
+    """Return the stretch of thread with the greatest force to one side that explains a velocity nobody predicts.
 
         f_i = D zeta_perp n_i . r_i + (dt EI / D^3) n_i . (second differences of c(r))_i + T_i kappa_i
         T_i = -sum_{j > i} D zeta_par t_j . r_j,    c(r)_i = r_{i+1} - 2 r_i + r_{i-1}
@@ -149,63 +139,32 @@ def force_density(
     The force of what touches the thread is across it; along it the tension alone balances the drag.
 
     Args:
-        rate: r, by how much faster each node moves than predicted, shape (n + 1, 2) [m/s].
+        rate: r, by how much faster each node moves than predicted, over the time dt, shape (n + 1, 2) [m/s].
         positions: shape (n + 1, 2) [m].
-        drag_across: zeta_perp [Pa s].
-        drag_along: zeta_par [Pa s].
-        bending: dt EI, the stiffness times the interval over which r was averaged [N m^2 s].
-    """
-    along = np.gradient(positions, axis=0)
-    size = np.maximum(np.hypot(*along.T), 1e-12)
-    tangent = along / size[:, None]
-    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-    unit = float(size.mean())
-    pull = unit * drag_along * np.einsum("ij,ij->i", tangent, rate)
-    tensions = -(np.cumsum(pull[::-1])[::-1] - pull)
-    turn = np.zeros(len(positions))
-    bend = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
-    turn[1:-1] = np.einsum("ij,ij->i", bend, normal[1:-1]) / unit
-    curved = np.zeros_like(rate)
-    curved[1:-1] = rate[2:] - 2.0 * rate[1:-1] + rate[:-2]
-    bent = -2.0 * curved
-    bent[1:] += curved[:-1]
-    bent[:-1] += curved[1:]
-    force = unit * drag_across * rate + bending / unit**3 * bent
-    return np.asarray(np.einsum("ij,ij->i", normal, force) - tensions * turn)
-
-
-def strongest(force: Vector, positions: Points, unit: float, significance: float, since: float) -> Disturbance:
-    """Return the stretch of thread with the greatest force to one side.
-
-    Args:
-        force: on each node along its normal, shape (n + 1,) [N].
-        positions: shape (n + 1, 2) [m].
-        unit: D [m].
+        thread: the thread.
         significance: [standard deviations]
         since: [s]
     """
+    normal, unit, medium = normals_of(positions), thread.segment_length, thread.medium
+    pull = unit * medium.drag_along * (normal[:, 1] * rate[:, 0] - normal[:, 0] * rate[:, 1])
+    tensions = np.cumsum(pull[::-1])[::-1] - pull
+    turn, curved = np.zeros(len(positions)), np.zeros((len(positions) + 2, 2))
+    turn[1:-1] = np.einsum("ia,ia->i", np.diff(positions, 2, axis=0), normal[1:-1]) / unit
+    curved[2:-2] = np.diff(rate, 2, axis=0)
+    bending = thread.bending_stiffness * AVERAGING_TIME / unit**3
+    forces = unit * medium.drag_across * rate + bending * np.diff(curved, 2, axis=0)
+    force = np.einsum("ia,ia->i", normal, forces) + tensions * turn
     # Stretches of one sign; the needle itself, node 0, carries what acts on it.
-    signs = np.sign(force[1:])
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(signs)) + 1, [len(signs)]])
-    sums = np.add.reduceat(force[1:], starts[:-1])
+    starts = np.concatenate([[1], np.flatnonzero(np.diff(np.sign(force[1:]))) + 2])
+    sums = np.add.reduceat(force, starts)
     k = int(np.abs(sums).argmax())
-    nodes = np.arange(starts[k], starts[k + 1]) + 1
+    nodes = np.arange(starts[k], [*starts, len(force)][k + 1])
     share = force[nodes] / sums[k] if sums[k] != 0.0 else np.full(len(nodes), 1.0 / len(nodes))
     middle = float(share @ nodes)
-    along = np.gradient(positions, axis=0)
-    at = round(middle)
-    tangent = along[at] / max(float(np.hypot(*along[at])), 1e-12)
-    place = np.array([np.interp(middle, np.arange(len(positions)), positions[:, axis]) for axis in range(2)])
-    side = 1.0 if sums[k] >= 0.0 else -1.0
-    return Disturbance(
-        arc_length=middle * unit,
-        extent=len(nodes) * unit,
-        position=place,
-        direction=side * np.array([-tangent[1], tangent[0]]),
-        force=abs(float(sums[k])),
-        significance=significance,
-        since=since,
-    )
+    place = np.array([np.interp(middle, np.arange(len(positions)), axis) for axis in positions.T])
+    direction = math.copysign(1.0, sums[k]) * normal[round(middle)]
+    size = abs(float(sums[k]))
+    return Disturbance(middle * unit, len(nodes) * unit, place, direction, size, significance, since)
 
 
 class DisturbanceTest:
@@ -289,34 +248,20 @@ class DisturbanceTest:
         A force on node c displaces as `BendingRelaxation` says of a load there.
         """
         # What a known contact did is forgotten after three averaging times.
-        touched = np.flatnonzero(self._untouched <= 3.0 * AVERAGING_TIME)
-        touched = touched[touched > 0]
-        if not len(touched):
-            return np.zeros_like(normals)
-        runs = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1)
-        columns = []
-        for node in sorted({int(end) for run in runs for end in (run[0], run[-1])}):
-            loads = np.zeros_like(normals)
-            loads[node] = 1.0
-            loads = self._bending.relaxed(AVERAGING_TIME * self._rate, loads)
-            columns += [loads * (1.0, 0.0), loads * (0.0, 1.0)]
-        responses = np.array(columns)
-        responses /= np.maximum(np.linalg.norm(responses, axis=(1, 2)), 1e-12)[:, None, None]
-        across = np.einsum("ij,kij->ik", normals, responses)
+        touched = self._untouched <= 3.0 * AVERAGING_TIME
+        touched[0] = False
+        ends = np.flatnonzero(touched & (np.convolve(touched, (1, 0, 1), "same") < 2))  # of each stretch
+        shapes = np.eye(len(normals))[:, ends]
+        shapes = self._bending.relaxed(AVERAGING_TIME * self._rate, shapes)
+        shapes /= np.maximum(np.linalg.norm(shapes, axis=0), 1e-12)
+        across = np.hstack([normals[:, :1] * shapes, normals[:, 1:] * shapes])
         aside = np.einsum("ij,ij->i", normals, self._displacement)
-        forces = np.linalg.lstsq(across, aside, rcond=1e-3)[0]
-        return np.asarray(np.einsum("k,kij->ij", forces, responses))
-
-    def confirmed(self, stamp: float) -> bool:
-        """Return whether the camera has moved the thread too far for long."""
-        return stamp - self._since >= 0.25 * AVERAGING_TIME
+        forces = np.linalg.lstsq(across, aside, rcond=1e-3)[0].reshape(2, -1)
+        return np.asarray(shapes @ forces.T)
 
     def found(self, stamp: float, positions: Points) -> tuple[Disturbance, ...]:
-        """Return the forces that explain what the camera moves the thread by, if it does so for long."""
-        if not self.confirmed(stamp):
+        """Return the force that explains what the camera moves the thread by, if it does so for long."""
+        if not stamp - self._since >= 0.25 * AVERAGING_TIME:
             return ()
-        thread = self._thread
-        drag, bending = thread.medium, thread.bending_stiffness * AVERAGING_TIME
         rate = (self._displacement - self._explained) / AVERAGING_TIME
-        force = force_density(rate, positions, drag.drag_across, drag.drag_along, bending)
-        return (strongest(force, positions, thread.segment_length, self._significance, self._since),)
+        return (strongest(rate, positions, self._thread, self._significance, self._since),)

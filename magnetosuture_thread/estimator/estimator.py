@@ -3,49 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.barrier import BarrierRows
-from magnetosuture_thread.configuration import Configuration, quantity
+from magnetosuture_thread.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.estimator.association import (
-    MIN_DEVIATION,
-    POINT_CORRELATION,
-    MeasuredPoints,
-    PlacedPiece,
-    measured_points,
-    place_pieces,
+from magnetosuture_thread.estimator import association, noise
+from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
+from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
+from magnetosuture_thread.estimator.noise import Innovations, NoiseModel
+from magnetosuture_thread.estimator.stiffness import (
+    AUTOMATIC,
+    STIFFNESS_OVER_DRAG,
+    LearnedState,
+    SlowParameter,
+    StiffnessLearner,
 )
-from magnetosuture_thread.estimator.correction import Corrector, Prior
-from magnetosuture_thread.estimator.disturbance import DisturbanceTest
-from magnetosuture_thread.estimator.estimate import FilterState, ThreadEstimate
-from magnetosuture_thread.estimator.noise import (
-    Innovations,
-    NoiseModel,
-    at_nodes,
-    learn,
-    propagate_errors,
-    take_correction,
-    weigh,
-)
-from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, StiffnessLearner
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import SOLID, Margins
+from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
-from magnetosuture_thread.thread.step import ThreadState
+from magnetosuture_thread.thread.step import ThreadState, WarmStart
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 
+ONE_SIDED_99 = 2.3263478740408408  # standard deviations
 INITIAL_ERROR = 0.2  # standard deviation of the free end of a thread whose shape nobody has seen, of the length
 LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
@@ -74,6 +66,110 @@ class EstimatorOptions:
         if self.slow_parameters not in ((), (AUTOMATIC,), (STIFFNESS_OVER_DRAG,)):
             expected = f"{STIFFNESS_OVER_DRAG} or {AUTOMATIC} alone, or nothing"
             raise ConfigurationError("estimator.slow_parameters", list(self.slow_parameters), expected)
+
+
+@dataclass(frozen=True)
+class ThreadEstimate:
+    """The thread at one instant, as model and camera have it.
+
+    Attributes:
+        prediction: the step that led to it; its positions and margins are the model's, from the last estimate.
+        positions: of all nodes, shape (n + 1, 2) [m].
+        covariance: of each node, shape (n + 1, 2, 2) [m^2].
+        deviation: of each node across the thread, shape (n + 1,) [m].
+        corrected: whether a measurement went into it; otherwise it is only a prediction.
+        unmeasured_for: time since the last measurement went in, inf if none ever did [s].
+        converged: whether the barriers themselves hold.
+        residual: largest scaled residual of the correction's program.
+        points: number of points that were measured and placed on the thread.
+        hidden: part of the thread that no point shows.
+        innovations: None without a measurement.
+        noise: intensity of the process noise in each window, shape (w,) [m^2/s].
+        disturbances: what the model does not know.
+        problems: why pieces or the whole observation were refused.
+        slow_parameters: what is learned of thread and liquid; empty if nothing is asked for.
+        thread: with what is learned.
+        compute_margins: at its positions.
+    """
+
+    prediction: Prediction
+    positions: Points
+    covariance: NDArray[np.float64]
+    deviation: Vector
+    corrected: bool
+    unmeasured_for: float
+    converged: bool
+    residual: float
+    points: int
+    hidden: float
+    innovations: Innovations | None
+    noise: Vector
+    disturbances: tuple[Disturbance, ...]
+    problems: tuple[str, ...]
+    slow_parameters: tuple[SlowParameter, ...]
+    thread: Thread
+    compute_margins: Callable[[], Margins] = field(repr=False, compare=False)
+
+    @property
+    def stamp(self) -> float:
+        """Of the needle's pose [s]."""
+        return self.prediction.stamp
+
+    @cached_property
+    def margins(self) -> Margins:
+        """The margins of every barrier by its name with their bounds, of its positions; computed at first access."""
+        return self.compute_margins()
+
+
+def clearance_bound(rows: BarrierRows, covariance: NDArray[np.float64]) -> Vector:
+    """Return the one-sided 99 % bound of each margin of a barrier as a distance [m].
+
+        clearance - 2.33 sum_k (g_k' C_k g_k)^(1/2) / |g|
+
+    with the covariances C_k of the nodes that the row depends on, taken as fully correlated. Of obstacles and wall
+    the clearance is that of the half segments beside a node too, and the greatest deviation along g of the node
+    and its neighbours counts: that of a point between two nodes is not greater.
+
+    Args:
+        rows: of obstacles, wall or a barrier that a user added.
+        covariance: of each node, shape (n + 1, 2, 2) [m^2].
+    """
+    deviation, gradient = np.zeros(len(rows.clearance)), rows.gradient
+    for apart in (-1, 0, 1) if rows.name in SOLID else (0,):
+        near = covariance[np.clip(rows.nodes + apart, 0, len(covariance) - 1)]
+        square = np.einsum("rka,rkab,rkb->rk", gradient, near, gradient)
+        deviation = np.maximum(deviation, np.sqrt(np.maximum(square, 0.0)).sum(axis=1))
+    slope = np.sqrt(np.einsum("rkd,rkd->r", gradient, gradient))
+    return np.asarray(rows.clearance - ONE_SIDED_99 * deviation / np.where(slope > 0.0, slope, 1.0))
+
+
+@dataclass
+class FilterState:
+    """What the next step and correction depend on, besides the predictor.
+
+    Attributes:
+        errors: variance and density of each node, see `noise`, shape (2, n + 1) [D^2].
+        noise: what is learned of the noise.
+        test: for disturbances.
+        measured_at: stamp of the last measurement, -inf before the first [s].
+        gross: number of frames in a row that showed the thread somewhere else.
+        unknown: whether nobody has seen the thread's shape.
+        converged: whether the barriers themselves hold.
+        prediction: the last step.
+    """
+
+    errors: Points
+    noise: NoiseModel
+    test: DisturbanceTest
+    measured_at: float = -math.inf
+    gross: int = 0
+    unknown: bool = True
+    converged: bool = False
+    prediction: Prediction | None = None
+
+
+Snapshot = tuple[FilterState, NeedlePose | None, ThreadState | None, WarmStart, LearnedState]
+"""Everything that the next step depends on: of the filter, predictor, formulation and stiffness."""
 
 
 class ThreadEstimator:
@@ -107,12 +203,12 @@ class ThreadEstimator:
         self._length = max(0.1 * self.thread.segments, 0.5)  # l [D]
         self._corrector = Corrector(predictor, formulation)
         self._stiffness = StiffnessLearner(predictor, formulation, self.options.slow_parameters)
-        self._now = self._forgotten()
+        self._forget()
 
-    def _forgotten(self) -> FilterState:
+    def _forget(self) -> None:
         self._stiffness.reset()
         errors = np.zeros((2, self.thread.segments + 1))
-        return FilterState(errors, NoiseModel.new(), DisturbanceTest(self.thread))
+        self._now = FilterState(errors, NoiseModel.new(), DisturbanceTest(self.thread))
 
     @property
     def started(self) -> bool:
@@ -124,10 +220,10 @@ class ThreadEstimator:
         self.predictor.warm_up()
         path = np.array([[0.0, 0.0], [-self.thread.length, 0.0]])
         points = np.linspace(path[0], path[1], 50)
+        points[10, 1] = self.thread.length  # an outlier
         piece = ThreadPiece(points, np.full(50, 1e-5), PieceEnd.TAIL, PieceEnd.FREE, (0.0, 0.0), False)
         pose = NeedlePose(0.0, np.zeros(2), np.array([1.0, 0.0]))
         self.start(pose, path)
-        self.correct(ThreadObservation((piece,), True))
         self.step(replace(pose, stamp=0.01), ThreadObservation((piece,), True))
         self.reset()
         self.predictor.added.first_time = math.inf
@@ -135,30 +231,25 @@ class ThreadEstimator:
     def reset(self) -> None:
         """Forget the thread; the next call must be `start`."""
         self.predictor.reset()
-        self._now = self._forgotten()
+        self._forget()
 
-    def start(
-        self, pose: NeedlePose, centreline: Points | None = None, deviation: float | None = None
-    ) -> ThreadEstimate:
+    def start(self, pose: NeedlePose, centreline: Points | None = None) -> ThreadEstimate:
         """Set the thread's shape.
 
         Args:
             pose: the needle.
             centreline: measured, from the needle's tail on, shape (m, 2) [m]; it may end early. None is a thread that
                 lies straight behind the needle, of which nothing is known.
-            deviation: of the centreline [m]; None for that of a measured one.
 
         Raises:
             InvalidInputError: see `ThreadPredictor.start`.
         """
         prediction = self.predictor.start(pose, centreline, strict=False)
-        seen, known = 0.0, 0.0
-        if centreline is not None:
-            seen = float(arc_lengths(centreline)[-1]) / self._unit
-            known = (LAID_DEVIATION * MIN_DEVIATION if deviation is None else deviation) / self._unit
-        self._now = now = self._forgotten()
+        self._forget()
+        now, seen = self._now, 0.0 if centreline is None else float(arc_lengths(centreline)[-1])
         now.prediction, now.converged, now.unknown = prediction, prediction.converged, centreline is None
-        now.errors = self._errors_of(seen, known**2)
+        known = 0.0 if centreline is None else LAID_DEVIATION * association.MIN_DEVIATION
+        now.errors = self._errors_of(seen / self._unit, (known / self._unit) ** 2)
         return self._estimate([])
 
     def _errors_of(self, seen: float, variance: float) -> Points:
@@ -187,56 +278,79 @@ class ThreadEstimator:
         before, now = self.predictor.state, self._now
         now.prediction = prediction = self._stiffness.step(pose)
         now.converged = prediction.converged
-        state = self.predictor.state
         assert before is not None
-        assert state is not None
-        noise = at_nodes(now.noise.intensity, self.thread.segments + 1)
-        noise[0] = 0.0
-        added = noise * np.array([[1.0], [2.0 * self._length]]) * (prediction.interval / self._unit**2)
-        here, there = np.ascontiguousarray(state.positions), np.ascontiguousarray(before.positions)
-        now.errors = propagate_errors(here, there, self._unit, added, now.errors)
+        intensity = noise.at_nodes(now.noise.intensity, self.thread.segments + 1)
+        intensity[0] = 0.0
+        added = np.outer((1.0, 2.0 * self._length), intensity) * (prediction.interval / self._unit**2)
+        now.errors = noise.propagate_errors(prediction.positions, before.positions, self._unit, added, now.errors)
         now.test.decay(prediction.interval, self._formulation.nodes_in_contact)
         return self.correct(observation) if observation is not None else self._estimate([])
 
     def correct(self, observation: ThreadObservation) -> ThreadEstimate:
         """Correct the thread at the last pose by an observation of the same instant."""
-        state, pose, unit = self.predictor.state, self.predictor.pose, self._unit
+        now, state, pose, unit = self._now, self.predictor.state, self.predictor.pose, self._unit
         if state is None or pose is None:
             raise InvalidInputError("thread observation", "one before the start", "a centreline first")
-        placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
+        placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
         if placed and (laid := self._laid_along(placed[0], pose, state)) is not None:
             state = laid
-            placed, problems = place_pieces(observation, state.positions / unit, self._now.errors[0], unit)
+            placed, problems = association.place_pieces(observation, state.positions / unit, now.errors[0], unit)
         points, refused = self._points_of(placed, state)
         if points is None:
             return self._estimate(problems + refused)
-        if self._stiffness.state.active:
-            weigh(points, self._now.errors[0])
-            noise = at_nodes(self._now.noise.raised, self.thread.segments + 1)
-            if not self._corrector.solve(self._prior(state, pose, noise), points):
-                state = self._stiffness.learn(self._corrector, state, pose.stamp)
+        learner, corrector, work = self._stiffness, self._corrector, self._corrector.work
+        if learner.state.active:
+            noise.weigh(points, now.errors[0])
+            if not corrector.solve(self._prior(state, pose), points):
+                state = learner.learn(corrector, state, pose.stamp)
                 again, refused = self._points_of(placed, state)
                 points = again or points
-        return self._corrected(points, pose, state, problems + refused)
+        problems, count = problems + refused, len(points.place)
+        measured = math.isfinite(now.measured_at)
+        elapsed = pose.stamp - now.measured_at if measured else 0.0
+        now.noise, innovations, now.errors = noise.learn(
+            now.noise, points, now.errors, unit, elapsed, 2.0 * self._length
+        )
+        prior = self._prior(state, pose)
+        if problem := corrector.solve(prior, points):
+            return self._estimate([*problems, problem], innovations, count)
+        normals = normals_of(prior.positions)
+        now.errors, applied, hidden = noise.take_correction(points, normals, work.moved, work.covariance, prior.density)
+        now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
+        if learner.state.active:
+            learner.correct(corrector, float(now.errors[0].mean()))
+        if measured:  # else there is no earlier time to compare with
+            # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
+            # points of a window share it, and so do both times that the test compares.
+            scale, sums = now.noise.scale, now.noise.sums
+            variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
+            now.test.add(work.moved * unit, normals, variance, pose.stamp, np.asarray(pose.deviation))
+        self.predictor.pose = pose
+        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
+        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
+        return self._estimate(problems, innovations, count, hidden)
 
-    def _points_of(self, placed: list[PlacedPiece], state: ThreadState) -> tuple[MeasuredPoints | None, list[str]]:
+    def _points_of(
+        self, placed: list[association.PlacedPiece], state: ThreadState
+    ) -> tuple[association.MeasuredPoints | None, list[str]]:
         now, nodes = self._now, state.positions / self._unit
         obstacles = self._formulation.workspace, 0.5 * self.thread.diameter
-        return measured_points(placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles)
+        return association.measured_points(
+            placed, nodes, float(now.errors[0, -1]), now.noise.scale, self._unit, obstacles
+        )
 
-    def _prior(self, state: ThreadState, pose: NeedlePose, noise: Vector) -> Prior:
-        """Return the prior of a correction; noise as intensity at each node [m^2/s]."""
+    def _prior(self, state: ThreadState, pose: NeedlePose) -> Prior:
         unit, rod = self._unit, self._formulation.rod
         return Prior(
             np.ascontiguousarray(state.positions / unit),
             np.ascontiguousarray(pose.heading, dtype=np.float64),
             np.maximum(self._now.errors[1], 1e-12),
-            noise / unit**2,
+            noise.at_nodes(self._now.noise.raised, self.thread.segments + 1) / unit**2,
             self._length,
             rod.bending_stiffness / (rod.drag_across * unit**4),
         )
 
-    def _laid_along(self, piece: PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
+    def _laid_along(self, piece: association.PlacedPiece, pose: NeedlePose, state: ThreadState) -> ThreadState | None:
         """Lay the thread along a piece that begins at the needle, if the estimate is nowhere near it.
 
         At once where the estimate is known to be as bad as that, or was never measured, else when a second frame says
@@ -252,7 +366,7 @@ class ThreadEstimator:
         measured = math.isfinite(now.measured_at)
         if not now.unknown and measured and now.gross < 2 and piece.square > 9.0 * prior:
             return None
-        seen = smoothed_line(piece.points, piece.arcs, 2.0 * POINT_CORRELATION / unit) * unit
+        seen = smoothed_line(piece.points, piece.arcs, 2.0 * association.POINT_CORRELATION / unit) * unit
         path = continued(np.vstack([pose.tail, seen[1:]]), state.positions, int(min(end, segments - 1.0)))
         radius = self._formulation.workspace.wall_radius - 0.5 * self.thread.diameter
         laid = ThreadState.at_rest(chain_inside(path, segments, unit, radius))
@@ -264,34 +378,6 @@ class ThreadEstimator:
         self._stiffness.restart()
         return laid
 
-    def _corrected(
-        self, points: MeasuredPoints, pose: NeedlePose, state: ThreadState, problems: list[str]
-    ) -> ThreadEstimate:
-        now, unit, work = self._now, self._unit, self._corrector.work
-        measured = math.isfinite(now.measured_at)
-        elapsed = pose.stamp - now.measured_at if measured else 0.0
-        learned = learn(now.noise, points, now.errors, unit, elapsed, 2.0 * self._length)
-        now.noise, mean, variance, now.errors = learned
-        innovations = Innovations(mean, variance)
-        prior = self._prior(state, pose, at_nodes(now.noise.raised, self.thread.segments + 1))
-        if problem := self._corrector.solve(prior, points):
-            return self._estimate([*problems, problem], innovations, len(points.place))
-        now.errors, applied, hidden = take_correction(points, work.normals, work.moved, work.covariance, prior.density)
-        now.noise = now.noise._replace(error=now.noise.error - unit * applied[:, None])
-        self._stiffness.correct(self._corrector, float(now.errors[0].mean()))
-        if measured:  # else there is no earlier time to compare with
-            # What of a point's variance does not change from frame to frame is of the dish's place in the image: the
-            # points of a window share it, and so do both times that the test compares.
-            scale, sums = now.noise.scale, now.noise.sums
-            variance = sums.own * (1.0 + 0.5 * max(1.0 - scale, MIN_SHARED) / scale * sums.independent) * unit**2
-            now.test.add(work.moved * unit, work.normals, variance, pose.stamp, np.asarray(pose.deviation))
-            if now.test.confirmed(pose.stamp):
-                self._stiffness.activate()
-        self.predictor.pose = pose
-        self.predictor.state = ThreadState(work.about * unit, state.velocities, state.interval)
-        now.converged, now.unknown, now.measured_at = True, False, pose.stamp
-        return self._estimate(problems, innovations, len(points.place), hidden)
-
     def _estimate(
         self,
         problems: Sequence[str],
@@ -300,28 +386,33 @@ class ThreadEstimator:
         hidden: float | None = None,
     ) -> ThreadEstimate:
         """Return the estimate; `hidden` is None where the thread was not corrected."""
-        now, pose, state = self._now, self.predictor.pose, self.predictor.state
-        assert now.prediction is not None
+        now, pose, state, prediction = self._now, self.predictor.pose, self.predictor.state, self._now.prediction
+        assert prediction is not None
         assert pose is not None
         assert state is not None
-        formulation, positions = self._formulation, state.positions
+        formulation, positions, tolerance = self._formulation, state.positions, self.predictor.contact_tolerance
         corrected = hidden is not None
         # Where innovations are larger than expected, so are the errors that are left.
         scale = self._unit**2 * max(now.noise.ratio, 1.0)
         if corrected:
             covariance = scale * self._corrector.work.covariance
         else:
-            along = np.gradient(positions, axis=0)
-            normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+            normal = normals_of(positions)
             covariance = scale * now.errors[0][:, None, None] * normal[:, :, None] * normal[:, None, :]
         formulation.added.set_time(pose.stamp)
         added = formulation.added.rows(positions)  # at once, as barriers may move on before they are asked again
+        disturbances = now.test.found(pose.stamp, positions)
+        if corrected and disturbances:
+            self._stiffness.activate()
 
-        def compute_rows() -> list[BarrierRows]:
-            return [*formulation.margins(positions, pose.heading), *added]
+        def compute_margins() -> Margins:
+            rows = [*formulation.margins(positions, pose.heading), *added]
+            bounded = [each for each in rows if each.name in SOLID or each.name not in BUILT_IN]
+            bounds = {each.name: clearance_bound(each, covariance) for each in bounded}
+            return Margins.of(rows, tolerance, prediction.scene_version).with_bounds(bounds)
 
         return ThreadEstimate(
-            prediction=now.prediction,
+            prediction=prediction,
             positions=positions,
             covariance=covariance,
             deviation=np.sqrt(scale * np.maximum(now.errors[0], 0.0)),
@@ -329,74 +420,43 @@ class ThreadEstimator:
             unmeasured_for=pose.stamp - now.measured_at,
             converged=now.converged,
             residual=self._corrector.residual if corrected else 0.0,
-            solves=self._corrector.solves if corrected else 0,
             points=points,
             hidden=1.0 if hidden is None else hidden,
             innovations=innovations,
             noise=now.noise.intensity,
-            disturbances=now.test.found(pose.stamp, positions),
+            disturbances=disturbances,
             problems=tuple(problems),
             slow_parameters=self._stiffness.report(),
             thread=self._stiffness.thread,
-            compute_rows=compute_rows,
-            contact_tolerance=self.predictor.contact_tolerance,
+            compute_margins=compute_margins,
         )
 
-    def snapshot(self) -> FilterState:
+    def snapshot(self) -> Snapshot:
         """Return everything that the next step depends on."""
-        return replace(
-            self._now,
-            test=copy(self._now.test),
-            pose=self.predictor.pose,
-            thread=self.predictor.state,
-            warm_start=self._formulation.warm_start(),
-            learned=self._stiffness.state,
-        )
+        now, predictor = replace(self._now, test=copy(self._now.test)), self.predictor
+        return now, predictor.pose, predictor.state, self._formulation.warm_start(), self._stiffness.state
 
-    def restore(self, kept: FilterState) -> None:
+    def restore(self, kept: Snapshot) -> None:
         """Go back to a snapshot of a thread that has started; what follows is the same again to the last bit."""
-        assert kept.warm_start is not None
-        assert kept.learned is not None
-        self._now = replace(kept, test=copy(kept.test))
-        self.predictor.pose, self.predictor.state = kept.pose, kept.thread
-        self._formulation.restore(kept.warm_start)
-        self._stiffness.restore(kept.learned)
+        now, self.predictor.pose, self.predictor.state, warm_start, learned = kept
+        self._now = replace(now, test=copy(now.test))
+        self._formulation.restore(warm_start)
+        self._stiffness.restore(learned)
 
     def follow_on(self, other: ThreadEstimator) -> None:
-        """Continue from the estimate of another thread, in another scene or with other options.
+        """Continue from the estimate of another thread, in another scene or with other options; a step comes next.
 
         What was learned of the stiffness and added up for disturbances stays with the thread that it is of.
         """
         self.reset()
         self.predictor.follow_on(other.predictor)
-        kept, now, (old, new) = other.snapshot(), self._now, (other._unit, self._unit)
+        (kept, *_, learned), (old, new) = other.snapshot(), (other._unit, self._unit)
         at, nodes = new * np.arange(self.thread.segments + 1), old * np.arange(other.thread.segments + 1)
-        now.errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
-        now.noise, now.measured_at, now.prediction = kept.noise, kept.measured_at, self._carried_over(kept)
-        now.gross, now.unknown, now.converged = kept.gross, kept.unknown, kept.converged
-        if self.thread == other.thread:
-            now.test = kept.test
-            if self.options.slow_parameters == other.options.slow_parameters and kept.learned is not None:
-                self._stiffness.restore(kept.learned)
-
-    def _carried_over(self, kept: FilterState) -> Prediction:
-        """Return the step that led to a state as one of this thread and scene; it keeps no other predictor alive."""
-        predictor, state, pose = self.predictor, self.predictor.state, kept.pose
-        assert kept.prediction is not None
-        assert state is not None
-        assert pose is not None
-        positions, heading, version = state.positions, pose.heading, predictor.scene_version
-        lengths = np.hypot(*np.diff(positions, axis=0).T)
-        return replace(
-            kept.prediction,
-            scene_version=version,
-            positions=positions,
-            strain=lengths / self._formulation.rest_lengths(positions, heading) - 1.0,
-            compute_margins=lambda: Margins.of(
-                self._formulation.margins(positions, heading), predictor.contact_tolerance, version
-            ),
-            compute_forces=lambda: None,
-        )
+        errors = (old / new) ** 2 * np.array([np.interp(at, nodes, each) for each in kept.errors])
+        test = kept.test if self.thread == other.thread else self._now.test
+        self._now = replace(kept, errors=errors, test=test, prediction=None)
+        if self.thread == other.thread and self.options.slow_parameters == other.options.slow_parameters:
+            self._stiffness.restore(learned)
 
 
 def smoothed_line(points: Points, arcs: Vector, length: float) -> Points:
@@ -424,39 +484,3 @@ def continued(path: Points, positions: Points, node: int) -> Points:
     turn = math.atan2(new[1], new[0]) - math.atan2(old[1], old[0])
     c, s = math.cos(turn), math.sin(turn)
     return np.vstack([path, path[-1] + rest @ np.array([[c, s], [-s, c]])])
-
-
-@dataclass(frozen=True)
-class EstimatorSettings(Configuration):
-    """Whether and how the thread is estimated; see `EstimatorOptions`."""
-
-    estimator: bool = quantity(
-        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
-    )
-    estimator_path_deviation: float = quantity(
-        2e-5,
-        "standard deviation of the points of thread/measured, used where nobody publishes thread/observation",
-        unit="m",
-        minimum=1e-7,
-        maximum=0.01,
-    )
-    estimator_history: float = quantity(
-        EstimatorOptions.history, "how late an observation of the thread may come", unit="s", minimum=0.05, maximum=5.0
-    )
-    estimator_slow_parameters: tuple[str, ...] = quantity(
-        EstimatorOptions.slow_parameters,
-        "what the estimator learns of the thread as it runs: stiffness_over_drag, or nothing; auto: stiffness over "
-        "drag, once the thread moves as the model cannot explain",
-    )
-
-    def estimator_options(self) -> EstimatorOptions:
-        """Return the options of the estimator.
-
-        Raises:
-            ConfigurationError: a slow parameter is unknown.
-        """
-        try:
-            return EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
-        except ConfigurationError as error:
-            name = error.name.replace("estimator.", f"{self.GROUP}.estimator_")
-            raise ConfigurationError(name, error.value, error.expectation) from None

@@ -21,9 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.estimator.association import MeasuredPoints
-from magnetosuture_thread.estimator.correction import robust_weights
+from magnetosuture_thread.estimator.correction import normals_of, robust_weights
 from magnetosuture_thread.geometry.polyline import Points
 
 Vector = NDArray[np.float64]
@@ -120,7 +119,7 @@ class NoiseModel(NamedTuple):
         return cls(filters, filters, likelihood, quiet, quiet, 1.0, 1.0, 0.0, sums, nothing, nothing)
 
 
-@compiled
+@np.errstate(divide="ignore", invalid="ignore")
 def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
     """Write the robust weights of the points against the prior; return the sums of the windows.
 
@@ -128,29 +127,23 @@ def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
         points: the points.
         variance: of the prior at each node across the thread, shape (n + 1,) [D^2].
     """
-    prior = np.interp(points.place, np.arange(len(variance)) * 1.0, variance)
+    prior = np.interp(points.place, np.arange(len(variance)), variance)
     robust_weights(points.innovation, points.variance + prior, points.weight)
-    own, mean, known, independent = np.zeros(WINDOWS), np.zeros(WINDOWS), np.zeros(WINDOWS), np.zeros(WINDOWS)
-    for p in range(len(prior)):
-        w = min(int(points.place[p] * WINDOWS / (len(variance) - 1)), WINDOWS - 1)
-        information = points.weight[p] * points.share[p]
-        own[w] += information / points.variance[p]
-        independent[w] += information
-        mean[w] += information / points.variance[p] * points.innovation[p]
-        known[w] += information / points.variance[p] * prior[p]
-    total = np.where(own > 0.0, own, np.nan)
-    return WindowSums(mean / total, 1.0 / own, known / total, independent)
+    window = (points.place * WINDOWS / (len(variance) - 1)).astype(np.int64).clip(max=WINDOWS - 1)
+    information = points.weight * points.share
+    precision = information / points.variance
+    of_points = (precision, precision * points.innovation, precision * prior, information)
+    own, mean, known, independent = [np.bincount(window, each, WINDOWS) for each in of_points]
+    return WindowSums(mean / own, 1.0 / own, known / own, independent)
 
 
-@compiled
 def at_nodes(values: Vector, nodes: int) -> Vector:
     """Return at each node the windows' values, interpolated in their logarithms between the windows' middles."""
     places = len(values) * np.arange(nodes) / (nodes - 1.0) - 0.5
-    return np.asarray(np.exp(np.interp(places, np.arange(len(values)) * 1.0, np.log(values))))
+    return np.asarray(np.exp(np.interp(places, np.arange(len(values)), np.log(values))))
 
 
-@compiled
-def propagate_errors(positions: Points, before: Points, unit: float, added: Vector, errors: Points) -> Points:
+def propagate_errors(positions: Points, before: Points, unit: float, added: Points, errors: Points) -> Points:
     """Return variance and density after a step: errors across the thread stay where they are, and grow.
 
     The thread slides along itself when it is pulled: a node comes to where another part of the thread was, and has
@@ -163,25 +156,20 @@ def propagate_errors(positions: Points, before: Points, unit: float, added: Vect
         added: noise over the step, of variance and density at each node, shape (2, n + 1) [D^2].
         errors: variance and density before, shape (2, n + 1) [D^2].
     """
-    last, slid = len(positions) - 1, np.zeros(len(positions))
-    for i in range(last + 1):
-        a, b = max(i - 1, 0), min(i + 1, last)
-        tx, ty = before[a, 0] - before[b, 0], before[a, 1] - before[b, 1]  # towards the needle
-        size = np.hypot(tx, ty)
-        if size > 0.0:
-            slid[i] = ((positions[i, 0] - before[i, 0]) * tx + (positions[i, 1] - before[i, 1]) * ty) / (size * unit)
-    nodes = np.arange(last + 1.0)
-    result: Points = added.copy()
-    for k in range(2):
-        result[k] += np.interp(nodes - slid, nodes, errors[k])
-    return result
+    nodes, (x, y), normals = np.arange(len(positions)), (positions - before).T, normals_of(before)
+    slid = (x * normals[:, 1] - y * normals[:, 0]) / unit  # away from the needle
+    return np.asarray(added + [np.interp(nodes + slid, nodes, each) for each in errors])
 
 
-@compiled
 def learn(
     noise: NoiseModel, points: MeasuredPoints, errors: Points, unit: float, elapsed: float, factor: float
-) -> tuple[NoiseModel, Vector, Vector, Points]:
+) -> tuple[NoiseModel, Innovations, Points]:
     """Test the innovations of a frame, learn from them, and let the prior grow where the noise rose.
+
+    With the mean innovation nu of a window, its variance r by the points' own and p by the prior,
+
+        E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
+        E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames do not
 
     Args:
         noise: learned before.
@@ -192,54 +180,38 @@ def learn(
         factor: of the density over the variance.
 
     Returns:
-        What is learned now; the mean innovation of each window, nan where nothing is measured, shape (w,) [m]; the
-        variance that is expected of it [m^2]; and the errors that have grown.
+        What is learned now; the innovations; and the errors that have grown.
     """
     sums = weigh(points, errors[0])
     mean, own, known = sums.mean * unit, sums.own * unit**2, sums.known * unit**2
     seen, camera, expected = np.isfinite(mean), own / noise.scale, noise.ratio * (own + known)
-    ratio, scale = _matched(noise, mean, camera, expected, elapsed)
+    ratio, scale, both = noise.ratio, noise.scale, seen & np.isfinite(noise.last_mean)
+    if seen.any():
+        square = float((mean[seen] ** 2 / expected[seen]).mean())
+        ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square, MAX_SQUARE) - 1.0)))
+    if both.any():
+        apart = (mean - noise.last_mean)[both] ** 2 / (camera + noise.last_variance)[both]
+        # The scale is learned over 5 s.
+        share = min(elapsed / (min(noise.learned_for, 5.0) + LEARNING_PRIOR), 1.0)
+        scale += share * (float(np.minimum(apart, MAX_SCALE).mean()) - scale)
+        scale = min(max(scale, MIN_SCALE), MAX_SCALE)
     error, variance, likelihood, intensity = learn_intensity(noise, mean, own, elapsed)
     interval, settled = max(elapsed, MIN_INTERVAL), noise.learned_for >= NOISE_TIME
     raised = raised_intensity(error, variance, likelihood, intensity, seen, interval, settled)
     nodes = errors.shape[1]
     extra = at_nodes(np.maximum(noise.intensity, raised), nodes) - at_nodes(noise.intensity, nodes)
     extra[0] = 0.0
-    grown = errors.copy()
-    grown[0] += extra * (interval / unit**2)
-    grown[1] += factor * extra * (interval / unit**2)
+    grown = errors + np.outer((1.0, factor), extra) * (interval / unit**2)
     sums = weigh(points, grown[0])
     if noise.learned_for == 0.0:
         # Of the first step after a start no noise was known: it is tested with the noise that it shows.
         ratio, expected = noise.ratio, noise.ratio * (sums.own + sums.known) * unit**2
     learned_for = noise.learned_for + elapsed
     model = NoiseModel(error, variance, likelihood, intensity, raised, scale, ratio, learned_for, sums, mean, camera)
-    return model, mean, expected, grown
+    return model, Innovations(mean, expected), grown
 
 
-@compiled
-def _matched(noise: NoiseModel, mean: Vector, camera: Vector, expected: Vector, elapsed: float) -> tuple[float, float]:
-    """Return ratio and scale matched to the innovations of a frame.
-
-    E nu^2 = c (r + p)                  c, the ratio: log c <- log c + share (nu^2 / (c (r + p)) - 1)
-    E (nu_k - nu_{k-1})^2 = 2 s r       s, the scale: errors of the model last, those of two frames do not
-    """
-    square, change, windows, both, ratio, scale = 0.0, 0.0, 0, 0, noise.ratio, noise.scale
-    for w in np.flatnonzero(np.isfinite(mean)):
-        square, windows = square + mean[w] ** 2 / expected[w], windows + 1
-        if np.isfinite(noise.last_mean[w]):
-            apart = (mean[w] - noise.last_mean[w]) ** 2 / (camera[w] + noise.last_variance[w])
-            change, both = change + min(apart, MAX_SCALE), both + 1
-    if windows > 0:
-        ratio *= np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square / windows, MAX_SQUARE) - 1.0))
-    if both > 0:
-        # The scale is learned over 5 s.
-        share = min(elapsed / (min(noise.learned_for, 5.0) + LEARNING_PRIOR), 1.0)
-        scale = min(max(scale + share * (change / both - scale), MIN_SCALE), MAX_SCALE)
-    return ratio, scale
-
-
-@compiled
+@np.errstate(invalid="ignore")
 def learn_intensity(
     noise: NoiseModel, mean: Vector, own: Vector, elapsed: float
 ) -> tuple[Points, Points, Points, Vector]:
@@ -247,27 +219,24 @@ def learn_intensity(
 
     Args:
         noise: before it.
-        mean: nu of each window, shape (w,) [m].
+        mean: nu of each window, nan where nothing is measured, shape (w,) [m].
         own: r of each, inf where nothing is measured, shape (w,) [m^2].
         elapsed: since the last measurement [s].
     """
     keep, switched = np.exp(-elapsed / NOISE_TIME), min(1.0, SWITCHING * elapsed)
-    error, variance = noise.error.copy(), noise.variance + GRID * elapsed
-    likelihood, intensity = noise.likelihood.copy(), noise.intensity.copy()
-    for w in np.flatnonzero(np.isfinite(own)):
-        prior, off = variance[w].copy(), mean[w] - error[w]
-        expected = prior + own[w]
-        logs = keep * np.log(likelihood[w]) - 0.5 * (np.log(expected) + off * off / expected)
-        weight = np.exp(logs - logs.max())
-        weight = (1.0 - switched) * weight / weight.sum() + switched / len(GRID)
-        error[w] += prior / expected * off
-        variance[w] = prior * own[w] / expected
-        likelihood[w] = np.maximum(weight, 1e-30)
-        intensity[w] = np.exp((likelihood[w] * np.log(GRID)).sum())
+    prior, own, off = noise.variance + GRID * elapsed, own[:, None], mean[:, None] - noise.error
+    expected = prior + own
+    logs = keep * np.log(noise.likelihood) - 0.5 * (np.log(expected) + off * off / expected)
+    weight = np.exp(logs - logs.max(axis=1, keepdims=True))
+    weight = (1.0 - switched) * weight / weight.sum(axis=1, keepdims=True) + switched / len(GRID)
+    seen = np.isfinite(own)
+    error = np.where(seen, noise.error + prior / expected * off, noise.error)
+    variance = np.where(seen, prior * own / expected, prior)
+    likelihood = np.where(seen, np.maximum(weight, 1e-30), noise.likelihood)
+    intensity = np.where(seen[:, 0], np.exp(likelihood @ np.log(GRID)), noise.intensity)
     return error, variance, likelihood, intensity
 
 
-@compiled
 def raised_intensity(
     error: Points,
     variance: Points,
@@ -300,7 +269,6 @@ def raised_intensity(
     return np.maximum(intensity + np.maximum(left - SURE**2 * doubt, 0.0) / interval, common / interval)
 
 
-@compiled
 def take_correction(
     points: MeasuredPoints, normals: Points, moved: Points, covariance: NDArray[np.float64], density: Vector
 ) -> tuple[Points, Vector, float]:
@@ -314,21 +282,15 @@ def take_correction(
         density: v of each node before, shape (n + 1,) [D^2].
     """
     segments = len(density) - 1
-    gained, seen = np.zeros(segments + 1), np.zeros(segments, dtype=np.bool_)
-    total, applied = np.zeros(WINDOWS), np.zeros(WINDOWS)
-    left, across = np.zeros((2, segments + 1)), (normals * moved).sum(axis=1)
-    for i in range(segments + 1):
-        n, c = normals[i], covariance[i]
-        left[0, i] = n[0] * n[0] * c[0, 0] + 2.0 * n[0] * n[1] * c[0, 1] + n[1] * n[1] * c[1, 1]
-    for p in range(len(points.place)):
-        low = min(int(points.place[p]), segments - 1)
-        part = points.place[p] - low
-        precision = points.weight[p] * points.share[p] / points.variance[p]
-        gained[low] += precision * (1.0 - part)
-        gained[low + 1] += precision * part
-        w = min(int(points.place[p] * WINDOWS / segments), WINDOWS - 1)
-        total[w] += precision
-        applied[w] += precision * ((1.0 - part) * across[low] + part * across[low + 1])
-        seen[low] = True
+    window = (points.place * WINDOWS / segments).astype(np.int64).clip(max=WINDOWS - 1)
+    low = np.minimum(points.place.astype(np.int64), segments - 1)
+    part, precision = points.place - low, points.weight * points.share / points.variance
+    gained = np.bincount(low, precision * (1.0 - part), segments + 1)
+    gained += np.bincount(low + 1, precision * part, segments + 1)
+    across = np.einsum("ia,ia->i", normals, moved)
+    applied = np.bincount(window, precision * ((1.0 - part) * across[low] + part * across[low + 1]), WINDOWS)
+    applied /= np.maximum(np.bincount(window, precision, WINDOWS), 1e-300)
+    left = np.zeros((2, segments + 1))
+    left[0] = np.einsum("ia,iab,ib->i", normals, covariance, normals)
     left[1, 1:] = 1.0 / (1.0 / density[1:] + gained[1:])
-    return left, np.where(total > 0.0, applied / np.maximum(total, 1e-300), 0.0), 1.0 - seen.sum() / segments
+    return left, applied, 1.0 - len(np.unique(low)) / segments

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,8 +9,7 @@ import numpy as np
 from magnetosuture_thread.arguments import checked_arguments
 from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.estimator.association import LENGTH_ERROR
-from magnetosuture_thread.estimator.estimate import FilterState, ThreadEstimate
-from magnetosuture_thread.estimator.estimator import ThreadEstimator
+from magnetosuture_thread.estimator.estimator import Snapshot, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -25,7 +23,7 @@ class _Moment:
 
     pose: NeedlePose
     observation: ThreadObservation | None
-    after: FilterState
+    after: Snapshot
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class EstimatorSession:
     @checked_arguments("estimator session")
     def __init__(self, estimator: ThreadEstimator) -> None:
         self._estimator, self._history = estimator, estimator.options.history
-        self._moments: deque[_Moment] = deque(maxlen=MAX_POSES)
+        self._moments: dict[float, _Moment] = {}  # by stamps, which rise
         self._early: dict[float, ThreadObservation] = {}
 
     def reset(self) -> None:
@@ -70,20 +68,18 @@ class EstimatorSession:
     def follow_on(self, other: EstimatorSession) -> None:
         """Continue from the estimate of another session, of another thread, scene or other options.
 
-        Observations of frames before its last pose are too late from then on.
+        Observations of frames up to its last pose are too late from then on.
         """
         self.reset()
         self._early = dict(other._early)
         if other._estimator.started:
             self._estimator.follow_on(other._estimator)
-            last = other._moments[-1]
-            self._moments.append(_Moment(last.pose, last.observation, self._estimator.snapshot()))
 
     def start(self, pose: NeedlePose, centreline: Points | None = None) -> EstimationResult:
         """Start from a shape that is given; without it, straight behind the needle."""
         self.reset()
         estimate = self._estimator.start(pose, centreline)
-        self._moments.append(_Moment(pose, None, self._estimator.snapshot()))
+        self._moments[pose.stamp] = _Moment(pose, None, self._estimator.snapshot())
         return EstimationResult(estimate, estimate)
 
     def on_pose(self, pose: NeedlePose) -> EstimationResult:
@@ -95,18 +91,18 @@ class EstimatorSession:
         # Older by more than a second, it is not late: time itself was set back.
         if last is not None and pose.stamp < last.stamp - 1.0:
             self.reset()
-        observation = self._early.pop(pose.stamp, None)
         try:
-            estimate = self._take(pose, observation)
+            estimate = self._take(pose, self._early.pop(pose.stamp, None))
         except (InvalidInputError, SolverError) as error:
             return EstimationResult(None, problem=error)
-        self._moments.append(_Moment(pose, observation, self._estimator.snapshot()))
-        while self._moments[0].pose.stamp < pose.stamp - self._history:
-            self._moments.popleft()
+        oldest = next(iter(self._moments))
+        while oldest < pose.stamp - self._history or len(self._moments) > MAX_POSES:
+            del self._moments[oldest]
+            oldest = next(iter(self._moments))
         latest = pose.stamp + self._history
-        problem = next((self._too_early(stamp) for stamp in self._early if stamp > latest), None)
+        too_early = [stamp for stamp in self._early if stamp > latest]
         self._early = {stamp: early for stamp, early in self._early.items() if pose.stamp < stamp <= latest}
-        return EstimationResult(estimate, estimate, problem)
+        return EstimationResult(estimate, estimate, self._too_early(too_early[0]) if too_early else None)
 
     def on_observation(self, stamp: float, observation: ThreadObservation) -> EstimationResult:
         """Take what a frame shows of the thread, at the pose of that frame.
@@ -124,36 +120,31 @@ class EstimatorSession:
                 del self._early[min(self._early)]
             early = last is not None and stamp > last.stamp + self._history
             return EstimationResult(None, problem=self._too_early(stamp) if early else None, waits=True)
-        index = next((k for k, moment in enumerate(self._moments) if moment.pose.stamp == stamp), None)
-        if index is None:
+        moment, problem = self._moments.get(stamp), None
+        if moment is None:
             return EstimationResult(None, problem=_refusal(stamp, "the stamp of a pose that is kept"))
-        if self._moments[index].observation is not None:
+        if moment.observation is not None:
             return EstimationResult(None, problem=_refusal(stamp, "no second observation of the same frame"))
-        return self._fold_in(index, observation)
-
-    def _fold_in(self, index: int, observation: ThreadObservation) -> EstimationResult:
-        """Correct a moment by its observation, and take all after it again."""
-        moments, problem = list(self._moments), None
-        moment = moments[index]
         self._estimator.restore(moment.after)
         estimate = measured = self._estimator.correct(observation)
         moment.observation, moment.after = observation, self._estimator.snapshot()
-        self._moments = deque(moments[: index + 1], maxlen=MAX_POSES)
-        for later in moments[index + 1 :]:
+        for later in [self._moments.pop(at) for at in list(self._moments) if at > stamp]:
             try:
                 estimate = self._take(later.pose, later.observation)
             except (InvalidInputError, SolverError) as error:
                 problem = error
-            else:
-                self._moments.append(_Moment(later.pose, later.observation, self._estimator.snapshot()))
         return EstimationResult(estimate, measured, problem)
 
     def _take(self, pose: NeedlePose, observation: ThreadObservation | None) -> ThreadEstimate:
+        """Step or start the thread, and keep the state after it."""
         if self._estimator.started:
-            return self._estimator.step(pose, observation)
-        if observation is not None:
-            return self._estimator.start_observed(pose, observation)
-        return self._estimator.start(pose)
+            estimate = self._estimator.step(pose, observation)
+        elif observation is not None:
+            estimate = self._estimator.start_observed(pose, observation)
+        else:
+            estimate = self._estimator.start(pose)
+        self._moments[pose.stamp] = _Moment(pose, observation, self._estimator.snapshot())
+        return estimate
 
     def _too_early(self, stamp: float) -> InvalidInputError:
         return _refusal(stamp, f"at most {self._history:g} s after the last pose")

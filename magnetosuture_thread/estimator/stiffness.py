@@ -40,7 +40,6 @@ import numpy as np
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.estimator.correction import Corrector
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
@@ -103,8 +102,7 @@ class LearnedState:
         deviation: root mean square of those of the nodes after the last correction [m].
         excited: by the last measurement.
         effect: sums over frames of how far x moves the thread, squared and as it is [m^2], [m].
-        block: sums of scores and of their expected squares in the block of time under way.
-        block_time: since it began [s].
+        block: sums of scores and of their expected squares in the block of time under way, and since when [s].
         dispersion: sums over blocks of squared scores and of what was expected.
     """
 
@@ -116,8 +114,7 @@ class LearnedState:
     deviation: float = math.inf
     excited: bool = False
     effect: tuple[float, float] = (0.0, 0.0)
-    block: tuple[float, float] = (0.0, 0.0)
-    block_time: float = 0.0
+    block: tuple[float, float, float] = (0.0, 0.0, 0.0)
     dispersion: tuple[float, float] = (0.0, 0.0)
 
 
@@ -126,18 +123,21 @@ class StiffnessLearner:
 
     Args:
         predictor: of the estimator.
+        formulation: its own.
         learned: nothing, `STIFFNESS_OVER_DRAG`, or `AUTOMATIC`: from the first disturbance on.
 
     Attributes:
         state: what is known.
+        thread: with what is learned.
 
     Raises:
         ConfigurationError: the stiffness is to be learned of a thread without stiffness or drag.
     """
 
     def __init__(self, predictor: ThreadPredictor, formulation: RodFormulation, learned: tuple[str, ...]) -> None:
-        self._predictor, self._formulation, self._thread = predictor, formulation, predictor.thread
-        medium, stiffness = self._thread.medium, self._thread.bending_stiffness
+        self._predictor, self._formulation = predictor, formulation
+        self.thread = self._given = predictor.thread
+        medium, stiffness = self._given.medium, self._given.bending_stiffness
         resists = min(stiffness, medium.drag_across, medium.drag_along) > 0.0
         if STIFFNESS_OVER_DRAG in learned and not resists:
             expected = "none for a thread without stiffness or drag"
@@ -151,33 +151,29 @@ class StiffnessLearner:
 
     def reset(self) -> None:
         """Forget everything."""
-        derivative = np.zeros((2, self._thread.segments + 1, 2))
+        derivative = np.zeros((2, self._given.segments + 1, 2))
         self.restore(LearnedState(self._learns and not self._automatic, self._start, derivative))
 
     def restore(self, state: LearnedState) -> None:
         """Go back to a state."""
         self.state = state
         if self._learns:
-            self._formulation.set_thread(self.thread)
+            self._use(state.x)
+
+    def _use(self, x: float) -> None:
+        """Let the predictor step a thread of another stiffness."""
+        self.thread = self._given
+        if x != self._start:  # a logarithm and back would change the last bit
+            self.thread = replace(self._given, bending_stiffness=math.exp(x) * self._given.medium.drag_across)
+        self._formulation.set_thread(self.thread)
 
     def activate(self) -> None:
         """Begin to learn, where that waited for the model to be found wrong."""
-        if self._learns and not self.state.active:
-            self.state = replace(self.state, active=True)
+        self.state = replace(self.state, active=self._learns)
 
     def restart(self) -> None:
         """Take the thread's place as one that does not depend on the stiffness, as where it was measured whole."""
         self.state = replace(self.state, derivative=np.zeros_like(self.state.derivative))
-
-    @property
-    def thread(self) -> Thread:
-        """The thread with what is learned."""
-        return self._thread_with(self.state.x)
-
-    def _thread_with(self, x: float) -> Thread:
-        if x == self._start:  # a logarithm and back would change the last bit
-            return self._thread
-        return replace(self._thread, bending_stiffness=math.exp(x) * self._thread.medium.drag_across)
 
     def step(self, pose: NeedlePose) -> Prediction:
         """Let the predictor follow the needle to its next pose, and propagate the derivative with it.
@@ -195,8 +191,8 @@ class StiffnessLearner:
         assert after is not None
         change = DIFFERENCE if state.x < self._start else -DIFFERENCE
         moved, derivative = change * state.derivative, np.zeros_like(state.derivative)
-        if np.abs(moved[0]).max() < 0.5 * self._thread.segment_length:  # beyond it is no derivative: it begins anew
-            formulation.set_thread(self._thread_with(state.x + change))
+        if np.abs(moved[0]).max() < 0.5 * self._given.segment_length:  # beyond it is no derivative: it begins anew
+            self._use(state.x + change)
             formulation.restore(warm_start)
             predictor.pose = last_pose
             predictor.state = ThreadState(before.positions + moved[0], before.velocities + moved[1], before.interval)
@@ -205,7 +201,7 @@ class StiffnessLearner:
                 other = predictor.state
                 derivative[:] = other.positions - after.positions, other.velocities - after.velocities
                 derivative /= change
-            formulation.set_thread(self.thread)
+            self._use(state.x)
             formulation.restore(kept)
             predictor.pose, predictor.state = pose, after
         self.state = replace(state, derivative=derivative)
@@ -220,7 +216,7 @@ class StiffnessLearner:
             stamp: of the frame [s].
         """
         state = self.state
-        found = corrector.sensitivity(state.derivative[0] / self._thread.segment_length)
+        found = corrector.sensitivity(state.derivative[0] / self._given.segment_length)
         if not (math.isfinite(found.information) and math.isfinite(found.score)):
             return predicted
         moved = math.sqrt(float((state.derivative[0] ** 2).sum(axis=1).mean()))
@@ -229,31 +225,22 @@ class StiffnessLearner:
             return predicted
         # Where not even the innovations that are left are as expected, a frame says less.
         trust = 1.0 / max(1.0, found.square / max(found.independent, 1.0))
-        information, score = trust * found.information, trust * found.score
+        score, gained = trust * found.score, trust * found.information / state.information
         elapsed = min(stamp - state.stamp, 1.0) if math.isfinite(state.stamp) else 0.0
-        gained = information / state.information
         kept = 1.0 - min(-math.expm1(-elapsed / SLOW_TIME), gained)
-        change = score / (state.information * (kept + gained))
-        change = min(max(change, -MAX_CHANGE), MAX_CHANGE)
+        information = state.information * (kept + gained)
+        change = min(max(score / information, -MAX_CHANGE), MAX_CHANGE)
         x = min(max(state.x + change, self._low), self._high)
-        block = state.block[0] + score, state.block[1] + information * (1.0 + gained)
-        block_time, dispersion = state.block_time + elapsed, state.dispersion
-        if block_time >= BLOCK_TIME:
-            old = math.exp(-block_time / SLOW_TIME) if block[1] > 0.0 else 1.0
-            dispersion = old * dispersion[0] + block[0] ** 2, old * dispersion[1] + block[1]
-            block, block_time = (0.0, 0.0), 0.0
-        self.state = replace(
-            state,
-            x=x,
-            information=state.information * (kept + gained),
-            stamp=stamp,
-            excited=True,
-            effect=(state.effect[0] * kept + moved**2, state.effect[1] * kept + moved),
-            block=block,
-            block_time=block_time,
-            dispersion=dispersion,
+        scores, expected, time = np.add(state.block, (score, gained * state.information * (1.0 + gained), elapsed))
+        block, dispersion = (scores, expected, time), state.dispersion
+        if time >= BLOCK_TIME:
+            old = math.exp(-time / SLOW_TIME) if expected > 0.0 else 1.0
+            block, dispersion = (0.0, 0.0, 0.0), (old * dispersion[0] + scores**2, old * dispersion[1] + expected)
+        effect = state.effect[0] * kept + moved**2, state.effect[1] * kept + moved
+        self.state = LearnedState(
+            True, x, state.derivative, information, stamp, state.deviation, True, effect, block, dispersion
         )
-        self._formulation.set_thread(self.thread)
+        self._use(x)
         positions, velocities = (x - state.x) * state.derivative
         return ThreadState(predicted.positions + positions, predicted.velocities + velocities, predicted.interval)
 
@@ -264,12 +251,10 @@ class StiffnessLearner:
             corrector: that has solved it.
             variance: of the nodes after it, in the mean [D^2].
         """
-        if self.state.active:
-            unit, derivative = self._thread.segment_length, self.state.derivative.copy()
-            corrected = corrector.sensitivity(derivative[0] / unit).corrected
-            derivative[0] = unit * np.where(np.isfinite(corrected), corrected, 0.0)
-            deviation = unit * math.sqrt(max(variance, 0.0))
-            self.state = replace(self.state, derivative=derivative, deviation=deviation)
+        unit, derivative = self._given.segment_length, self.state.derivative.copy()
+        corrected = corrector.sensitivity(derivative[0] / unit).corrected
+        derivative[0] = unit * np.where(np.isfinite(corrected), corrected, 0.0)
+        self.state = replace(self.state, derivative=derivative, deviation=unit * math.sqrt(max(variance, 0.0)))
 
     def report(self) -> tuple[SlowParameter, ...]:
         """Return what is known now; empty where nothing is learned."""
@@ -278,9 +263,7 @@ class StiffnessLearner:
             return ()
         ratio = max(state.dispersion[0] / max(state.dispersion[1], 1e-300), 1.0)
         square, effect = state.effect
-        half = STUDENT_95 * math.sqrt(ratio / state.information) + CHAIN * self._thread.length * effect / (
-            square or 1.0
-        )
-        half = min(half, NORMAL_95 * DEVIATION)
+        chain = CHAIN * self._given.length * effect / (square or 1.0)
+        half = min(STUDENT_95 * math.sqrt(ratio / state.information) + chain, NORMAL_95 * DEVIATION)
         value, low, high = map(math.exp, (state.x, max(state.x - half, self._low), min(state.x + half, self._high)))
         return (SlowParameter(STIFFNESS_OVER_DRAG, "m^4/s", value, low, high, state.excited),)

@@ -168,7 +168,7 @@ def _disturbance_markers(number: int, found: Disturbance, width: float) -> list[
 def deviation_band(estimate: ThreadEstimate) -> Points:
     """Return the triangles of the band within 2.33 standard deviations of the estimated thread, shape (6 n, 2) [m]."""
     # Only here: a scene server packs markers too, and needs no estimator.
-    from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
+    from magnetosuture_thread.estimator.estimator import ONE_SIDED_99
 
     nodes = estimate.positions
     along = np.gradient(nodes, axis=0)

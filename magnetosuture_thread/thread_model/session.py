@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from magnetosuture_thread.estimator.session import observation_of
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points, lay_behind_needle
 from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.thread.margins import FrictionLaw, Margins
+from magnetosuture_thread.thread.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedleMotion, NeedlePose, Prediction, check_pose
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
@@ -34,9 +35,8 @@ TURNING = 0.2  # rad/s per root of a second; the same of the rate of turning
 MAX_SPEED, MAX_TURNING = 0.01, 3.0  # m/s, rad/s; standard deviations of a velocity of which nothing is known
 MANEUVER = 16.0  # normalized square of three innovations, of which a motion without a change of mind exceeds 0.1 %
 MAX_POSE_INTERVAL = 0.2  # s; between poses farther apart nothing is known of the motion
-SIZE = 6  # of the state of the needle's motion
-
-Vector = NDArray[np.float64]
+UNKNOWN_MOTION = np.diag((MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2))
+NOISE_RATES = np.array((ACCELERATION, ACCELERATION, TURNING)) ** 2
 
 
 @dataclass(frozen=True)
@@ -110,11 +110,7 @@ class InitialObservation:
     """
 
     def __init__(self) -> None:
-        self._first_part: int | None = None  # stamp of the first part since the last start [ns]
-
-    def reset(self) -> None:
-        """Forget the parts that were seen."""
-        self._first_part = None
+        self._first_part = math.inf  # stamp of the first part since the last start [ns]
 
     def shape(self, stamp: int, observation: ThreadObservation) -> Points | None:
         """Return the shape to start from.
@@ -130,11 +126,10 @@ class InitialObservation:
         if points is None:
             return None
         if not observation.complete:
-            if self._first_part is None or stamp < self._first_part:
-                self._first_part = stamp
+            self._first_part = min(self._first_part, stamp)
             if stamp - self._first_part < PARTIAL_WAIT:
                 return None
-        self._first_part = None
+        self._first_part = math.inf
         return points
 
 
@@ -154,11 +149,7 @@ class NeedleMotionFilter:
     """
 
     def __init__(self) -> None:
-        self._state, self._covariance = np.zeros(SIZE), np.zeros((SIZE, SIZE))
-        self._stamp = -math.inf
-
-    def reset(self) -> None:
-        """Forget the motion."""
+        self._state, self._covariance = np.zeros(6), np.zeros((6, 6))
         self._stamp = -math.inf
 
     def update(self, pose: NeedlePose) -> NeedlePose:
@@ -173,76 +164,49 @@ class NeedleMotionFilter:
         interval, (place, angle) = pose.stamp - self._stamp, pose.deviation
         if interval <= 0.0:
             return pose
-        if not (place > 0.0 and angle > 0.0 and math.isfinite(place) and math.isfinite(angle)):
-            self.reset()
-            return pose
+        known = 0.0 < place < math.inf and 0.0 < angle < math.inf
+        self._stamp = pose.stamp if known else -math.inf
         measured = np.array([*pose.tail, math.atan2(pose.heading[1], pose.heading[0])])
-        self._stamp = pose.stamp
-        if interval > MAX_POSE_INTERVAL:
-            self._state[:], self._covariance[:] = 0.0, 0.0
-            self._state[:3] = measured
-            variances = [place**2, place**2, angle**2, MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2]
-            np.fill_diagonal(self._covariance, variances)
+        variances = np.diag((place**2, place**2, angle**2))
+        state, before = self._state, self._covariance
+        if not known or interval > MAX_POSE_INTERVAL:
+            state[:3], state[3:] = measured, 0.0
+            before[:] = 0.0
+            before[:3, :3], before[3:, 3:] = variances, UNKNOWN_MOTION
             return pose
-        filter_pose(self._state, self._covariance, measured, interval, place**2, angle**2)
-        c, s = math.cos(self._state[2]), math.sin(self._state[2])
-        along, across, turning = self._state[3:].tolist()
-        own = np.diagonal(self._covariance)
+        # It moves by the velocity in the middle of the interval, in which the noise is added.
+        middle = float(state[2] + 0.5 * interval * state[5])
+        c, s = math.cos(middle), math.sin(middle)
+        x, y = state[3] * c - state[4] * s, state[3] * s + state[4] * c
+        state[:3] += interval * x, interval * y, interval * state[5]
+        move, half = np.eye(6), np.zeros((6, 3))
+        move[0, 2:] = -interval * y, interval * c, -interval * s, -0.5 * interval**2 * y
+        move[1, 2:] = interval * x, interval * s, interval * c, 0.5 * interval**2 * x
+        move[2, 5] = interval
+        half[:3] = 0.5 * interval * np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        half[3:] = np.eye(3)
+        noise = (half * interval * NOISE_RATES) @ half.T
+        covariance = move @ before @ move.T + noise
+        innovation = measured - state[:3]
+        innovation[2] = math.remainder(innovation[2], 2.0 * math.pi)
+        inverse = np.linalg.inv(covariance[:3, :3] + variances)
+        if innovation @ inverse @ innovation > MANEUVER:
+            before[3:, :], before[:, 3:] = 0.0, 0.0
+            before[3:, 3:] = UNKNOWN_MOTION
+            covariance = move @ before @ move.T + noise
+            inverse = np.linalg.inv(covariance[:3, :3] + variances)
+        gain = covariance[:, :3] @ inverse
+        state += gain @ innovation
+        before[:] = covariance - gain @ covariance[:3, :]
+        c, s = math.cos(state[2]), math.sin(state[2])
+        along, across, turning = state[3:].tolist()
         return replace(
             pose,
-            tail=self._state[:2].copy(),
+            tail=state[:2].copy(),
             heading=np.array([c, s]),
-            deviation=(math.sqrt(0.5 * (own[0] + own[1])), math.sqrt(own[2])),
+            deviation=(math.sqrt(0.5 * (before[0, 0] + before[1, 1])), math.sqrt(before[2, 2])),
             motion=NeedleMotion(np.array([along * c - across * s, along * s + across * c]), turning),
         )
-
-
-def filter_pose(
-    state: Vector, covariance: Vector, measured: Vector, interval: float, place: float, angle: float
-) -> None:
-    """Predict a state over an interval [s] and correct it by a measured tail and angle with these variances."""
-    before = covariance.copy()
-    middle = float(state[2] + 0.5 * interval * state[5])
-    c, s = math.cos(middle), math.sin(middle)
-    x, y = state[3] * c - state[4] * s, state[3] * s + state[4] * c
-    state[:3] += interval * x, interval * y, interval * state[5]
-    move, noise = _motion(x, y, c, s, interval)
-    covariance[:] = move @ before @ move.T + noise
-    innovation = measured - state[:3]
-    innovation[2] = math.remainder(innovation[2], 2.0 * math.pi)
-    variances = np.diag((place, place, angle))
-    inverse = np.linalg.inv(covariance[:3, :3] + variances)
-    if innovation @ inverse @ innovation > MANEUVER:
-        before[3:, :], before[:, 3:] = 0.0, 0.0
-        before[3, 3] = before[4, 4] = MAX_SPEED**2
-        before[5, 5] = MAX_TURNING**2
-        covariance[:] = move @ before @ move.T + noise
-        inverse = np.linalg.inv(covariance[:3, :3] + variances)
-    gain = covariance[:, :3] @ inverse
-    state += gain @ innovation
-    covariance -= gain @ covariance[:3, :]
-
-
-def _motion(x: float, y: float, c: float, s: float, interval: float) -> tuple[Vector, Vector]:
-    """Return how errors of a state move over an interval [s], and the covariance that noise in its middle adds.
-
-    Args:
-        x: velocity of the tail in the middle [m/s].
-        y: the same.
-        c: cosine of the heading's angle in the middle.
-        s: its sine.
-        interval: [s].
-    """
-    move = np.eye(SIZE)
-    move[0, 2:] = -interval * y, interval * c, -interval * s, -0.5 * interval**2 * y
-    move[1, 2:] = interval * x, interval * s, interval * c, 0.5 * interval**2 * x
-    move[2, 5] = interval
-    half = np.zeros((SIZE, 3))  # from the middle on, of the velocities
-    half[:2] = 0.5 * interval * np.array([[c, -s, 0.0], [s, c, 0.0]])
-    half[2, 2] = 0.5 * interval
-    half[3:] = np.eye(3)
-    rates = interval * np.array([ACCELERATION**2, ACCELERATION**2, TURNING**2])
-    return move, (half * rates) @ half.T
 
 
 class ThreadSession:
@@ -275,18 +239,23 @@ class ThreadSession:
         """Forget the thread, as if nothing had come yet; settings and scene stay in force."""
         settings, scene = self.settings, self.scene
         self._predictor = settings.predictor(scene)
+        self._first = math.inf  # stamp of the first pose [s]
+        self._motion = NodeMotion(settings.friction_averaging)
+        self._start_over()
         self._estimator = settings.estimator_session(scene)
         self._last_pose: int | None = None  # stamp of the last pose of the estimate [ns]
         self._late_estimates: list[PredictionResult] = []
         self._measured = False  # whether the camera ever measured the thread that is estimated
+        self._estimate_motion = NodeMotion(settings.friction_averaging)
+        self._motion_before = self._estimate_motion  # the estimate's, before its last pose
+
+    def _start_over(self) -> None:
+        """Let the prediction wait for the first measured thread."""
+        self._predictor.reset()
+        self._last: int | None = None  # stamp of the last pose of the prediction [ns]
         self._seen: tuple[int, Points] | None = None
         self._early: deque[tuple[int, NeedlePose]] = deque(maxlen=MAX_WAITING_POSES)
-        self._last: int | None = None
-        self._first = math.inf  # stamp of the first pose [s]
-        self._needle_motion = NeedleMotionFilter()
-        self._initial_observation = InitialObservation()
-        self._motion, self._estimate_motion = settings.node_motion(), settings.node_motion()
-        self._motion_before = self._estimate_motion  # the estimate's, before its last pose
+        self._needle_motion, self._initial_observation = NeedleMotionFilter(), InitialObservation()
 
     @property
     def thread(self) -> Thread:
@@ -310,18 +279,17 @@ class ThreadSession:
         if settings == self.settings and scene == self.scene:
             return lambda: None
         predictor, estimator = settings.predictor(scene), settings.estimator_session(scene)
-        motion, estimate_motion, motion_before = (settings.node_motion() for _ in range(3))
 
         def put_in_force() -> None:
             predictor.follow_on(self._predictor)
-            motion.follow_on(self._motion)
-            estimate_motion.follow_on(self._estimate_motion)
-            motion_before.follow_on(self._motion_before)
             if estimator is not None and self._estimator is not None:
                 estimator.follow_on(self._estimator)
-            self.settings, self.scene, self._predictor, self._motion = settings, scene, predictor, motion
-            self._estimator, self._estimate_motion = estimator, estimate_motion
-            self._motion_before = motion_before
+            before = self._motion, self._estimate_motion, self._motion_before
+            after = [NodeMotion(settings.friction_averaging) for _ in before]
+            for motion, other in zip(after, before, strict=True):
+                motion.follow_on(other)
+            self._motion, self._estimate_motion, self._motion_before = after
+            self.settings, self.scene, self._predictor, self._estimator = settings, scene, predictor, estimator
             self._measured = self._measured and estimator is not None
 
         return put_in_force
@@ -398,27 +366,25 @@ class ThreadSession:
         """Correct the estimate by an observation; one that comes before the pose of its frame waits for that."""
         if self._estimator is None:
             return
-        found = self._estimator.on_observation(stamp * 1e-9, self.settings.attached_observation(observation))
+        if self.settings.attachment_offset:
+            observation = observation.measured_from(-self.settings.attachment_offset[0])
+        found = self._estimator.on_observation(stamp * 1e-9, observation)
         if found.measured is not None and found.estimate is not None and self._last_pose is not None:
             self._measured = self._measured or math.isfinite(found.estimate.unmeasured_for)
             # As if the observation had come before the last pose.
             self._estimate_motion = copy(self._motion_before)
             self._estimate_motion.update(found.estimate.positions, found.estimate.prediction.interval)
-            changed = {stamp: found.measured, self._last_pose: found.estimate}
-            self._late_estimates += [self._late(at, estimate) for at, estimate in changed.items()]
+            for at, estimate in {stamp: found.measured, self._last_pose: found.estimate}.items():
+                known, speeds = math.isfinite(estimate.unmeasured_for), self._estimate_motion.speeds
+                self._late_estimates.append(
+                    self._result(at, late=True, estimate=estimate if known else None, speeds=speeds)
+                )
         if found.problem is not None and not found.waits:
-            self._late_estimates.append(replace(self._late(stamp, None), estimate_problem=found.problem))
+            self._late_estimates.append(self._result(stamp, late=True, estimate_problem=found.problem))
 
-    def _late(self, stamp: int, estimate: ThreadEstimate | None) -> PredictionResult:
-        measured = estimate is not None and math.isfinite(estimate.unmeasured_for)
-        return PredictionResult(
-            stamp,
-            estimate=estimate if measured else None,
-            late=True,
-            scene_version=self.scene_version,
-            law=self.settings.friction_law(),
-            speeds=self._estimate_motion.speeds,
-        )
+    def _result(self, stamp: int, pose: NeedlePose | None = None, **values: Any) -> PredictionResult:
+        law = self.settings.friction_law()
+        return PredictionResult(stamp, pose, scene_version=self.scene_version, law=law, **values)
 
     def on_pose(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Follow the needle to a pose.
@@ -447,8 +413,7 @@ class ThreadSession:
         self._measured = math.isfinite(found.estimate.unmeasured_for)
         if not self._measured:
             return replace(result, estimate_problem=found.problem)
-        law = self.settings.friction_law()
-        return replace(result, estimate=found.estimate, estimate_problem=found.problem, law=law, speeds=speeds)
+        return replace(result, estimate=found.estimate, estimate_problem=found.problem, speeds=speeds)
 
     def predict(self, stamp: int, pose: NeedlePose) -> PredictionResult:
         """Return what the model alone says of a pose; the first half of `on_pose`.
@@ -456,17 +421,14 @@ class ThreadSession:
         A pose with deviations is filtered by those before, and its velocity is that of the forces.
         """
         if self._last is not None and stamp < self._last - MAX_LATENESS:
-            self._predictor.reset()
-            self._needle_motion.reset()
-            self._last = None
-            self._initial_observation.reset()
-            self._early.clear()
-            if self._seen is not None and self._seen[0] > stamp:
-                self._seen = None  # of the time before it was set back
+            seen = self._seen
+            self._start_over()
+            if seen is not None and seen[0] <= stamp:  # else of the time before it was set back
+                self._seen = seen
         try:
             check_pose(pose, self._predictor.reach)
         except InvalidInputError as error:
-            return PredictionResult(stamp, pose, problem=error, scene_version=self.scene_version)
+            return self._result(stamp, pose, problem=error)
         self._first = self._predictor.added.first_time = min(self._first, pose.stamp)
         return self._follow(stamp, self._needle_motion.update(pose))
 
@@ -480,13 +442,12 @@ class ThreadSession:
                 prediction = self._predictor.start(attached, centreline, strict=False)
             else:
                 self._early.append((stamp, pose))
-                return PredictionResult(stamp, pose, scene_version=self.scene_version)
+                return self._result(stamp, pose)
         except (InvalidInputError, SolverError) as error:
-            return PredictionResult(stamp, pose, problem=error, scene_version=self.scene_version)
+            return self._result(stamp, pose, problem=error)
         self._last = stamp
         speeds = self._motion.update(prediction.positions, prediction.interval)
-        law = self.settings.friction_law()
-        return PredictionResult(stamp, pose, prediction, scene_version=self.scene_version, law=law, speeds=speeds)
+        return self._result(stamp, pose, prediction=prediction, speeds=speeds)
 
     def _initial_shape(self, stamp: int, pose: NeedlePose, attached: NeedlePose) -> Points | None:
         if self.settings.initial_shape == "straight":

@@ -10,20 +10,17 @@ import numpy as np
 
 from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.configuration import Configuration, autostart_parameter, configuration_fields, quantity
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.estimator import EstimatorSession, ThreadEstimator
-from magnetosuture_thread.estimator.estimator import EstimatorSettings
+from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
-from magnetosuture_thread.thread.margins import FrictionLaw, NodeMotion
+from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
 from magnetosuture_thread.thread.solvers import SOLVERS
-from magnetosuture_thread.thread_observation import ThreadObservation
 
-MEDIA = ("liquid", "air")
 OF_MEDIUM = {
     "viscosity": "liquid",
     "wetted_fraction": "liquid",
@@ -44,33 +41,7 @@ FIXED = {  # why a node cannot change it while it is configured
 
 
 @dataclass(frozen=True)
-class ForecastSettings(Configuration):
-    """How far the estimated thread is forecast under the present command, and the needle that is moved."""
-
-    forecast_horizon: float = quantity(
-        0.0,
-        "how far ahead thread/forecast looks from every estimate, the present command held; 0 for none",
-        unit="s",
-        minimum=0.0,
-        maximum=30.0,
-    )
-    forecast_step: float = quantity(0.03, "duration of its steps", unit="s", minimum=0.001, maximum=0.5)
-    forecast_period: float = quantity(
-        0.0,
-        "time between estimates that are forecast; 0 for every estimate, as far as there is time",
-        unit="s",
-        minimum=0.0,
-        maximum=10.0,
-    )
-    friction_feedback: str = shared_parameter("friction_feedback")
-    keep_out: float = shared_parameter("keep_out")
-    pose_margin: float = shared_parameter("pose_margin")
-    needle_length: float = shared_parameter("needle_length")
-    needle_curvature: float = shared_parameter("needle_curvature")
-
-
-@dataclass(frozen=True)
-class ThreadModelSettings(EstimatorSettings, ForecastSettings):
+class ThreadModelSettings(Configuration):
     """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
 
     GROUP: ClassVar[str] = "thread_model"
@@ -83,134 +54,119 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
     solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
     barriers: tuple[str, ...] = quantity((), "barriers of your own, each as module:class; see Barrier")
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
-    diameter: float = quantity(0.0, "of the thread; 0 takes the material's", unit="m", minimum=0.0, maximum=0.01)
+    diameter: float = quantity(0.0, "of the thread; 0 takes the material's", "m", 0.0, 0.01)
     elastic_modulus: float = quantity(
-        0.0, "effective modulus of the thread in bending; 0 takes the material's", unit="Pa", minimum=0.0, maximum=1e12
+        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, 1e12
     )
     thread_length: float = shared_parameter("thread_length")
-    segments: int = quantity(25, "number of segments, n", minimum=3, maximum=2000)
+    segments: int = quantity(25, "number of segments, n", "", 3, 2000)
     attachment: str = quantity(
         Attachment.PINNED.value,
-        "how the thread is fixed to the needle: pinned turns freely, clamped leaves along the needle's axis; for rod",
+        "how the needle holds the thread: pinned turns freely, clamped leaves along its axis; for rod",
         choices=tuple(kind.value for kind in Attachment),
     )
     rest_curvature: float = quantity(
         0.0,
-        "curvature that the thread keeps in memory, positive to the left, seen from the needle along it",
-        unit="1/m",
-        minimum=-2000.0,
-        maximum=2000.0,
+        "curvature of the unloaded thread, positive to the left, seen from the needle along it",
+        "1/m",
+        -2000.0,
+        2000.0,
     )
     fixed_nodes: tuple[int, ...] = quantity(
-        (), "nodes that stay where they are, as where tissue holds the thread", minimum=1, maximum=2000
+        (), "nodes that stay where they are, as where tissue holds the thread", "", 1, 2000
     )
     medium: str = quantity(
-        "liquid",
-        "what the thread moves in: liquid drags it, in air its inertia and weight count; for rod",
-        choices=MEDIA,
+        "liquid", "liquid drags the thread, in air its inertia and weight count; for rod", choices=("liquid", "air")
     )
     viscosity: float = shared_parameter("viscosity")
     wetted_fraction: float = quantity(
-        0.5, "part of the thread's surface in the liquid; half for a floating thread", minimum=0.05, maximum=1.0
+        0.5, "part of the thread's surface in the liquid; half for a floating thread", "", 0.05, 1.0
     )
     drag_anisotropy: float = quantity(
-        0.5,
-        "drag of the liquid along the thread over that across it; half for a slender body",
-        minimum=0.05,
-        maximum=1.0,
+        0.5, "drag of the liquid along the thread over that across it; half for a slender body", "", 0.05, 1.0
     )
     attachment_offset: tuple[float, ...] = quantity(
         (),
-        "where the thread is fixed, seen from the tracked tail: along the needle's heading, and to its left",
-        unit="m",
-        minimum=-0.01,
-        maximum=0.01,
+        "where the thread is fixed, from the tracked tail: along the heading, and to its left",
+        "m",
+        -0.01,
+        0.01,
         multiple=2,
     )
     paper_damping: float = quantity(
-        0.95, "kappa, part of its velocity that a node keeps from step to step; for paper", minimum=0.0, maximum=0.999
+        0.95, "kappa, part of its velocity that a node keeps from step to step; for paper", "", 0.0, 0.999
     )
-    paper_stiffness_weight: float = quantity(
-        0.0, "W_stiff; 0 takes the material's; for paper", minimum=0.0, maximum=1e12
-    )
-    mass_per_length: float = quantity(
-        4e-6, "mass of the thread in air per length", unit="kg/m", minimum=1e-9, maximum=10.0
-    )
-    air_drag: float = quantity(
-        1e-4, "drag of the thread in air per length and speed", unit="Pa s", minimum=0.0, maximum=10.0
-    )
+    paper_stiffness_weight: float = quantity(0.0, "W_stiff; 0 takes the material's; for paper", "", 0.0, 1e12)
+    mass_per_length: float = quantity(4e-6, "mass of the thread in air per length", "kg/m", 1e-9, 10.0)
+    air_drag: float = quantity(1e-4, "drag of the thread in air per length and speed", "Pa s", 0.0, 10.0)
     bending_damping: float = quantity(
-        0.0,
-        "time in which bending in air is damped: its moment over its stiffness and rate",
-        unit="s",
-        minimum=0.0,
-        maximum=10.0,
+        0.0, "time in which bending in air is damped: its moment over its stiffness and rate", "s", 0.0, 10.0
     )
     gravity: tuple[float, ...] = quantity(
-        (),
-        "weight in the plane of the camera, for a thread in air: x, y",
-        unit="m/s^2",
-        minimum=-20.0,
-        maximum=20.0,
-        multiple=2,
+        (), "weight in the plane of the camera, for a thread in air: x, y", "m/s^2", -20.0, 20.0, multiple=2
     )
     flow: tuple[float, ...] = quantity(
         (),
-        "velocity of the liquid or air in the plane of the camera, the same everywhere: x, y; for rod",
-        unit="m/s",
-        minimum=-0.1,
-        maximum=0.1,
+        "velocity of the liquid or air in the camera's plane, the same everywhere; for rod",
+        "m/s",
+        -0.1,
+        0.1,
         multiple=2,
     )
     initial_shape: str = quantity(
         "measured",
-        "where the thread starts: as the camera first measures it, or straight behind the needle",
+        "where the thread starts: as first measured, or straight behind the needle",
         choices=("measured", "straight"),
     )
     max_step: float = quantity(
-        0.02,
-        "intervals between poses are divided into steps of at most this; at 60 Hz and faster each is one step",
-        unit="s",
-        minimum=1e-4,
-        maximum=0.1,
+        0.02, "longest step; a longer interval between poses is divided into steps", "s", 1e-4, 0.1
     )
     margin_range: float = quantity(
-        5e-3,
-        "margins are published of nodes that are closer to an obstacle or the wall than this",
-        unit="m",
-        minimum=1e-4,
-        maximum=1.0,
+        5e-3, "margins are published of nodes that are closer to an obstacle or the wall than this", "m", 1e-4, 1.0
     )
-    contact_tolerance: float = quantity(
-        2e-6, "a node this close to an obstacle or the wall touches it", unit="m", minimum=0.0, maximum=1e-3
-    )
+    contact_tolerance: float = quantity(2e-6, "a node this close to an obstacle or the wall touches it", "m", 0.0, 1e-3)
     residual_tolerance: float = quantity(
-        1e-6, "largest scaled residual with which a solution is accepted", minimum=1e-12, maximum=1e-2
+        1e-6, "largest scaled residual with which a solution is accepted", "", 1e-12, 1e-2
     )
-
-    friction_threshold: float = quantity(
-        5e-4, "a node this close to two obstacles is under friction", unit="m", minimum=0.0, maximum=0.1
-    )
+    friction_threshold: float = quantity(5e-4, "a node this close to two obstacles is under friction", "m", 0.0, 0.1)
     friction_slowdown: float = quantity(
-        0.9, "beta: each node under friction slows the needle by this factor", minimum=0.01, maximum=1.0
+        0.9, "beta: each node under friction slows the needle by this factor", "", 0.01, 1.0
     )
     stuck_speed: float = quantity(
-        2e-4,
-        "a thread under friction whose nodes there are not faster rests, and slows nothing",
-        unit="m/s",
-        minimum=0.0,
-        maximum=1.0,
+        2e-4, "a thread under friction whose nodes there are not faster rests, and slows nothing", "m/s", 0.0, 1.0
     )
     friction_averaging: float = quantity(
-        0.2,
-        "time over which the nodes' velocities are averaged for that, as tracked poses tremble",
-        unit="s",
-        minimum=0.0,
-        maximum=10.0,
+        0.2, "time over which the nodes' velocities are averaged for that, as tracked poses tremble", "s", 0.0, 10.0
     )
     friction_by_bound: bool = quantity(
         False, "whether the 99 % bound of an estimated clearance counts for friction, in place of the clearance"
     )
+    estimator: bool = quantity(
+        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
+    )
+    estimator_path_deviation: float = quantity(
+        2e-5, "deviation of points of thread/measured, used where nobody publishes thread/observation", "m", 1e-7, 0.01
+    )
+    estimator_history: float = quantity(
+        EstimatorOptions.history, "how late an observation of the thread may come", "s", 0.05, 5.0
+    )
+    estimator_slow_parameters: tuple[str, ...] = quantity(
+        EstimatorOptions.slow_parameters,
+        "what the estimator learns: stiffness_over_drag, nothing, or auto: that, once the model is found wrong",
+        choices=(AUTOMATIC, STIFFNESS_OVER_DRAG),
+    )
+    forecast_horizon: float = quantity(
+        0.0, "how far ahead thread/forecast looks, the present command held; 0 for none", "s", 0.0, 30.0
+    )
+    forecast_step: float = quantity(0.03, "duration of its steps", "s", 0.001, 0.5)
+    forecast_period: float = quantity(
+        0.0, "time between estimates that are forecast; 0 for every one, as time allows", "s", 0.0, 10.0
+    )
+    friction_feedback: str = shared_parameter("friction_feedback")
+    keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
 
     def check(self) -> None:
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
@@ -220,19 +176,14 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
         if self.thread_length / segments <= diameter:
             most = math.ceil(self.thread_length / diameter) - 1
             raise self.refused("segments", f"at most {most}, so that a segment is longer than thick")
-        for name, pair, words in (
-            ("attachment_offset", self.attachment_offset, "along and to the left"),
-            ("gravity", self.gravity, "x and y"),
-            ("flow", self.flow, "x and y"),
-        ):
-            if len(pair) not in (0, 2):
-                raise ConfigurationError(f"{self.GROUP}.{name}", list(pair), f"two numbers, {words}, or none")
+        pairs = {"attachment_offset": "along and to the left", "gravity": "x and y", "flow": "x and y"}
+        for name, words in pairs.items():
+            if len(getattr(self, name)) > 2:
+                raise self.refused(name, f"two numbers, {words}, or none")
         if self.formulation == "paper" and self.medium != "liquid":
             raise self.refused("medium", "liquid, as the formulation paper has no inertia")
         if self.formulation == "paper" and self.flow:
-            raise ConfigurationError(
-                f"{self.GROUP}.flow", list(self.flow), "none, as the formulation paper has no drag"
-            )
+            raise self.refused("flow", "none, as the formulation paper has no drag")
         if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
             limit = MAX_REST_ANGLE * segments / self.thread_length
             words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
@@ -244,10 +195,10 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
                 raise self.refused(about.name, words)
         if 0.0 < self.forecast_horizon < self.forecast_step:
             raise self.refused("forecast_horizon", f"0, or at least forecast_step, {self.forecast_step:g} s")
-        for node in self.fixed_nodes:
-            if node > segments:
-                raise ConfigurationError(f"{self.GROUP}.fixed_nodes", node, f"nodes from 1 to {segments}")
-        self.estimator_options()
+        if max(self.fixed_nodes, default=0) > segments:
+            raise self.refused("fixed_nodes", f"nodes from 1 to {segments}")
+        if len(self.estimator_slow_parameters) > 1:
+            raise self.refused("estimator_slow_parameters", "one name, or none")
 
     def _material(self) -> Material:
         material = MATERIALS[self.material]
@@ -284,10 +235,6 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
         if motion is not None:
             motion = motion._replace(velocity=motion.velocity + motion.turning * np.array([-lever[1], lever[0]]))
         return replace(pose, tail=pose.tail + lever, motion=motion)
-
-    def attached_observation(self, observation: ThreadObservation) -> ThreadObservation:
-        """Return an observation whose arc lengths are measured from where the thread is fixed."""
-        return observation.measured_from(-self.attachment_offset[0]) if self.attachment_offset else observation
 
     def predictor(self, scene: Scene | None) -> ThreadPredictor:
         """Return a predictor of this thread in a scene, its kernels compiled.
@@ -336,17 +283,13 @@ class ThreadModelSettings(EstimatorSettings, ForecastSettings):
         """
         if not self.is_estimated:
             return None
-        options = self.estimator_options()
+        options = EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
         ThreadEstimator(self._predictor(scene and Scene(scene.dish)), options).warm_up()
         return EstimatorSession(ThreadEstimator(self._predictor(scene), options))
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""
         return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed, self.friction_by_bound)
-
-    def node_motion(self) -> NodeMotion:
-        """Return what follows the nodes' velocities."""
-        return NodeMotion(self.friction_averaging)
 
 
 def parse_material(message: Any) -> dict[str, Any]:

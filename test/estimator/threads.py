@@ -20,10 +20,11 @@ RATE = 30.0
 DEVIATION = 2e-5
 
 
-def thread_of(segments: int = 25, material: str = "silk_6_0", viscosity: float = 1.0) -> Thread:
-    return Thread.of(
-        MATERIALS[material], length=LENGTH, segments=segments, attachment=Attachment.PINNED, viscosity=viscosity
-    )
+def thread_of(
+    segments: int = 25, material: str = "silk_6_0", viscosity: float = 1.0, attachment: str = "pinned"
+) -> Thread:
+    kind = Attachment(attachment)
+    return Thread.of(MATERIALS[material], length=LENGTH, segments=segments, attachment=kind, viscosity=viscosity)
 
 
 def predictor_of(thread: Thread, discs: tuple[Disc, ...] = (), wall: float = math.inf) -> ThreadPredictor:
@@ -54,13 +55,7 @@ def true_shapes(thread: Thread, way: list[NeedlePose], discs: tuple[Disc, ...] =
 
 
 def piece_of(
-    nodes: Points,
-    seed: int,
-    begin: float = 0.0,
-    end: float = LENGTH,
-    deviation: float = DEVIATION,
-    *,
-    arc_length: tuple[float, float] | None = None,
+    nodes: Points, seed: int, begin: float = 0.0, end: float = LENGTH, deviation: float = DEVIATION
 ) -> ThreadPiece:
     """Return a noisy piece of a thread between two arc lengths, by default all of it."""
     rng = np.random.default_rng(seed)
@@ -74,7 +69,7 @@ def piece_of(
         np.full(len(points), deviation),
         PieceEnd.TAIL if begin == 0.0 else PieceEnd.COVERED,
         PieceEnd.FREE if end >= LENGTH else PieceEnd.COVERED,
-        (begin, begin) if arc_length is None else arc_length,
+        (begin, begin),
     )
 
 

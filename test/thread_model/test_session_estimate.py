@@ -107,26 +107,10 @@ def test_late_observations_take_the_place_of_the_estimates_there_were():
             results = [each for each in show(late, k - 6) if each.late]
             assert results[0].stamp == given
             found |= {each.stamp: estimated(each) for each in results}
+    np.testing.assert_allclose(results[-1].speeds, expected[-1].speeds, rtol=0.05)
     for each in expected:
         np.testing.assert_array_equal(found[each.stamp].positions, estimated(each).positions)
         np.testing.assert_array_equal(found[each.stamp].covariance, estimated(each).covariance)
-
-
-def test_friction_is_that_of_observations_in_time():
-    post = (Disc((-0.004, 0.0016), 1e-3), Disc((-0.004, -0.0016), 1e-3))
-    results = []
-    for late in (False, True):
-        session = ThreadSession(made(friction_threshold=1.2e-3), scene_with(*post))
-        for k in range(20):
-            if not late:
-                show(session, k)
-            result = session.on_pose(stamp_of(WAY[k]), at(WAY[k]))
-            if late:
-                result = show(session, k)[-1]
-        assert result.margins is not None
-        assert result.margins.friction.nodes
-        results.append((result.margins.friction, result.speeds.tolist()))
-    assert results[0] == results[1]
 
 
 def test_observations_that_cannot_be_used_leave_the_estimate_with_a_reason():
@@ -162,9 +146,8 @@ def test_other_settings_keep_the_estimate(values: dict[str, Any]):
     # What is late then is refused, and what comes later is taken.
     (late,) = show(session, 28)
     assert late.estimate_problem is not None
-    assert (
-        error_percent(estimated(follow(session, 31, 45)[-1]).positions[-1:], NODES[-1, -1:]) < 0.8
-    )  # the longer thread is 0.5 % longer
+    # The longer thread is 0.5 % longer.
+    assert error_percent(estimated(follow(session, 31, 45)[-1]).positions[-1:], NODES[-1, -1:]) < 0.8
 
 
 def test_what_is_learned_of_the_thread_is_kept_in_another_scene_and_not_of_another_thread():
