@@ -263,8 +263,8 @@ def test_a_remap_that_cannot_be_is_refused(tmp_path: Path):
             {"/camera/rbg": "/x"},
             r"has no topic /camera/rbg to remap; did you mean /camera/rgb\?; its topics: /camera/rgb",
         ),
-        ({"/other": "/needle"}, "has /needle itself; /other cannot be remapped to it"),
-        ({"/other": "/x", "/needle": "/x"}, "cannot both be remapped to /x"),
+        ({"/other": "/needle"}, "/needle and /other cannot both be /needle"),
+        ({"/other": "/x", "/needle": "/x"}, "/needle and /other cannot both be /x"),
     ):
         with pytest.raises(BagError, match=words):
             Bag(tmp_path / "bag", remap=remap)

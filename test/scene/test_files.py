@@ -64,8 +64,8 @@ BAD = [
     (f"{DISH}obstacles: []", "obstacles: got [], expected dish and shapes, nothing else"),
     ("dish: 0.035", "dish: got 0.035, expected diameter and depth [m]"),
     ("dish: {depth: 0.003}", "dish: got {'depth': 0.003}, expected diameter and depth [m]"),
-    ("dish: {diameter: 35}", "dish.diameter: got 35.0, expected a number from 0.005 to 0.5 m"),
-    ("dish: {diameter: 35 mm}", "dish.diameter: got '35 mm', expected a number [m]"),
+    ("dish: {diameter: 35}", "dish.diameter: got 35, expected a number from 0.005 to 0.5 m; given in metres?"),
+    ("dish: {diameter: 35 mm}", "dish.diameter: got '35 mm', expected a number from"),
     ("dish: {diameter: .nan}", "dish.diameter: got nan, expected a number"),
     ("dish: {diameter: 0.035, self_contact: 1}", "dish.self_contact: got 1, expected true or false or nothing"),
     ("dish: {diameter: 0.035, radius: 0.01}", "dish.radius: got 0.01, expected one of diameter, depth"),
@@ -74,17 +74,16 @@ BAD = [
     (f"{DISH}shapes: {{post: 3}}", "post: got 3, expected a shape, one of disc"),
     (
         f"{DISH}shapes: {{post: {{disc: {{center: [0, 0], raduis: 0.1}}}}}}",
-        "post.disc.radius: got None, expected a value",
+        "post.disc.raduis: got 0.1, expected one of center, radius (did you mean radius?)",
     ),
-    (f"{DISH}shapes: {{1: {{}}}}", "scene file: got 'the name 1 that is no text in line 2', expected valid YAML"),
+    (f"{DISH}shapes: {{1: {{}}}}", "shapes: got 1, expected names of 1 to 64"),
     (f"{DISH}shapes: {{a: 1, a: 2}}", "scene file: got 'a is given twice in line 2', expected valid YAML"),
     (f"{DISH}{DISH}", "scene file: got 'dish is given twice in line 2', expected valid YAML"),
     (f"{DISH}shapes: {{a", "scene file: got \"did not find expected ',' or '}' in line"),
     ("dish: \x07", "scene file: got '"),
     ("a: &a [*a]", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
-    ("dish: !!python/object/apply:os.system [ls]", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
+    ("dish: !!python/object/apply:os.system [ls]", 'scene file: got "could not determine a constructor'),
     ("[" * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
-    ("dish: " + "9" * 2000, "scene file: got 'a word of 2000 characters in line 1'"),
     (f"{DISH}---\n{DISH}", "scene file: got 'but found another document in line 2', expected valid YAML"),
 ]
 
@@ -115,9 +114,7 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
     large.write_text(DISH + "#" * (MAX_TEXT_BYTES - len(DISH)))
     assert read_scene(str(large)).shapes == ()
     large.write_text(DISH + "#" * (MAX_TEXT_BYTES - len(DISH) + 1))
-    with pytest.raises(
-        ConfigurationError, match="scene file: got 'a larger file', expected a regular file of at most 1000 kB"
-    ):
+    with pytest.raises(ConfigurationError, match="scene file: got 'a larger file', expected a readable YAML file"):
         read_scene(str(large))
     large.unlink()
     os.truncate(os.open(large, os.O_CREAT | os.O_WRONLY), 10**12)  # a terabyte with nothing in it

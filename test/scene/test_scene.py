@@ -56,7 +56,7 @@ def test_shapes_are_added_at_the_end_replaced_in_their_place_and_removed():
     assert more.remove("extra") == SCENE
     assert SCENE.names == ("post", "block")
     for change in (lambda: SCENE.remove("none"), lambda: SCENE.replace(extra), lambda: SCENE.remove("x" * 10_000)):
-        with pytest.raises(ConfigurationError, match=r"^shape\.name: got '[\w.]{1,80}', expected one of post, block$"):
+        with pytest.raises(ConfigurationError, match=r"^shape\.name: got '[\w…']{1,100}, expected one of post, block$"):
             change()
     with pytest.raises(ConfigurationError, match=r"^post: got 'a name given twice'"):
         SCENE.add(POST)
