@@ -248,7 +248,8 @@ class _RosLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten time
             if isinstance(key, yaml.ScalarNode) and key.value in keys:
                 raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
             keys.add(key.value if isinstance(key, yaml.ScalarNode) else None)
-        return super().construct_mapping(node, deep)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
 
 
 def use_ros_numbers(loader: type[Any], *, decimal_integers: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Reads bags: verifies the whole bag as it is opened, then yields its messages by time."""
+"""Reads bags, in mcap or sqlite3: verifies the whole bag as it is opened, then yields its messages by time."""
 
 from __future__ import annotations
 
@@ -256,7 +256,7 @@ class Bag:
     """A recorded bag: mcap or sqlite3, one file or several, whole or damaged.
 
     All checksums are verified as it is opened, so that damage is known before any message is used. Intact data is read;
-    data that may be wrong never is (see `bags/mcap/file.py` for the rule). Of a bag by URL, only what is read is
+    data that may be wrong never is (see `bags/mcap.py` for the rule). Of a bag by URL, only what is read is
     fetched and verified, and reading ends with an error where it is damaged.
 
     Args:

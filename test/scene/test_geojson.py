@@ -113,27 +113,19 @@ def test_a_definition_counts_until_the_geometry_is_moved():
         assert not set(after.definition) - {"disc", "polygon", "corner_radius"}
 
 
+POINT = {"type": "Point", "coordinates": [0, 0]}
 BAD: list[tuple[Any, str]] = [
-    ([], "type: got [], expected FeatureCollection"),
     (feature(polygon(SQUARE), name="a"), "type: got 'Feature', expected FeatureCollection"),
     ({"type": "FeatureCollection", "dish": DISH}, "features: got None, expected a list of at most 200 features"),
     (collection(*[{}] * 202), "features: got '202 features', expected a list of at most 200"),
     (collection({"type": "Feature", "properties": None}), "features[0]: got {'type': 'Feature', 'prop"),
     (collection(feature(polygon(SQUARE))), "features[0].properties.name: got None, expected a name"),
     (collection(feature(None, name="a")), "features[0].geometry: got None, expected a Point"),
-    (
-        collection(feature({"type": "LineString"}, name="a")),
-        "features[0].geometry: got {'type': 'LineString'}, expected a Point",
-    ),
-    (collection(feature({"type": "Polygon"}, name="a")), "features[0].geometry: got {'type': 'Polygon'}, expected a P"),
+    (collection(feature({"type": "LineString"}, name="a")), "features[0].geometry: got {'type': 'LineString'}, "),
     (collection(feature(polygon(), name="a")), "features[0].geometry: got {"),
     (collection(feature({"type": "MultiPolygon", "coordinates": []}, name="a")), "features[0].geometry: got {"),
-    (collection(feature(polygon(SQUARE[:2]), name="a")), "features[0].geometry: got {"),
     (collection(feature(polygon("abc"), name="a")), "features[0].geometry: got {"),
-    (
-        collection(feature(polygon([[10.2, 47.1]] * 4), name="a")),
-        "a.polygon.outline[0]: got [10.2, 47.1], expected two",
-    ),
+    (collection(feature(polygon([[10.2, 47.1]] * 4), name="a")), "a.polygon.outline[0]: got [10.2, 47.1], expected"),
     (collection(feature(polygon(SQUARE), name="a", kind="bone")), "a.kind: got 'bone', expected one of tissue"),
     (
         collection(feature(polygon(SQUARE), name="a", corner_radus=1)),
@@ -141,59 +133,32 @@ BAD: list[tuple[Any, str]] = [
     ),
     (collection(feature(polygon(SQUARE), name="a", corner_radius="1")), "a.corner_radius: got '1', expected a number"),
     (collection(feature(polygon(SQUARE), name="a", definition=3)), "a.properties.definition: got 3, expected a shape"),
-    (collection(feature(polygon(SQUARE), name="a", definition={"x": 3})), "a: got 'x', expected kind, corner_radius"),
-    (
-        collection(feature({"type": "Point", "coordinates": [0, 0]}, name="a")),
-        "a.disc.radius: got None, expected a numb",
-    ),
-    (
-        collection(feature({"type": "Point", "coordinates": 3}, name="a", radius=1)),
-        "features[0].geometry: got {'type': 'Point', 'coordinates': 3}, expected a Point",
-    ),
-    (
-        collection(dish={"diameter": 50}),
-        "dish.diameter: got 50, expected a number from 0.005 to 0.5 m; given in metres?",
-    ),
+    (collection(feature(POINT, name="a")), "a.disc.radius: got None, expected a numb"),
+    (collection(dish={"diameter": 50}), "dish.diameter: got 50, expected a number from 0.005 to 0.5 m; given in"),
+    (collection(dish={"diameter": math.nan}), "dish.diameter: got nan"),
     (collection(dish=None), "dish: got None, expected diameter and depth"),
     ({"type": "FeatureCollection", "features": []}, "dish: got 'no dish', expected one: the member dish"),
-    (collection(feature({"type": "Point", "coordinates": [0, 0]}, kind="dish", diameter=0.05)), "dish: got '2 dishes'"),
+    (collection(feature(POINT, kind="dish", diameter=0.05)), "dish: got '2 dishes'"),
     (collection(feature(polygon(SQUARE), kind="dish")), "dish.geometry: got 'POLYGON ((0 0, 0.01"),
-    (
-        collection(feature({"type": "Point", "coordinates": [0, 0]}, kind="dish", radius=0.05)),
-        "dish.properties.radius: got 0.05, expected diameter",
-    ),
+    (collection(feature(POINT, kind="dish", radius=0.05)), "dish.properties.radius: got 0.05, expected diameter"),
     (collection(feature(polygon(SQUARE), name="a"), feature(polygon(SQUARE), name="a")), "a: got 'a name given twice'"),
+]
+NO_JSON = [
+    ("", "scene file: got 'Expecting value: line 1 column 1 (char 0)', expected valid JSON"),
+    ("9" * 5000, "scene file: got 'Exceeds the limit"),
+    ("[" * 100_000, "scene file: got 'maximum recursion depth exceeded"),
+    ('{"type": "FeatureCollection", "features": ' + "[" * 500 + "]" * 500 + "}", "features[0]: got [[[["),
 ]
 
 
-@pytest.mark.parametrize(("content", "words"), BAD, ids=lambda value: value if isinstance(value, str) else "")
-def test_bad_geojson_is_refused_in_one_line_that_names_file_feature_and_field(tmp_path: Path, content: Any, words: str):
+@pytest.mark.parametrize(
+    ("text", "words"), [*((json.dumps(content), words) for content, words in BAD), *NO_JSON], ids=lambda text: text[:40]
+)
+def test_bad_geojson_is_refused_in_one_line_that_names_file_feature_and_field(tmp_path: Path, text: str, words: str):
     path = tmp_path / "bad.geojson"
-    path.write_text(json.dumps(content))
+    path.write_text(text)
     with pytest.raises(ConfigurationError) as caught:
         read_scene(str(path))
     assert str(caught.value).startswith(f"{path}: {words}")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500 + len(str(path))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "scene file: got 'Expecting value: line 1 column 1 (char 0)', expected valid JSON"),
-        ("9" * 5000, "scene file: got 'Exceeds the limit"),
-        ("[" * 100_000, "scene file: got 'maximum recursion depth exceeded"),
-        ('{"type": "FeatureCollection", "dish": {"diameter": NaN}, "features": []}', "dish.diameter: got nan"),
-        (
-            '{"type": "FeatureCollection", "features": ' + "[" * 500 + "]" * 500 + "}",
-            "features[0]: got [[[[",
-        ),
-    ],
-    ids=lambda value: value[:40],
-)
-def test_what_is_no_json_is_refused(tmp_path: Path, text: str, words: str):
-    path = tmp_path / "bad.json"
-    path.write_text(text)
-    with pytest.raises(ConfigurationError) as caught:
-        read_scene(str(path))
-    assert str(caught.value).startswith(f"{path}: {words}")
