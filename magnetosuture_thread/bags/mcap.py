@@ -397,6 +397,7 @@ class ScanResult:
         stopped: where the scan ended.
         data_crc: checksum of the data section as stored; 0 if there is none.
         data_verified: whether it is correct.
+        index: messages by channel, where the file was not scanned, but only its index read.
     """
 
     blocks: list[Block] = field(default_factory=list)
@@ -412,6 +413,7 @@ class ScanResult:
     stopped: int = 0
     data_crc: int = 0
     data_verified: bool = False
+    index: Counter[int] | None = None
 
 
 class Scanner:
@@ -633,7 +635,6 @@ class McapFile:
                     raise BagError(path, "is empty, expected an mcap file")
                 summary = read_summary(stream, size, budget)
                 scan = read_index(stream, summary, budget) if is_url(path) and summary is not None else None
-                is_indexed = scan is not None
                 if scan is None:
                     limit = summary.start if summary is not None else size
                     scan = Scanner(path.name, stream, limit, budget, progress).scan()
@@ -644,9 +645,8 @@ class McapFile:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from error
         except BudgetError as error:
             raise BagError(path, str(error)) from None
-        if is_indexed and summary is not None and summary.statistics is not None:
-            blocks, self.connections = scan.blocks, connections_of(summary.definitions)
-            counts = Counter(summary.statistics.channel_message_counts)
+        if scan.index is not None:
+            blocks, counts, self.connections = scan.blocks, scan.index, connections_of(scan.checked)
         else:
             blocks = self._salvage(scan, summary, size)
             counts = count_messages(blocks)
@@ -665,7 +665,8 @@ class McapFile:
         self.end = max((block.end for block in self._blocks), default=0)
         checked = sum(block.has_checksum for block in self._blocks)
         chunks = sum(block.is_chunk for block in self._blocks)
-        data = ", verified as they are read" if is_indexed else "; of all data too" if scan.data_verified else ""
+        data = "; of all data too" if scan.data_verified else ""
+        data = ", verified as they are read" if scan.index is not None else data
         self.facts = {
             "format": "mcap",
             "bytes": str(size),
@@ -886,18 +887,15 @@ def read_index(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> 
         return None
     if statistics is None or statistics.chunk_count != len(chunks):
         return None
-    counts = statistics.channel_message_counts
-    if (
-        sum(counts.values()) != statistics.message_count
-        or not counts.keys() <= connections_of(summary.definitions).keys()
-    ):
+    counts = Counter(statistics.channel_message_counts)
+    if counts.total() != statistics.message_count or counts.keys() - connections_of(summary.definitions).keys():
         return None
     stream.seek(0)
     magic = stream.read(len(MAGIC))
     stream.seek(chunks[0].offset)
     if magic != MAGIC or not any(stream.read(_CHUNK_CRC.stop)[_CHUNK_CRC]):
         return None
-    scan = ScanResult(blocks=chunks, ended=True, attachments=statistics.attachment_count)
+    scan = ScanResult(chunks, summary.definitions, attachments=statistics.attachment_count, index=counts)
     try:
         for offset, length in summary.metadata:
             stream.seek(offset + RECORD_HEADER.size)

@@ -12,7 +12,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
@@ -381,13 +381,12 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
     return pack("header float64[7] float64[36]", stamp, pose, both @ covariance @ both.T)
 
 
-def _moved(poses: ArrayLike, matrix: Matrix | None) -> Matrix:
+def _moved(poses: list[list[float]], matrix: Matrix | None) -> Matrix:
     """Return poses, shape (n, 7), in another frame; quaternions keep their length, which whoever takes them judges."""
-    poses = np.array(poses, dtype=float).reshape(-1, 7)
-    if matrix is None or not len(poses):
-        return poses
-    poses[:, :3] = poses[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
-    turns = _rotations(poses[:, 3:])
-    turned = type(turns).from_matrix(matrix[:3, :3]) * turns
-    poses[:, 3:] = turned.as_quat() * np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    return poses
+    moved = np.array(poses, dtype=float).reshape(-1, 7)
+    if matrix is not None and poses:
+        moved[:, :3] = moved[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
+        turns = _rotations(moved[:, 3:])
+        turned = type(turns).from_matrix(matrix[:3, :3]) * turns
+        moved[:, 3:] = turned.as_quat() * np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
+    return moved
