@@ -252,23 +252,14 @@ class _RosLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten time
         return mapping
 
 
-def use_ros_numbers(loader: type[Any], *, decimal_integers: bool = False) -> None:
-    """Make a YAML loader read numbers as ROS does: 1e-5 is a number, and nothing is a date.
-
-    Args:
-        loader: a class of the package `yaml`, changed in place.
-        decimal_integers: whether only decimal integers are numbers; else octal, hexadecimal and others are too.
-    """
-    dropped = (":float", ":timestamp", ":int") if decimal_integers else (":float", ":timestamp")
+def use_ros_numbers(loader: type[Any]) -> None:
+    """Make a YAML loader, a class, read numbers as ROS does: 1e-5 is a number, and nothing is a date."""
     loader.yaml_implicit_resolvers = {
-        first: [(tag, pattern) for tag, pattern in entries if not tag.endswith(dropped)]
+        first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
         for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
-    signs = list("-+0123456789")
-    if decimal_integers:
-        loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), signs)
     number = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
-    loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), [*signs, "."])
+    loader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(number), list("-+0123456789."))
 
 
 use_ros_numbers(_RosLoader)
