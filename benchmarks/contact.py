@@ -3,7 +3,7 @@
 The thread model first steers its needle, a point, as `magnetosuture reproduce hernia` does. Then the rig's rod, of
 springs and with many more segments, is driven along the same way, and the model, with several n, is compared with it.
 The same with friction, of the rig's own code and the model's; then the pull on the needle where closed loops move it;
-friction alone: capstans, a thread that is held, and the time of a step. Last, random motions in which the thread may
+friction alone: capstans of flexible and of stiff threads. Last, random motions in which the thread may
 not pass through itself.
 """
 
@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from benchmarks.closed_loop import closed_loop_table, measure_closed_loop, nodes_table
-from benchmarks.friction import friction_table, measure_friction
+from benchmarks.closed_loop import closed_loop_table, measure_closed_loop
+from benchmarks.friction import friction_tables, measure_friction
+from benchmarks.report import figures_table
 from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
@@ -73,30 +73,25 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     rough = _with_friction(setup, FRICTION)
     truth, pulls = _simulate(rough, poses)
     rows += [_compared(rough, poses, truth, pulls, segments) for segments in options.segments]
-    table = Table(title=f"hernia_ring, simulated, {poses[-1].stamp:.0f} s; errors in % of the length, mean (maximum)")
-    for name in (
-        "n",
-        "friction",
-        "error",
-        "deepest [µm]",
-        "pull on the needle [% of its peak, RMS]",
-        "not converged",
-        f"step [µs]: free, 1 to {CROWDED - 1}, {CROWDED} or more nodes pushed",
-    ):
-        table.add_column(name, justify="right")
-    for row in rows:
-        error = f"{row['error_mean_percent']:.3f} ({row['error_max_percent']:.2f})"
-        figures = f"{1e6 * row['deepest_m']:.1f}", f"{row['pull_error_percent']:.1f}", str(row["not_converged"])
-        times = ", ".join(f"{each:.0f}" for each in row["median_step_us"])
-        table.add_row(str(row["segments"]), f"{row['friction']:g}", error, *figures, times)
-    console.print(table)
+    title = f"hernia_ring, simulated, {poses[-1].stamp:.0f} s; errors in % of the length, mean (maximum)"
+    columns = {
+        "n": "{segments}",
+        "friction": "{friction:g}",
+        "error": "{error_mean_percent:.3f} ({error_max_percent:.2f})",
+        "deepest [m]": "{deepest_m:.1e}",
+        "pull on the needle [% of its peak, RMS]": "{pull_error_percent:.1f}",
+        "not converged": "{not_converged}",
+        "step [µs]: free": "{median_step_us[0]:.0f}",
+        f"1 to {CROWDED - 1} nodes pushed": "{median_step_us[1]:.0f}",
+        f"{CROWDED} or more": "{median_step_us[2]:.0f}",
+    }
+    console.print(figures_table(title, rows, columns))
     log("the loop closed: the needle moves by the coils, and the poses are noisy")
     loops = measure_closed_loop()
     console.print(closed_loop_table(loops))
-    console.print(nodes_table(loops))
     log("friction by itself")
     friction = measure_friction()
-    console.print(friction_table(friction))
+    console.print(*friction_tables(friction))
     log(f"a thread that touches itself: {options.motions} random motions")
     selves = measure_self_contact(options.motions)
     console.print(self_contact_table(selves))

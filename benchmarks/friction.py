@@ -1,15 +1,15 @@
-"""Friction of the thread at contacts by itself: capstans, a thread that is held, and the time of a step."""
+"""Friction of the thread at contacts by itself: capstans of flexible and of stiff threads."""
 
 from __future__ import annotations
 
 import math
-import time
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
 from scipy.optimize import brentq
 
+from benchmarks.report import figures_table
 from magnetosuture_thread import Disc, NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
@@ -40,26 +40,18 @@ def measure_friction() -> dict[str, Any]:
         for friction in (0.3, 0.5)
         for stiffness in STIFFNESSES
     ]
-    times = {f"{friction:g}": step_time(friction) for friction in (0.0, 0.3)}
-    return {"capstans": capstans, "stiff_capstans": stiff, "step": times}
+    return {"capstans": capstans, "stiff_capstans": stiff}
 
 
-def friction_table(figures: dict[str, Any]) -> Table:
-    """Return the figures as a table."""
-    table = Table(title="friction by itself")
-    table.add_column("case")
-    table.add_column("figure", justify="right")
-    for case in figures["capstans"]:
-        name = f"capstan, mu = {case['friction']:g}, {case['turns']:g} turns: T2 / T1 over theory, less 1"
-        table.add_row(name, f"{case['error_percent']:+.2f} %")
-    for case in figures["stiff_capstans"]:
-        case_name = f"capstan, mu = {case['friction']:g}, E I = {case['stiffness']:g} T1 R^2, 0.5 turns"
-        name = f"{case_name}: T2 / T1, by elastica theory, flexible"
-        table.add_row(name, f"{case['measured']:.3f}, {case['elastica']:.3f}, {case['flexible']:.3f}")
-    for friction, step in figures["step"].items():
-        name = f"step, n = 81, {step['contacts']:.0f} nodes in contact, mu = {friction}"
-        table.add_row(name, f"{step['median_us']:.0f} µs")
-    return table
+def friction_tables(figures: dict[str, Any]) -> tuple[Table, Table]:
+    """Return the figures as tables."""
+    error = {"mu": "{friction:g}", "turns": "{turns:g}", "off [%]": "{error_percent:+.2f}"}
+    ratios = {"mu": "{friction:g}", "E I [T1 R^2]": "{stiffness:g}", "T2 / T1": "{measured:.3f}"}
+    ratios |= {"by elastica theory": "{elastica:.3f}", "flexible": "{flexible:.3f}"}
+    return (
+        figures_table("capstans: T2 / T1 over exp(mu theta), less 1", figures["capstans"], error),
+        figures_table("stiff capstans, 0.5 turns", figures["stiff_capstans"], ratios),
+    )
 
 
 def capstan(friction: float, angle: float, free: int, stiffness: float = 0.0) -> tuple[ThreadPredictor, Points]:
@@ -165,17 +157,3 @@ def stiff_capstan(friction: float, stiffness: float, free: int = 250) -> StiffCa
         bent = predictor.thread.bending_stiffness / (low * radius**2)
         found.append((ratio, elastica_ratio(friction, float(theta), float(bent)), gain))
     return StiffCapstan(*np.mean(found, axis=0).tolist())
-
-
-def step_time(friction: float) -> dict[str, float]:
-    """Return processor time of a step of 81 segments, of which about 40 nodes touch a post."""
-    predictor, nodes = capstan(friction, 2.0 * math.pi, 81 - 40 - round(LEAD * PER_TURN / (2.0 * math.pi * POST)))
-    times, contacts = [], []
-    for k in range(1, 121):
-        pose = NeedlePose(k / RATE, nodes[0] + SPEED * k / RATE * EAST, EAST)
-        began = time.process_time()
-        prediction = predictor.step(pose)
-        times.append(time.process_time() - began)
-        assert prediction.forces is not None
-        contacts.append(np.count_nonzero(prediction.forces.contact.any(axis=1)))
-    return {"median_us": 1e6 * float(np.median(times[20:])), "contacts": float(np.mean(contacts))}

@@ -39,15 +39,7 @@ PROCEDURES = ("dead_end", "figure_eight", "hernia", "slalom", "wrap_and_tighten"
 TOLERANCE = 1e-7  # m, rad or of the value itself
 # Of the machine, and not compared.
 TIMES = (
-    "step_time",
-    "step_median",
-    "step_p99",
-    "solve_time",
-    "wall",
-    "speed",
-    "seconds",
-    "latency",
-    "duration",
+    *("step_time", "step_median", "step_p99", "solve_time", "wall", "speed", "seconds", "latency", "duration"),
     "tracker",
 )
 
@@ -150,32 +142,34 @@ def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
+def _values(path: Path) -> dict[str, Any]:
+    """Return the arrays of an .npz file, or the plain values of a JSON document, by name."""
+    if path.suffix == ".json":
+        return dict(_leaves(json.loads(path.read_text())))
+    with np.load(path) as saved:
+        return dict(saved)
+
+
 def _differences(old: Path, new: Path) -> Iterator[str]:
     """Yield how two files differ."""
-    if old.suffix == ".npz":
-        with np.load(old) as before, np.load(new) as after:
-            for name in sorted(set(before.files) ^ set(after.files)):
-                yield f"{name}: {'gone' if name in before.files else 'new'}"
-            for name in sorted(set(before.files) & set(after.files)):
-                a, b = before[name], after[name]
-                if a.shape != b.shape:
-                    yield f"{name}: {len(a)} values, {len(b)} now"
-                elif not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
-                    yield f"{name}: differs by {np.nanmax(np.abs(a - b)):.3g}"
-    elif old.suffix == ".json":
-        before, after = (dict(_leaves(json.loads(path.read_text()))) for path in (old, new))
-        for name in sorted(set(before) ^ set(after)):
-            yield f"{name}: {'gone' if name in before else 'new'}"
-        for name in sorted(set(before) & set(after)):
-            a, b = before[name], after[name]
-            same = a == b
-            if isinstance(a, float) and isinstance(b, (int, float)):
-                same = bool(np.isclose(a, b, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True))
-            if not same and not any(word in name for word in TIMES):
-                yield f"{name}: {a!r}, {b!r} now"
-    else:
+    if old.suffix == ".txt":
         a, b = (path.read_text().splitlines() for path in (old, new))
         yield from list(difflib.unified_diff(a, b, lineterm="", n=0))[2:]
+        return
+    before, after = _values(old), _values(new)
+    for name in sorted(before.keys() ^ after.keys()):
+        yield f"{name}: {'gone' if name in before else 'new'}"
+    for name in sorted(before.keys() & after.keys()):
+        a, b = before[name], after[name]
+        if old.suffix == ".json" and any(word in name for word in TIMES):
+            continue
+        is_number = all(np.asarray(value).dtype.kind in "bif" for value in (a, b))
+        if np.shape(a) != np.shape(b):
+            yield f"{name}: {len(a)} values, {len(b)} now"
+        elif is_number and not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE, equal_nan=True):
+            yield f"{name}: differs by {np.nanmax(np.abs(np.subtract(a, b, dtype=float))):.3g}"
+        elif not is_number and a != b:
+            yield f"{name}: {a!r}, {b!r} now"
 
 
 def _compare(old: Path, new: Path) -> int:

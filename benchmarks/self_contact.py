@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 from rich.table import Table
 
+from benchmarks.report import figures_table
 from magnetosuture_thread import NeedlePose, SolverError, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_along
@@ -125,16 +126,8 @@ def move_model(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotio
 
 def move_rig(seed: int, self_contact: bool, steps: int = STEPS) -> RandomMotion:
     """Return what the same motion of the simulated rig's thread comes to."""
-    thread = ThreadProperties(
-        length=LENGTH,
-        segments=SEGMENTS,
-        bending_stiffness=STIFFNESS,
-        stretching_stiffness=STRETCHING,
-        drag_across=DRAG,
-        drag_along=0.5 * DRAG,
-        attachment=NeedleJoint.PINNED,
-        diameter=DIAMETER,
-    )
+    rod = LENGTH, SEGMENTS, STIFFNESS, STRETCHING, DRAG, 0.5 * DRAG
+    thread = ThreadProperties(*rod, NeedleJoint.PINNED, diameter=DIAMETER)
     surface, body = Surface(wall_radius=0.5 * DISH, self_contact=self_contact), NeedleBody(2e-4, 5e-5, 0.0, 0.0, 1.0)
     rig = RigDynamics(body, thread, surface, None, np.zeros(2), 0.0, start_nodes(), largest_step=4e-3)
 
@@ -185,17 +178,13 @@ def _sum(done: list[RandomMotion]) -> dict[str, Any]:
         "not_converged": sum(each.unconverged for each in done),
         "motions_crossed": sum(each.crossed > 0 for each in done),
         "free_us": 1e6 * float(np.median(free)),
-        "touching_us": 1e6 * float(np.median(touching)) if touching else None,
+        "touching_us": 1e6 * float(np.median(touching or [0.0])),
     }
 
 
 def self_contact_table(figures: dict[str, Any]) -> Table:
     """Return the figures as a table."""
-    table = Table(title="a thread that touches itself, random motions of the needle")
     names = ("motions", "motions_crossed", "steps", "touched", "refused", "not_converged", "free_us", "touching_us")
-    for name in ("thread", *(name.replace("_", " ") for name in names)):
-        table.add_column(name, justify="right")
-    for name, row in figures.items():
-        values = (row[key] for key in names)
-        table.add_row(name, *("-" if value is None else f"{value:.0f}" for value in values))
-    return table
+    columns = {"thread": "{thread}"} | {name.replace("_", " "): f"{{{name}:.0f}}" for name in names}
+    rows = [{"thread": name, **row} for name, row in figures.items()]
+    return figures_table("a thread that touches itself, random motions of the needle", rows, columns)

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
-from benchmarks.general_solvers import PEERS
+from benchmarks.general_solvers import PEERS, PeerSolver
+from benchmarks.report import figures_table
 from benchmarks.track import OBSTACLES, Case, case
 from magnetosuture_thread.commands.command import progress
 from magnetosuture_thread.geometry.obstacles import Workspace
@@ -133,7 +133,7 @@ def _row(system: str, case: Case, durations: NDArray[np.float64], residual: floa
         "median_s": float(np.median(durations)),
         "p99_s": float(np.percentile(durations, 99.0)),
         "samples": len(durations),
-        "max_residual": residual if np.isfinite(residual) else None,  # JSON has no infinity
+        "max_residual": min(residual, ANY_RESIDUAL),  # JSON has no infinity
     }
 
 
@@ -153,7 +153,7 @@ def measure(
     for done, (n, dimension, obstacles) in enumerate(sizes):
         advance(done / len(sizes))
         motion = case(n, dimension, obstacles > 0, steps if n < 1000 else steps // 3)
-        solvers: list[Solver] = [BandedSolver(), OsqpSolver(), *(PEERS[name]() for name in PEERS if peers)]
+        solvers: list[Solver] = [BandedSolver(), OsqpSolver(), *(PeerSolver(name) for name in PEERS if peers)]
         captured = run_case(motion, BandedSolver())[0].captured
         for solver in solvers:
             if n > MAX_SEGMENTS.get(solver.name, 320):
@@ -176,13 +176,7 @@ def run(options: argparse.Namespace, console: Console) -> tuple[dict[str, Any], 
     """Time steps and solves; return the figures."""
     with progress(console, "solver") as advance:
         rows = measure(options.segments, 300, 0.5, options.peers, advance)
-    table = Table(title="one step, one solve", caption="microseconds of wall clock; obst.: of 200 triangles each")
-    table.add_column("system", no_wrap=True)
-    for name in ("n", "d", "obst.", "median", "p99", "residual"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in rows:
-        sizes = (str(row[name]) for name in ("n", "d", "obstacles"))
-        residual = "-" if row["max_residual"] is None else f"{row['max_residual']:.1e}"
-        table.add_row(row["system"], *sizes, f"{1e6 * row['median_s']:.1f}", f"{1e6 * row['p99_s']:.1f}", residual)
-    console.print(table)
+    columns = {"system": "{system}", "n": "{n}", "d": "{d}", "obst.": "{obstacles}"}
+    columns |= {"median [s]": "{median_s:.3g}", "p99 [s]": "{p99_s:.3g}", "residual": "{max_residual:.1e}"}
+    console.print(figures_table("one step, one solve, wall clock", rows, columns, "obst.: of 200 triangles each"))
     return {"rows": rows}, True

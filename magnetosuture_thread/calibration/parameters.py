@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
@@ -23,11 +23,6 @@ from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"
-WIDEST = math.log(1.5)  # of a logarithm: half an interval beyond says nothing of use
-LOGARITHM = 700.0  # whose exponential is a number yet
-STIFFNESS_RANGE = 1e3  # B is looked for within this factor of the material's
-OFFSET_COUNTS, MAX_OFFSET = 0.01, 0.1  # of the thread's length
-MIN_WEIGHT, MAX_WEIGHT = 1e-6, 1e7  # W_stiff; beyond, every step needs another solver
 
 Settings = ThreadModelSettings
 
@@ -42,7 +37,6 @@ class Parameter:
         unit: of its value.
         kind: `log`: x = ln value, for what is positive; `plain`: x = value; `lost`: x = ln (1 - value).
         bounds: least and greatest value.
-        counts: a change of x that counts: a factor of two, or what is said of it.
         getter: its value in settings, if it is not the setting itself.
         setter: settings with another value, likewise.
     """
@@ -52,9 +46,13 @@ class Parameter:
     unit: str
     kind: str
     bounds: Callable[[Settings], tuple[float, float]]
-    counts: Callable[[Settings], float] = field(default=lambda settings: math.log(2.0))
     getter: Callable[[Settings], float] | None = None
     setter: Callable[[Settings, float], Settings] | None = None
+
+    def counts(self, settings: Settings) -> float:
+        """Return the change of x that counts: a factor of two, 1 % of the length, or one radian on all of it."""
+        length = settings.thread_length
+        return {"m": 0.01 * length, "1/m": 1.0 / length}.get(self.unit, math.log(2.0))
 
     def read(self, settings: Settings) -> float:
         """Return its value in settings."""
@@ -62,11 +60,10 @@ class Parameter:
 
     def write(self, settings: Settings, value: float) -> Settings:
         """Return settings with another value."""
-        return _replaced(settings, self.setting, value) if self.setter is None else self.setter(settings, value)
-
-    def widest(self, settings: Settings) -> float:
-        """Return half of a 95 % interval of x beyond which the parameter counts as unknown."""
-        return self.counts(settings) if self.kind == "plain" else WIDEST
+        if self.setter is not None:
+            return self.setter(settings, value)
+        changes: dict[str, Any] = {self.setting: value}
+        return replace(settings, **changes)
 
     def to_fit(self, value: float) -> float:
         """Return x of a value."""
@@ -82,25 +79,14 @@ class Parameter:
 
     def fit_bounds(self, settings: Settings) -> tuple[float, float]:
         """Return least and greatest x."""
-        low, high = sorted(self.to_fit(value) for value in self.bounds(settings))
+        low, high = sorted(map(self.to_fit, self.bounds(settings)))
         return low, high
-
-    def reset(self, settings: Settings, start: Settings) -> Settings:
-        """Return settings with this parameter taken from other settings."""
-        if self.setting == OFFSET:
-            return self.write(settings, self.read(start))
-        return _replaced(settings, self.setting, getattr(start, self.setting))
 
     def interval(self, x: float, half: float) -> tuple[float, float]:
         """Return the ends of x - half ... x + half as values, the lower one first."""
-        ends = (x - half, x + half) if self.kind == "plain" else (max(x - half, -LOGARITHM), min(x + half, LOGARITHM))
-        low, high = sorted(self.from_fit(end) for end in ends)
+        limit = math.inf if self.kind == "plain" else 700.0  # whose exponential is a number yet
+        low, high = sorted(map(self.from_fit, (max(x - half, -limit), min(x + half, limit))))
         return low, high
-
-
-def _replaced(settings: Settings, field: str, value: Any) -> Settings:
-    changes: dict[str, Any] = {field: value}
-    return replace(settings, **changes)
 
 
 def stiffness_over_drag(settings: Settings) -> float:
@@ -119,7 +105,7 @@ def _stiffness_bounds(settings: Settings) -> tuple[float, float]:
     middle = stiffness_over_drag(replace(settings, elastic_modulus=0.0))  # the material's
     # Just within what a setup may say [Pa].
     most = stiffness_over_drag(replace(settings, elastic_modulus=0.99e12))
-    return middle / STIFFNESS_RANGE, min(middle * STIFFNESS_RANGE, most)
+    return 1e-3 * middle, min(1e3 * middle, most)
 
 
 def _curvature_bounds(settings: Settings) -> tuple[float, float]:
@@ -137,13 +123,10 @@ def _offset(index: int, name: str) -> Parameter:
         return replace(settings, attachment_offset=tuple(both) if any(both) else ())
 
     def bounds(settings: Settings) -> tuple[float, float]:
-        most = min(0.01, MAX_OFFSET * settings.thread_length)
+        most = min(0.01, 0.1 * settings.thread_length)
         return -most, most
 
-    def counts(settings: Settings) -> float:
-        return OFFSET_COUNTS * settings.thread_length
-
-    return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, counts, read, write)
+    return Parameter(f"offset {name}", OFFSET, "m", "plain", bounds, read, write)
 
 
 STIFFNESS_OVER_DRAG = Parameter(
@@ -156,33 +139,20 @@ STIFFNESS_OVER_DRAG = Parameter(
     setter=with_stiffness_over_drag,
 )
 DRAG_ANISOTROPY = Parameter("drag anisotropy", "drag_anisotropy", "", "log", lambda settings: (0.05, 1.0))
-REST_CURVATURE = Parameter(
-    "rest curvature",
-    "rest_curvature",
-    "1/m",
-    "plain",
-    _curvature_bounds,
-    lambda settings: 1.0 / settings.thread_length,  # by which the thread turns by one radian on its whole length
-)
+REST_CURVATURE = Parameter("rest curvature", "rest_curvature", "1/m", "plain", _curvature_bounds)
 DAMPING = Parameter("kappa", "paper_damping", "", "lost", lambda settings: (0.0, 0.999))
 STIFFNESS_WEIGHT = Parameter(
     "W_stiff",
     "paper_stiffness_weight",
     "",
     "log",
-    lambda settings: (MIN_WEIGHT, MAX_WEIGHT),
+    lambda settings: (1e-6, 1e7),  # beyond, every step needs another solver
     getter=lambda settings: settings.paper_stiffness_weight or MATERIALS[settings.material].stiffness_weight,
 )
 OF_FORMULATION: dict[str, tuple[Parameter, ...]] = {
     "rod": (STIFFNESS_OVER_DRAG, DRAG_ANISOTROPY, REST_CURVATURE, _offset(0, "along"), _offset(1, "left")),
     "paper": (DAMPING, STIFFNESS_WEIGHT),
 }
-
-
-def known_settings(formulation: str) -> tuple[str, ...]:
-    """Return the names of the settings that can be fitted in a formulation."""
-    names = dict.fromkeys(parameter.setting for parameter in OF_FORMULATION[formulation])
-    return (*names, ATTACHMENT) if formulation == "rod" else tuple(names)
 
 
 def choose_parameters(formulation: str, names: Sequence[str] = ()) -> tuple[tuple[Parameter, ...], bool]:
@@ -195,7 +165,9 @@ def choose_parameters(formulation: str, names: Sequence[str] = ()) -> tuple[tupl
     Raises:
         ConfigurationError: a name is none of those.
     """
-    known = known_settings(formulation)
+    known = dict.fromkeys(parameter.setting for parameter in OF_FORMULATION[formulation])
+    if formulation == "rod":
+        known[ATTACHMENT] = None
     for name in names:
         if name not in known:
             close = get_close_matches(name, known, n=1)

@@ -43,7 +43,7 @@ def _summary(calibration: CalibrationResult) -> str:
     held = [score.held_out for score in calibration.scores if np.isfinite(score.held_out)]
     if held:
         words += f", {np.mean(held):.2f} % for each bag by the others"
-    simulated = sum(bool(text) for text in calibration.simulated)
+    simulated = sum(bool(score.simulated) for score in calibration.scores)
     if simulated:
         words += "; simulated" if simulated == count else f"; {simulated} simulated"
     return words

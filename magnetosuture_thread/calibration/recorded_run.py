@@ -15,23 +15,21 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.errors import BagError, GraphError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
-from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, mean_over_nodes, node_errors, target_points
+from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, node_errors, target_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_model.session import InitialObservation, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
-from magnetosuture_thread.workers import WorkerDiedError, make_runner
+from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
-AGAINST = ("seen", "truth")
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it
 MAX_FRAMES = 600  # compared, evenly over the run; every pose is replayed
 MIN_DURATION = 3.0  # s
 MIN_FRAMES = 20  # compared
 GAP = 500_000_000  # ns without a needle, after which the thread's way is not known
-SMOOTHED, STEPS = 1.0, 0.5  # s; over which the thread is averaged to tell whether it moves, and the needle how fast
 BLOCKS = 10  # of time, in each of which residuals are taken to be alike
-STILL, SLOW = 0.02, 0.15  # of the thread's length, by which some point of it moves
+SLOW = 0.15  # of the thread's length, by which some point of it moves
 
 
 @dataclass(frozen=True)
@@ -93,15 +91,10 @@ class RecordedRun:
 
         The upper quartile over steps of half a second, so that a needle that stops now and then counts as it goes.
         """
-        parts = ((self.stamps - self.stamps[0]) * 1e-9 / STEPS).astype(int)
+        parts = ((self.stamps - self.stamps[0]) * 1e-9 / 0.5).astype(int)
         means = np.array([self.tails[parts == part].mean(axis=0) for part in np.unique(parts)])
-        steps = np.linalg.norm(np.diff(means, axis=0), axis=1) / STEPS
+        steps = np.linalg.norm(np.diff(means, axis=0), axis=1) / 0.5
         return float(np.percentile(steps, 75.0)) if len(steps) else 0.0
-
-    @property
-    def duration(self) -> float:
-        """From the first pose to the last [s]."""
-        return float(self.stamps[-1] - self.stamps[0]) * 1e-9
 
 
 def read_run(
@@ -138,8 +131,8 @@ def read_run(
             continue
         stamp, last = observation.stamp, poses[-1][0] if poses else None
         counts.update(needle=1, seen=len(observation.measured) > 1, truth=len(observation.ground_truth) > 1)
-        curves = [observation.measured, observation.ground_truth]
-        (measured, true), lengths = target_points(curves, length, settings.segments)
+        curves = {"seen": observation.measured, "truth": observation.ground_truth}
+        found = {which: target_points(curve, length, settings.segments) for which, curve in curves.items()}
         if last is not None and stamp <= last:
             if stamp < last - 1_000_000_000:
                 back = (last - stamp) * 1e-9
@@ -156,19 +149,16 @@ def read_run(
         poses.append((stamp, observation.tail, observation.heading))
         # Before, the noise of the leg's first centreline has not straightened out.
         is_settled = stamp >= poses[legs[-1]][0] + round(SETTLING * 1e9)
-        if is_settled and lengths[AGAINST.index(against)] >= enough:
-            compared.append((len(poses) - 1, measured if against == "seen" else true, true))
-    problem = ""
+        if is_settled and found[against][1] >= enough:
+            compared.append((len(poses) - 1, found[against][0], found["truth"][0]))
     if not counts["needle"]:
-        problem = "shows no needle in any frame; is it another setup's?"
-    elif not counts["seen"]:
-        problem = "shows no thread in any frame: nothing to start from or to compare with"
-    elif not poses:
-        problem = "never shows half of the thread or more: nothing to start from"
-    elif against == "truth" and not counts["truth"]:
-        problem = "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen"
-    if problem:
-        raise BagError(name, problem)
+        raise BagError(name, "shows no needle in any frame; is it another setup's?")
+    if not counts["seen"]:
+        raise BagError(name, "shows no thread in any frame: nothing to start from or to compare with")
+    if not poses:
+        raise BagError(name, "never shows half of the thread or more: nothing to start from")
+    if against == "truth" and not counts["truth"]:
+        raise BagError(name, "holds no ground truth (ground_truth/thread), as bags of a robot do; compare against seen")
     ends = [*legs[1:], len(poses)]
     duration = sum(poses[end - 1][0] - poses[leg][0] for leg, end in zip(legs, ends, strict=True)) * 1e-9
     if duration < MIN_DURATION:
@@ -182,40 +172,38 @@ def read_run(
     stamps, tails, headings = zip(*poses, strict=True)
     frames, targets, truths = zip(*(compared[index] for index in chosen), strict=True)
     run = RecordedRun(
-        name=name,
-        stamps=np.array(stamps, dtype=np.int64),
-        tails=np.array(tails),
-        headings=np.array(headings),
-        legs=tuple(legs),
-        initials=tuple(initials),
-        frames=np.array(frames, dtype=np.int64),
-        targets=np.array(targets),
-        ground_truths=np.array(truths),
+        name,
+        np.array(stamps, dtype=np.int64),
+        np.array(tails),
+        np.array(headings),
+        tuple(legs),
+        tuple(initials),
+        np.array(frames),
+        np.array(targets),
+        np.array(truths),
         against=against,
         simulated=simulated,
         scene=scene,
     )
     moved = _moved(run) / length
-    if moved < STILL:
-        raise BagError(name, f"nothing moves: {moved:.1%} of the thread's length, expected {SLOW:.0%} and more")
     if moved < SLOW:
-        words = f"needle and thread move by {moved:.1%} of the thread's length in {run.duration:.0f} s"
-        raise BagError(name, f"the needle is too slow: {words}, expected {SLOW:.0%} and more")
+        why = "nothing moves" if moved < 0.02 else "the needle is too slow"
+        words = f"needle and thread move by {moved:.1%} of the thread's length in {duration:.0f} s"
+        raise BagError(name, f"{why}: {words}, expected {SLOW:.0%} and more")
     return run
 
 
 def _moved(run: RecordedRun) -> float:
     """Return the diagonal of the box that the needle or a node moves in [m]; means over a second leave noise out."""
-    parts = (run.times / SMOOTHED).astype(int)
+    parts = (run.times).astype(int)
     nodes = np.concatenate([run.tails[run.frames][:, None], run.targets], axis=1)
-    blocks = (np.moveaxis(nodes[parts == part], 0, -1) for part in np.unique(parts))
-    means = np.array([mean_over_nodes(block, np.isfinite(block)) for block in blocks])
+    means = np.array(
+        [np.ma.masked_invalid(nodes[parts == part]).mean(axis=0).filled(np.nan) for part in np.unique(parts)]
+    )
     way = means[:, np.isfinite(means[..., 0]).sum(axis=0) > 1]
     extent = np.nanmax(way, axis=0) - np.nanmin(way, axis=0)
     return float(np.hypot(extent[:, 0], extent[:, 1]).max())
 
-
-SHARES = {"starts": 0.2, "fit": 0.4, "identified": 0.15, "held out": 0.25}  # of the time, by stage
 
 Task = tuple[int, ThreadModelSettings]
 RunTasks = Callable[[Sequence[Task]], list[Points]]
@@ -228,21 +216,19 @@ def replay_with_parameters(run: RecordedRun, settings: ThreadModelSettings) -> P
     The very session that the node runs, over all poses, anew in each leg. Where a step fails the thread stays as it
     was; where it cannot even start, or such settings can predict nothing, all is not a number.
     """
-    nothing = np.full((settings.segments + 1, 2), np.nan)
-    kept = np.repeat(nothing[None], len(run.frames), axis=0)
+    kept = np.full((len(run.frames), settings.segments + 1, 2), np.nan)
     settings = replace(settings, estimator=False)  # what is fitted is the prediction alone
     slots = {int(frame): slot for slot, frame in enumerate(run.frames)}
-    stamps = run.stamps.tolist()
     try:
-        for leg, end, initial in zip(run.legs, [*run.legs[1:], len(stamps)], run.initials, strict=True):
-            session, last = ThreadSession(settings, run.scene), nothing
-            for _ in session.on_measured_thread(stamps[leg], initial):
+        for leg, end, initial in zip(run.legs, [*run.legs[1:], len(run.stamps)], run.initials, strict=True):
+            session, last = ThreadSession(settings, run.scene), np.full(kept.shape[1:], np.nan)
+            for _ in session.on_measured_thread(int(run.stamps[leg]), initial):
                 pass
             for index in range(leg, end):
-                pose = NeedlePose(stamps[index] * 1e-9, run.tails[index], run.headings[index])
-                outcome = session.on_pose(stamps[index], pose)
-                if outcome.prediction is not None:
-                    last = outcome.prediction.positions
+                stamp = int(run.stamps[index])
+                found = session.on_pose(stamp, NeedlePose(stamp * 1e-9, run.tails[index], run.headings[index]))
+                if found.prediction is not None:
+                    last = found.prediction.positions
                 elif index == leg:
                     break
                 if index in slots:
@@ -275,9 +261,7 @@ def replay_pool(runs: Sequence[RecordedRun], workers: int, scheduler: str = "") 
         yield run
 
 
-def _run_task(
-    runs: Sequence[RecordedRun], task: Task, log: Callable[[str], None], progress: Callable[[float], None]
-) -> Points:
+def _run_task(runs: Sequence[RecordedRun], task: Task, log: Log, progress: Progress) -> Points:
     index, settings = task
     return replay_with_parameters(runs[index], settings)
 
@@ -332,8 +316,9 @@ def mean_error(vertices: Points, targets: Points, length: float) -> float:
     A node that is not predicted counts as a length off; not a number if nothing is known.
     """
     found = node_errors(vertices, targets, length)
-    frames = mean_over_nodes(np.where(np.isfinite(found), found, 100.0), np.isfinite(targets[..., 0]))
-    return float(np.nanmean(frames)) if np.isfinite(frames).any() else math.nan
+    known = np.isfinite(targets[..., 0])
+    frames = np.ma.masked_array(np.where(np.isfinite(found), found, 100.0), ~known).mean(axis=1)
+    return float(frames.mean()) if known.any() else math.nan
 
 
 @dataclass
@@ -362,23 +347,23 @@ class Replays:
         runs: the recorded runs.
         run_tasks: gives the predicted nodes of tasks, in their order; here, one after the other, if None.
         best: is updated with every whole set of replays.
-        progress: called with the share done, which never falls.
+        expected: how many replays the search takes, roughly.
+        progress: called with the share of these that is done.
         log: called with a line at the end of each stage.
     """
 
     def __init__(
         self,
         runs: Sequence[RecordedRun],
-        run_tasks: RunTasks | None = None,
-        best: BestSettings | None = None,
-        progress: Callable[[float], None] = lambda share: None,
-        log: Callable[[str], None] = lambda line: None,
+        run_tasks: RunTasks | None,
+        best: BestSettings | None,
+        expected: int,
+        progress: Progress,
+        log: Log,
     ) -> None:
         self.runs, self.best = tuple(runs), best or BestSettings()
         self._run_tasks = run_tasks or self._run_here
-        self._progress, self._log = progress, log
-        self._begin = self._width = 0.0
-        self._done, self._expected = 0, 1
+        self._expected, self._progress, self._log = expected, progress, log
         self._known: dict[Task, Points] = {}
         self._errors: dict[ThreadModelSettings, float] = {}
 
@@ -397,8 +382,7 @@ class Replays:
         if len(chosen) == len(self.runs):
             for settings, vertices in zip(many, result, strict=True):
                 self._keep_best(settings, vertices)
-        self._done += len(missing)
-        self._progress(self._begin + self._width * self._done / (self._done + self._expected))
+        self._progress(min(0.99, self.best.replays / self._expected))
         return result
 
     def _keep_best(self, settings: ThreadModelSettings, vertices: list[Points]) -> None:
@@ -416,16 +400,10 @@ class Replays:
             self.of([settings])
         return self._errors[settings]
 
-    def begin_stage(self, stage: str, replays: int) -> None:
-        """Begin a stage of the search that takes about so many replays."""
-        self._begin += self._width
-        self._width, self._done, self._expected = SHARES[stage], 0, max(1, replays)
-        self._progress(self._begin)
-
-    def end_stage(self, result: str) -> None:
-        """Log what a stage came to."""
-        error, replays = self.best.error, self.best.replays
-        self._log(f"{result}; least distance of the nodes {error:.3g} % of the length after {replays} replays")
+    def report(self, result: str) -> None:
+        """Log what a stage of the search came to."""
+        error, count = self.best.error, self.best.replays
+        self._log(f"{result}; least distance of the nodes {error:.3g} % of the length after {count} replays")
 
     def _run_here(self, tasks: Sequence[Task]) -> list[Points]:
         return [replay_with_parameters(self.runs[index], settings) for index, settings in tasks]

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 from rich.table import Table
 
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
@@ -18,7 +19,6 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
-WIDTH = 118
 STIFFNESS = (
     "Only the ratio B = EI / zeta_perp of bending stiffness and drag across the thread moves it. elastic_modulus is "
     "the one that has the fitted ratio at the viscosity, diameter, thread_length and wetted_fraction below; it is the "
@@ -95,6 +95,7 @@ class BagErrors:
         across_before: mean distance across the thread, with what the setup says.
         across_after: calibrated; this is what was made least.
         unverified: why any message of the bag may be wrong; empty if nothing speaks against them.
+        simulated: what of it is simulated; empty if nothing says so.
     """
 
     name: str
@@ -108,6 +109,7 @@ class BagErrors:
     across_before: float = math.nan
     across_after: float = math.nan
     unverified: str = field(default="", kw_only=True)
+    simulated: str = field(default="", kw_only=True)
 
     @property
     def warning(self) -> str:
@@ -145,7 +147,8 @@ class BagFit(NamedTuple):
             for vertices in self[1:]
         ]
         across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
-        return BagErrors(run.name, len(run.frames), *errors, *across, unverified=run.unverified)
+        frames, unverified = len(run.frames), run.unverified
+        return BagErrors(run.name, frames, *errors, *across, unverified=unverified, simulated=run.simulated)
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,6 @@ class CalibrationResult:
         estimates: of all numbers that were asked for.
         attachment: which fits better; None if it was not asked for.
         scores: of each bag.
-        simulated: what of each bag is simulated; empty for what nothing says so of.
         replays: how many runs were replayed.
         finished: whether it came to its end; else this is the best so far.
     """
@@ -168,7 +170,6 @@ class CalibrationResult:
     estimates: tuple[Estimate, ...]
     attachment: AttachmentDecision | None
     scores: tuple[BagErrors, ...]
-    simulated: tuple[str, ...]
     replays: int
     finished: bool = True
 
@@ -177,27 +178,24 @@ class CalibrationResult:
         cls,
         settings: ThreadModelSettings,
         fits: Sequence[BagFit],
-        estimates: tuple[Estimate, ...],
+        estimates: Sequence[Estimate],
         attachment: AttachmentDecision | None,
         replays: int,
         finished: bool = True,
     ) -> CalibrationResult:
         """Return the result of fits of some bags."""
         scores = tuple(fit.errors(settings.thread_length) for fit in fits)
-        simulated = tuple(fit.run.simulated for fit in fits)
-        return cls(settings, fits[0].run.against, estimates, attachment, scores, simulated, replays, finished)
+        return cls(settings, fits[0].run.against, tuple(estimates), attachment, scores, replays, finished)
 
     @property
     def warnings(self) -> list[str]:
         """Warnings for the user."""
         lines = []
-        for estimate in self.estimates:
-            words = f"{estimate.name} cannot be identified in this data: {estimate.reason}"
+        for estimate in [estimate for estimate in self.estimates if estimate.reason]:
+            lines.append(f"{estimate.name} cannot be identified in this data: {estimate.reason}")
             if estimate.status == STAND_IN:
                 value = f"{estimate.value:.4g} {estimate.unit}".rstrip()
-                words += f"; {value} stands in, as it predicts better than what the setup says"
-            if estimate.reason:
-                lines.append(words)
+                lines[-1] += f"; {value} stands in, as it predicts better than what the setup says"
         if self.attachment is not None and self.attachment.reason:
             lines.append(f"the attachment cannot be told: {self.attachment.reason}")
         lines += [f"{score.name} is unverified: {score.unverified}" for score in self.scores if score.unverified]
@@ -217,9 +215,7 @@ class CalibrationResult:
             "against": self.against,
             "parameters": [_plain(estimate) for estimate in self.estimates],
             "attachment": asdict(self.attachment) if self.attachment is not None else None,
-            "bags": [
-                {**_plain(score), "simulated": words} for score, words in zip(self.scores, self.simulated, strict=True)
-            ],
+            "bags": [_plain(score) for score in self.scores],
             "warnings": self.warnings,
             "replays": self.replays,
         }
@@ -231,22 +227,16 @@ def _plain(values: Any) -> dict[str, Any]:
 
 def to_yaml(calibration: CalibrationResult) -> str:
     """Return the text of the file, the same for the same calibration."""
-    lines = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"]
-    settings = calibration.settings
+    lines, settings = [*_header(calibration), "/**/thread_model:", "  ros__parameters:"], calibration.settings
     if settings.formulation != "rod":
-        lines.append(f"    formulation: {settings.formulation}")
+        lines.append(_entry("formulation", settings.formulation))
     # What gives the fitted numbers their meaning; with 0 the material's diameter counts.
-    for name in ("material", "diameter", "thread_length", "segments", "viscosity", "wetted_fraction"):
-        value = getattr(settings, name)
-        if name != "diameter" or value:
-            lines.append(f"    {name}: {_written(value)}")
+    meaning = ("material", *(["diameter"] if settings.diameter else []), "thread_length", "segments", "viscosity")
+    lines += [_entry(name, getattr(settings, name)) for name in (*meaning, "wetted_fraction")]
     if settings.formulation == "rod":
         lines += _attachment(calibration)
-    groups: dict[str, list[Estimate]] = {}
-    for estimate in calibration.estimates:
-        groups.setdefault(estimate.setting, []).append(estimate)
-    for name, estimates in groups.items():
-        lines += _entry(name, estimates, settings)
+    for name in dict.fromkeys(estimate.setting for estimate in calibration.estimates):
+        lines += _setting(name, [each for each in calibration.estimates if each.setting == name], settings)
     return "\n".join(lines) + "\n"
 
 
@@ -257,79 +247,69 @@ def _header(calibration: CalibrationResult) -> list[str]:
     ]
     if not calibration.finished:
         words.insert(0, "BEST SO FAR, NOT FINISHED: the calibration was interrupted. There are no intervals.")
-    for score, simulated in zip(calibration.scores, calibration.simulated, strict=True):
-        source = f"simulated: {simulated}" if simulated else "nothing in it says that it is simulated"
-        held = "" if math.isnan(score.held_out) else f", by the other bags {score.held_out:.3g}"
-        figures = f"{score.before:.3g} before, {score.after:.3g} after{held}"
-        words.append(
-            f"From {score.name} ({source}), {score.frames} frames: prediction error {figures} % of the length."
-        )
+    for score in calibration.scores:
+        source = f"simulated: {score.simulated}" if score.simulated else "nothing in it says that it is simulated"
+        figures = _before_and_after(score.before, score.after, score.held_out)
+        words.append(f"From {score.name} ({source}), {score.frames} frames: prediction error {figures} of the length.")
         if score.unverified:
             words.append(f"  UNVERIFIED: {score.unverified}.")
         if not math.isnan(score.truth_after):
-            held = "" if math.isnan(score.truth_held_out) else f", by the other bags {score.truth_held_out:.3g}"
-            words.append(
-                f"  Against the ground truth: {score.truth_before:.3g} before, {score.truth_after:.3g} after{held} %."
-            )
+            figures = _before_and_after(score.truth_before, score.truth_after, score.truth_held_out)
+            words.append(f"  Against the ground truth: {figures}.")
     compared = "the measured centreline" if calibration.against == "seen" else "the ground truth"
     if calibration.finished:
         words.append(f"Fitted to {compared}. Intervals are of 95 %.")
-    if calibration.settings.formulation == "rod" and any(
-        estimate.setting == "elastic_modulus" for estimate in calibration.estimates
-    ):
+    if any(estimate.setting == "elastic_modulus" for estimate in calibration.estimates):
         words.append(STIFFNESS)
     return [line for text in words for line in _comment(text)]
 
 
+def _before_and_after(before: float, after: float, held_out: float) -> str:
+    held = "" if math.isnan(held_out) else f", by the other bags {held_out:.3g}"
+    return f"{before:.3g} before, {after:.3g} after{held} %"
+
+
 def _comment(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+    return textwrap.wrap(text, 118, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   ")
+
+
+def _entry(name: str, value: Any, note: str = "") -> str:
+    """Return a line of the section: a float has its point, as ROS and any YAML reader take it, and six digits."""
+    if isinstance(value, tuple):
+        value = [float(f"{each:.6g}") for each in value]
+    elif isinstance(value, float):
+        value = float(f"{value:.6g}")
+    text = yaml.safe_dump({name: value}, default_flow_style=None if isinstance(value, list) else False).strip()
+    return f"    {text}" + (f" # {note}" if note else "")
 
 
 def _attachment(calibration: CalibrationResult) -> list[str]:
-    verdict, value = calibration.attachment, calibration.settings.attachment
-    if verdict is None:
-        return [f"    {ATTACHMENT}: {value} # as in the setup"]
-    if verdict.reason:
-        return _comment(f"{ATTACHMENT} is left out, as this data cannot tell it: {verdict.reason}", "    ")
-    errors = ", ".join(f"{kind} {error:.3g} %" for kind, error in sorted(verdict.errors.items()))
-    return [f"    {ATTACHMENT}: {value}" + (f" # best fits: {errors}" if len(verdict.errors) > 1 else "")]
+    decision, value = calibration.attachment, calibration.settings.attachment
+    if decision is None:
+        return [_entry(ATTACHMENT, value, "as in the setup")]
+    if decision.reason:
+        return _comment(f"{ATTACHMENT} is left out, as this data cannot tell it: {decision.reason}", "    ")
+    errors = ", ".join(f"{kind} {error:.3g} %" for kind, error in sorted(decision.errors.items()))
+    return [_entry(ATTACHMENT, value, f"best fits: {errors}" if len(decision.errors) > 1 else "")]
 
 
-def _entry(name: str, estimates: list[Estimate], settings: ThreadModelSettings) -> list[str]:
+def _setting(name: str, estimates: list[Estimate], settings: ThreadModelSettings) -> list[str]:
     """Return the lines of one setting, with why it is left out or what stands in."""
-    lines = []
-    for estimate in estimates:
-        if estimate.reason:
-            what = "is left out" if estimate.status == FIXED else "is no measurement but what predicts best"
-            if estimate.status == FIXED and any(other.status != FIXED for other in estimates):
-                what = f"stays {estimate.start:.4g} {estimate.unit}"
-            lines += _comment(f"{estimate.name} {what}, as this data cannot tell it: {estimate.reason}", "    ")
-    if all(estimate.status == FIXED for estimate in estimates):
+    lines, is_fixed = [], all(estimate.status == FIXED for estimate in estimates)
+    for estimate in [estimate for estimate in estimates if estimate.reason]:
+        what = "is left out" if is_fixed else f"stays {estimate.start:.4g} {estimate.unit}"
+        if estimate.status != FIXED:
+            what = "is no measurement but what predicts best"
+        lines += _comment(f"{estimate.name} {what}, as this data cannot tell it: {estimate.reason}", "    ")
+    if is_fixed:
         return lines
-    value = getattr(settings, name)
-    if name == OFFSET and not value:
-        value = (0.0, 0.0)
-    intervals = "; ".join(_interval(estimate) for estimate in estimates if estimate.status == IDENTIFIED)
+    known = [estimate for estimate in estimates if estimate.status == IDENTIFIED]
+    intervals = "; ".join(f"{estimate.low:.3g} to {estimate.high:.3g}" for estimate in known)
     units = {"rest_curvature": "1/m", OFFSET: "m, along and left"}
-    note = " ".join(part for part in (units.get(name, ""), intervals and f"[{intervals}]") if part)
     if name == "elastic_modulus":
-        note = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s" + (f" [{intervals}]" if intervals else "")
-    return [*lines, f"    {name}: {_written(value)}" + (f" # {note}" if note else "")]
-
-
-def _interval(estimate: Estimate) -> str:
-    return f"{estimate.low:.3g} to {estimate.high:.3g}"
-
-
-def _written(value: Any) -> str:
-    """Return a value as ROS and any YAML reader take it: a float has its point, a list one kind."""
-    if isinstance(value, tuple):
-        return "[" + ", ".join(_written(entry) for entry in value) + "]"
-    if not isinstance(value, float):
-        return str(value)
-    text = f"{value:.6g}"
-    mantissa, exponent, power = text.partition("e")
-    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power
+        units[name] = f"Pa; B = {stiffness_over_drag(settings):.4g} m^4/s"
+    value = getattr(settings, name) or ((0.0, 0.0) if name == OFFSET else 0.0)
+    return [*lines, _entry(name, value, " ".join(filter(None, (units.get(name), intervals and f"[{intervals}]"))))]
 
 
 def parameter_table(found: Mapping[str, Any]) -> Table:
@@ -354,23 +334,21 @@ def parameter_table(found: Mapping[str, Any]) -> Table:
 
 def bag_table(found: Mapping[str, Any]) -> Table:
     """Return a row for each bag: prediction errors before and after, and by the other bags."""
-    several, truth = len(found["bags"]) > 1, any(row["truth_after"] is not None for row in found["bags"])
+    truth = any(row["truth_after"] is not None for row in found["bags"])
     fitted = "the measured thread" if found["against"] == "seen" else "ground truth"
     table = Table(title=f"prediction error, fitted to {fitted}")
     table.caption = "mean over time of the mean distance of the nodes, % of the length"
     table.add_column("bag", overflow="fold", min_width=12)
     table.add_column("frames", justify="right")
-    # On a line of its own, as eight columns must fit into a terminal's 80.
-    kinds = ["", *(["ground\ntruth\n"] if truth and found["against"] == "seen" else [])]
-    for kind in kinds:
-        for name in ("before", "after", *(["held out"] if several else [])):
-            table.add_column(f"{kind}{name}" if kind else name.replace(" ", "\n"), justify="right", no_wrap=True)
+    keys = ["before", "after", *(["held_out"] if len(found["bags"]) > 1 else [])]
+    names = {key: key.replace("_", "\n") for key in keys}
+    if truth and found["against"] == "seen":  # on lines of its own, as eight columns must fit into a terminal's 80
+        names |= {f"truth_{key}": f"ground\ntruth\n{key.replace('_', ' ')}" for key in keys}
+    for name in names.values():
+        table.add_column(name, justify="right", no_wrap=True)
     for row in found["bags"]:
-        cells = []
-        for kind in kinds:
-            keys = ("before", "after", *(["held_out"] if several else []))
-            cells += [_percent(row[("truth_" if kind else "") + key]) for key in keys]
-        table.add_row(row["name"], str(row["frames"]), *cells)
+        errors = ("-" if row[key] is None else f"{row[key]:.3f}" for key in names)
+        table.add_row(row["name"], str(row["frames"]), *errors)
     return table
 
 
@@ -378,10 +356,4 @@ def calibration_lines(found: Mapping[str, Any]) -> list[str]:
     """Return the lines that complement the tables."""
     simulated = [row["name"] for row in found["bags"] if row["simulated"]]
     lines = [f"warning: {warning}" for warning in found["warnings"]]
-    if simulated:
-        lines.append(f"simulated: {', '.join(simulated)}")
-    return lines
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:.3f}"
+    return [*lines, f"simulated: {', '.join(simulated)}"] if simulated else lines

@@ -1,30 +1,36 @@
-"""The calibration procedure: initial guesses, the fit to all that is unknown, what is identified, predictions by it."""
+"""The calibration: initial guesses, least squares over replays of recorded runs, and what is identified by them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
-from magnetosuture_thread.calibration.fit import (
-    Array,
-    FitSolution,
-    Identifiability,
-    Objective,
-    assess_identifiability,
-    initial_guesses,
-    robust_scale,
-)
 from magnetosuture_thread.calibration.parameters import (
+    DAMPING,
     OF_FORMULATION,
     STIFFNESS_OVER_DRAG,
+    STIFFNESS_WEIGHT,
     Parameter,
     choose_parameters,
+    stiffness_over_drag,
+    with_stiffness_over_drag,
 )
-from magnetosuture_thread.calibration.recorded_run import BestSettings, RecordedRun, Replays, RunTasks, mean_across
+from magnetosuture_thread.calibration.recorded_run import (
+    BestSettings,
+    RecordedRun,
+    Replays,
+    RunTasks,
+    across_residuals,
+    mean_across,
+    offset_residuals,
+)
 from magnetosuture_thread.calibration.result import (
     FIXED,
     IDENTIFIED,
@@ -37,14 +43,17 @@ from magnetosuture_thread.calibration.result import (
 )
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread_model.session import ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.workers import Log, Progress
 
-MIN_IMPROVEMENT = 0.05  # % of length by which an attachment must fit better, besides the noise
-GIVEN_WAY = 0.1  # % of length; a default that predicts worse by more gives way to what was fitted
+Array = NDArray[np.float64]
 
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
+STARTS = tuple(10.0 ** (power / 1.5) for power in range(-3, 4))  # of the material's stiffness
+FLOOR = 2e-3  # of the length, which camera, tracker and model are wrong by
+CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time
+MIN_EFFECT = 1e-12  # effect of a number, as a share of the length, below which it has none
 
 
 def calibrate(
@@ -84,12 +93,37 @@ def calibrate(
     parameters, both = choose_parameters(settings.formulation, names)
     if settings.medium != "liquid":
         raise ConfigurationError("thread_model.medium", settings.medium, "liquid: what is fitted is bending over drag")
-    replays = Replays(runs, run_tasks, best, progress, log)
     for scene in dict.fromkeys(run.scene for run in runs):
         ThreadSession(settings, scene)  # which says what is wrong with the obstacles, if anything is
-    result = _Search(replays, settings, parameters, both).go()
+    count, derivatives = len(runs), len(parameters) + 1
+    expected = count * (60 + 10 * derivatives + 3 * (count - 1) * derivatives)
+    replays = Replays(runs, run_tasks, best, expected, progress, log)
+    replays.error(settings)
+    candidates = initial_guesses(replays, settings, parameters, both)
+    solutions = [_robust_fit(Objective(replays, candidate, parameters)) for candidate in candidates]
+    solution, attachment = _choose_attachment(replays, solutions, settings) if both else (solutions[0], None)
+    replays.report("fitted all that is unknown")
+    found = assess_identifiability(solution, runs)
+    fitted, statuses = _fit_identified(replays, solution, found, settings)
+    replays.report("fitted what can be identified")
+    held_out: list[Points | None] = [None] * count
+    free = [parameter for parameter, status in zip(parameters, statuses, strict=True) if status != FIXED]
+    for index in range(count) if count > 1 else ():
+        others = Objective(replays, fitted, free, [other for other in range(count) if other != index])
+        held_out[index] = replays.of([others.fit(scale=solution.scale).settings], [index])[0][0]
+    before, after = replays.of([settings, fitted])
+    fits = [BagFit(*parts) for parts in zip(runs, before, after, held_out, strict=True)]
+    estimates = []
+    for index, (parameter, each, status) in enumerate(zip(parameters, found, statuses, strict=True)):
+        value, low, high = parameter.read(fitted), math.nan, math.nan
+        if np.isfinite(each.half):
+            middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
+            low, high = parameter.interval(middle, each.half)
+        values, effect = (value, parameter.read(settings), low, high), 100.0 * each.effect
+        named = parameter.name, parameter.setting, parameter.unit
+        estimates.append(Estimate(*named, *values, status, each.reason, effect, parameter.kind == "log"))
     progress(1.0)
-    return result
+    return CalibrationResult.of(fitted, fits, estimates, attachment, replays.best.replays), fits
 
 
 def unfinished_result(
@@ -104,9 +138,9 @@ def unfinished_result(
     """
     found = best.settings or settings
     parameters = [p for p in OF_FORMULATION[settings.formulation] if p.read(found) != p.read(settings)]
-    estimates = tuple(
+    estimates = [
         Estimate(p.name, p.setting, p.unit, p.read(found), p.read(settings), status=UNFINISHED) for p in parameters
-    )
+    ]
     attachment = None
     if found.attachment != settings.attachment:
         attachment = AttachmentDecision(found.attachment, settings.attachment, {}, looked=False)
@@ -114,121 +148,399 @@ def unfinished_result(
     return CalibrationResult.of(found, fits, estimates, attachment, best.replays, finished=False), fits
 
 
-@dataclass
-class _Search:
-    replays: Replays
-    start: ThreadModelSettings
-    parameters: tuple[Parameter, ...]
-    both: bool
+def _robust_fit(objective: Objective) -> FitSolution:
+    """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
+    scale = robust_scale(objective.residuals(objective.start())[0])
+    solution = objective.fit(scale=scale)
+    narrower = robust_scale(solution.residuals)
+    return objective.fit(solution.x, narrower) if narrower < 0.5 * scale else solution
 
-    def go(self) -> tuple[CalibrationResult, list[BagFit]]:
-        runs, count = self.replays.runs, len(self.replays.runs)
-        self.replays.error(self.start)
-        candidates = initial_guesses(self.replays, self.start, self.parameters, self.both)
-        self.replays.begin_stage("fit", count * len(candidates) * 6 * (len(self.parameters) + 1))
-        solutions = [self._fitted(Objective(self.replays, settings, self.parameters)) for settings in candidates]
-        solution, attachment = self._attached(solutions)
-        self.replays.end_stage("fitted all that is unknown")
-        found = assess_identifiability(solution, runs)
-        self.replays.begin_stage("identified", count * 4 * len(self.parameters))
-        settings, statuses = self._identified(solution, found)
-        self.replays.end_stage("fitted what can be identified")
-        fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-        held_out: list[Points | None] = [None] * count
-        if count > 1:
-            self.replays.begin_stage("held out", count * (count - 1) * 3 * (len(fitted) + 1))
-            held_out = [self._held_out(settings, fitted, solution.scale, index) for index in range(count)]
-            self.replays.end_stage("predicted each bag by the others")
-        before, after = self.replays.of([self.start, settings])
-        fits = [BagFit(*parts) for parts in zip(runs, before, after, held_out, strict=True)]
-        estimates = tuple(
-            self._estimate(solution, index, each, status, settings)
-            for index, (each, status) in enumerate(zip(found, statuses, strict=True))
-        )
-        return CalibrationResult.of(settings, fits, estimates, attachment, self.replays.best.replays), fits
 
-    def _fitted(self, objective: Objective) -> FitSolution:
-        """Return a robust fit, repeated where its outliers turn out to be much farther out than they seemed."""
-        scale = robust_scale(objective.residuals(objective.start())[0])
-        solution = objective.fit(scale=scale)
-        narrower = robust_scale(solution.residuals)
-        return objective.fit(solution.x, narrower) if narrower < 0.5 * scale else solution
+def _choose_attachment(
+    replays: Replays, solutions: Sequence[FitSolution], start: ThreadModelSettings
+) -> tuple[FitSolution, AttachmentDecision]:
+    """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
 
-    def _attached(self, solutions: Sequence[FitSolution]) -> tuple[FitSolution, AttachmentDecision | None]:
-        """Return the solution whose attachment fits better, or the setup's where that cannot be told."""
-        if not self.both:
-            return solutions[0], None
-        errors = {s.settings.attachment: self.replays.error(s.settings) for s in solutions}
-        best = min(solutions, key=lambda s: float(np.mean(self._blocks(s))))
-        if len(solutions) == 1:
-            return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors)
-        other = next(s for s in solutions if s is not best)
-        difference = self._blocks(other) - self._blocks(best)
-        middle, count = float(difference.mean()), len(difference)
-        half = float(stdtrit(count - 1, 0.975) * difference.std(ddof=1) / np.sqrt(count))
-        reason = ""
-        if middle < max(MIN_IMPROVEMENT, half):
-            reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
-            best = next(s for s in solutions if s.settings.attachment == self.start.attachment)
-        return best, AttachmentDecision(best.settings.attachment, self.start.attachment, errors, reason)
-
-    def _blocks(self, solution: FitSolution) -> Array:
+    def blocks(solution: FitSolution) -> Array:
         """Return the mean distance across the thread in each block of time of each run [% of length]."""
         result = []
-        for residual, run in zip(solution.residuals, self.replays.runs, strict=True):
+        for residual, run in zip(solution.residuals, replays.runs, strict=True):
             block, sizes = run.blocks, 100.0 * np.abs(residual)
             result += [float(sizes[block == k][run.known[block == k]].mean()) for k in np.unique(block)]
         return np.array(result)
 
-    def _identified(
-        self, solution: FitSolution, found: Sequence[Identifiability]
-    ) -> tuple[ThreadModelSettings, list[str]]:
-        """Return the fit of what can be identified, and what became of each number."""
-        statuses = [self._status(solution, index, each) for index, each in enumerate(found)]
-        if not any(each.reason for each in found):
-            return solution.settings, statuses
-        spare = [index for index, status in enumerate(statuses) if status == FIXED]
-        spare.sort(key=lambda i: (self.parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
-        most = self._error(solution.settings) + GIVEN_WAY
-        while True:
-            base = solution.settings
-            for parameter, status in zip(self.parameters, statuses, strict=True):
-                base = base if status != FIXED else parameter.reset(base, self.start)
-            fitted = [p for p, status in zip(self.parameters, statuses, strict=True) if status != FIXED]
-            settings = Objective(self.replays, base, fitted).fit(scale=solution.scale).settings if fitted else base
-            if self._error(settings) <= most or not spare:
-                return settings, statuses
-            statuses[spare.pop(0)] = STAND_IN
+    errors = {s.settings.attachment: replays.error(s.settings) for s in solutions}
+    best, *others = sorted(solutions, key=lambda s: float(blocks(s).mean()))
+    reason = ""
+    for other in others:
+        difference = blocks(other) - blocks(best)
+        middle, count = float(difference.mean()), len(difference)
+        half = float(stdtrit(count - 1, 0.975) * difference.std(ddof=1) / np.sqrt(count))
+        if middle < max(0.05, half):  # % of the length, and the noise
+            reason = f"{other.settings.attachment} is worse by {middle:.2g} ± {half:.2g} % of the length only"
+            best = next(s for s in solutions if s.settings.attachment == start.attachment)
+    return best, AttachmentDecision(best.settings.attachment, start.attachment, errors, reason)
 
-    def _status(self, solution: FitSolution, index: int, each: Identifiability) -> str:
-        """Return what becomes of a number at first: the setup's is kept unless the data contradict it."""
-        if not each.reason:
-            return IDENTIFIED
-        parameter = self.parameters[index]
-        off = abs(parameter.to_fit(parameter.read(self.start)) - float(solution.x[index]))
-        return STAND_IN if off > each.half else FIXED
 
-    def _error(self, settings: ThreadModelSettings) -> float:
+def _fit_identified(
+    replays: Replays, solution: FitSolution, found: Sequence[Identifiability], start: ThreadModelSettings
+) -> tuple[ThreadModelSettings, list[str]]:
+    """Return the fit of what can be identified, and what became of each number.
+
+    What cannot be identified stays as the setup has it, unless the data contradict that, or predictions get worse.
+    """
+    parameters, statuses = solution.parameters, []
+    for parameter, x, each in zip(parameters, solution.x.tolist(), found, strict=True):
+        is_contradicted = abs(parameter.to_fit(parameter.read(start)) - x) > each.half
+        statuses.append(IDENTIFIED if not each.reason else STAND_IN if is_contradicted else FIXED)
+    if not any(each.reason for each in found):
+        return solution.settings, statuses
+
+    def error(settings: ThreadModelSettings) -> float:
         """Return the mean distance across the thread [% of length]."""
-        pairs = zip(self.replays.of([settings])[0], self.replays.runs, strict=True)
-        return float(np.mean([mean_across(v, p, settings.thread_length) for v, p in pairs]))
+        pairs = zip(replays.of([settings])[0], replays.runs, strict=True)
+        return float(np.mean([mean_across(v, run, settings.thread_length) for v, run in pairs]))
 
-    def _held_out(self, settings: ThreadModelSettings, fitted: Sequence[Parameter], scale: float, index: int) -> Points:
-        """Return what is predicted of a run by a fit to the others."""
-        others = [other for other in range(len(self.replays.runs)) if other != index]
-        if fitted:
-            settings = Objective(self.replays, settings, fitted, others).fit(scale=scale).settings
-        return self.replays.of([settings], [index])[0][0]
+    spare = [index for index, status in enumerate(statuses) if status == FIXED]
+    spare.sort(key=lambda i: (parameters[i] is not STIFFNESS_OVER_DRAG, -found[i].effect))
+    most = error(solution.settings) + 0.1  # % of the length; a default that is worse gives way to what was fitted
+    while True:
+        base = replace(start, attachment=solution.settings.attachment)
+        fitted = [parameter for parameter, status in zip(parameters, statuses, strict=True) if status != FIXED]
+        for parameter in fitted:
+            base = parameter.write(base, parameter.read(solution.settings))
+        settings = Objective(replays, base, fitted).fit(scale=solution.scale).settings if fitted else base
+        if error(settings) <= most or not spare:
+            return settings, statuses
+        statuses[spare.pop(0)] = STAND_IN
 
-    def _estimate(
-        self, solution: FitSolution, index: int, each: Identifiability, status: str, settings: ThreadModelSettings
-    ) -> Estimate:
+
+@dataclass(frozen=True)
+class FitSolution:
+    """Where a fit ended.
+
+    Attributes:
+        settings: with the fitted numbers.
+        parameters: that were fitted.
+        x: their numbers, in the scale of the fit, shape (P,).
+        residuals: of each run, shape (K, n).
+        jacobian: of each run, d residual / d x, shape (K, n, P).
+        scale: beyond which residuals count by their size only, as a share of the length; inf for none.
+        cost: what was made least; comparable for the same scale only.
+    """
+
+    settings: ThreadModelSettings
+    parameters: tuple[Parameter, ...]
+    x: Array
+    residuals: list[Array]
+    jacobian: list[Array]
+    scale: float
+    cost: float
+
+    @property
+    def weights(self) -> list[Array]:
+        """Weight of each residual: rho'((r / scale)^2) of the robust loss, shape (K, n) for each run."""
+        return [1.0 / np.sqrt(1.0 + (r / self.scale) ** 2) for r in self.residuals]
+
+    def at_bound(self, index: int) -> bool:
+        """Whether a number ended at a bound."""
         parameter = self.parameters[index]
-        value = parameter.read(settings)
-        low = high = math.nan
-        if np.isfinite(each.half):
-            middle = parameter.to_fit(value) if status == IDENTIFIED else float(solution.x[index])
-            low, high = parameter.interval(middle, each.half)
-        start, effect = parameter.read(self.start), 100.0 * each.effect
-        named = parameter.name, parameter.setting, parameter.unit
-        return Estimate(*named, value, start, low, high, status, each.reason, effect, parameter.kind == "log")
+        low, high = parameter.fit_bounds(self.settings)
+        near = 0.02 * parameter.counts(self.settings)
+        return not low + near < self.x[index] < high - near
+
+
+class Objective:
+    """Residuals and their derivatives over some parameters and runs.
+
+    Args:
+        replays: of all runs.
+        base: settings that the parameters change.
+        parameters: to fit.
+        which: runs that count; all if None.
+        whole: whether residuals are those of `offset_residuals`, in both directions, and not of `across_residuals`.
+    """
+
+    def __init__(
+        self,
+        replays: Replays,
+        base: ThreadModelSettings,
+        parameters: Sequence[Parameter],
+        which: Sequence[int] | None = None,
+        *,
+        whole: bool = False,
+    ) -> None:
+        self.base, self.parameters = base, tuple(parameters)
+        self._which = tuple(range(len(replays.runs)) if which is None else which)
+        self._replays, self._runs = replays, [replays.runs[index] for index in self._which]
+        self._residuals = offset_residuals if whole else across_residuals
+        self._units = np.array([parameter.counts(base) for parameter in parameters])
+        self._low, self._high = np.array([parameter.fit_bounds(base) for parameter in parameters]).reshape(-1, 2).T
+
+    def start(self) -> Array:
+        """Return the numbers of the base, moved inside of their bounds."""
+        x = np.array([parameter.to_fit(parameter.read(self.base)) for parameter in self.parameters])
+        margin = 0.01 * np.minimum(self._units, self._high - self._low)
+        return np.asarray(np.clip(x, self._low + margin, self._high - margin))
+
+    def settings(self, x: Array) -> ThreadModelSettings:
+        """Return the settings of some numbers."""
+        settings = self.base
+        for parameter, number in zip(self.parameters, x.tolist(), strict=True):
+            low, high = parameter.bounds(settings)  # of which a logarithm may miss the last bits
+            settings = parameter.write(settings, min(max(parameter.from_fit(number), low), high))
+        return settings
+
+    def residuals(self, *points: Array) -> list[list[Array]]:
+        """Return the residuals of each run that counts, at each point."""
+        found, length = self._replays.of([self.settings(x) for x in points], self._which), self.base.thread_length
+        return [
+            [self._residuals(v, run, length) for v, run in zip(vertices, self._runs, strict=True)] for vertices in found
+        ]
+
+    def jacobian(self, x: Array) -> list[Array]:
+        """Return derivatives by difference quotients, away from the nearer bound; shape (K, n, P) of each run."""
+        # Predictions of `paper` jump by 0.01 % of the length from one number to the next.
+        lengths = (0.5 if self.base.formulation == "paper" else 0.01) * self._units
+        steps = lengths * np.where(x + lengths <= self._high, 1.0, -1.0)
+        middle, *moved = self.residuals(x, *(x + np.diag(steps)))
+        return [
+            np.array([(end[run] - begin) / step for end, step in zip(moved, steps, strict=True)])
+            .reshape(-1, *begin.shape)
+            .transpose(1, 2, 0)
+            for run, begin in enumerate(middle)
+        ]
+
+    def fit(self, start: Array | None = None, scale: float = np.inf) -> FitSolution:
+        """Return the best numbers near a start.
+
+            min over x  sum rho(r(x)^2 / scale^2),    rho(z) = 2 (sqrt(1 + z) - 1)
+
+        Args:
+            start: numbers to begin with; those of the base if None.
+            scale: of the robust loss, as a share of the length; inf for plain least squares.
+
+        Source: nonlinear least squares by scipy, trust region reflective.
+        """
+        first = self.start() if start is None else np.clip(start, self._low, self._high)
+        x, cost = first, 0.0
+        if self.parameters:  # else only the attachment is asked for
+            units = self._units
+
+            def residuals_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+                return np.concatenate([part.ravel() for part in self.residuals(first + units * y)[0]])
+
+            def jacobian_at(y: NDArray[np.float64]) -> NDArray[np.float64]:
+                parts = [part.reshape(-1, len(first)) for part in self.jacobian(first + units * y)]
+                return np.asarray(units * np.concatenate(parts))
+
+            found = least_squares(
+                residuals_at,
+                np.zeros(len(first)),
+                jac=jacobian_at,
+                bounds=((self._low - first) / units - 1e-9, (self._high - first) / units + 1e-9),
+                ftol=1e-4,
+                xtol=1e-3,
+                gtol=1e-10,
+                loss="linear" if np.isinf(scale) else "soft_l1",
+                f_scale=1.0 if np.isinf(scale) else scale,
+                max_nfev=15,
+            )
+            x, cost = np.clip(first + units * found.x, self._low, self._high), float(found.cost)
+        residuals = self.residuals(x)[0]
+        return FitSolution(self.settings(x), self.parameters, x, residuals, self.jacobian(x), scale, cost)
+
+
+def robust_scale(residuals: Sequence[Array]) -> float:
+    """Return the scale of the robust loss: three times the scatter of the residuals, by their median size."""
+    sizes = np.abs(np.concatenate([part[part != 0.0] for part in residuals]))
+    middle = float(np.median(sizes)) if len(sizes) else 0.0
+    return max(3.0 * 1.4826 * middle, 1e-3)
+
+
+def initial_guesses(
+    replays: Replays, start: ThreadModelSettings, parameters: Sequence[Parameter], both: bool
+) -> list[ThreadModelSettings]:
+    """Return the best initial settings of each attachment that may be right.
+
+    Stiffnesses from a hundredth to a hundred times the material's are tried with each attachment, and the best local
+    minima fitted, all else as the setup has it, by the whole distance of prediction and thread.
+
+    Args:
+        replays: of all runs.
+        start: what the setup says.
+        parameters: that will be fitted.
+        both: whether the attachment is asked for.
+    """
+    kinds = [kind.value for kind in Attachment] if both else [start.attachment]
+    bases = [replace(start, attachment=kind) for kind in kinds]
+    if start.formulation == "paper":  # whose error has several minima in kappa and W_stiff
+        tried = [start]
+        for parameter, values in (
+            (DAMPING, (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)),
+            (STIFFNESS_WEIGHT, (1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6)),
+        ):
+            if parameter in parameters:
+                tried = [parameter.write(settings, value) for settings in tried for value in values]
+        replays.of(tried)
+        replays.report(f"tried {len(tried)} starts")
+        return [min(tried, key=replays.error)]
+    if STIFFNESS_OVER_DRAG not in parameters:
+        return bases
+    tried = []
+    for base in bases:
+        low, high = STIFFNESS_OVER_DRAG.bounds(base)
+        stiffnesses = np.clip(np.array(STARTS) * stiffness_over_drag(base), low, high).tolist()
+        tried += [with_stiffness_over_drag(base, stiffness) for stiffness in stiffnesses]
+    replays.of(tried)  # at once, so that all cores have work
+    errors, found = np.reshape([replays.error(settings) for settings in tried], (len(bases), -1)), []
+    for index in _not_much_worse(errors.min(axis=1).tolist(), 3.0, 1.0):
+        objectives = [
+            Objective(replays, tried[index * len(STARTS) + place], [STIFFNESS_OVER_DRAG], whole=True)
+            for place in local_minima(errors[index].tolist())[:2]
+        ]
+        found.append(min((objective.fit() for objective in objectives), key=lambda fit: fit.cost).settings)
+    replays.report(f"tried {len(tried)} starts")
+    return [found[i] for i in _not_much_worse([replays.error(s) for s in found], 2.0, 0.05)]
+
+
+def _not_much_worse(errors: Sequence[float], times: float, by: float) -> list[int]:
+    """Return the indices of the least error, and of those not larger by a factor or by so much [% of length]."""
+    least = min(errors)
+    return [index for index, error in enumerate(errors) if error <= max(times * least, least + by)]
+
+
+def local_minima(values: Sequence[float]) -> list[int]:
+    """Return where a row of values has local minima, the least first.
+
+    >>> local_minima([3.0, 1.0, 2.0, 0.5])
+    [3, 1]
+    """
+    padded = [np.inf, *values, np.inf]
+    lows = [i for i, value in enumerate(values) if value < padded[i] and value <= padded[i + 2]]
+    return sorted(lows, key=lambda i: values[i]) or [0]
+
+
+class Identifiability(NamedTuple):
+    """Identifiability of one parameter, with its confidence interval.
+
+    Attributes:
+        reason: why it cannot be identified; empty if it can.
+        half: half of its 95 % interval, in the scale of the fit.
+        effect: of a change that counts, as a share of the length.
+    """
+
+    reason: str
+    half: float
+    effect: float
+
+
+class Uncertainty(NamedTuple):
+    """How well numbers are determined.
+
+    Attributes:
+        half: half of the 95 % interval of each, in the scale of the fit, shape (P,).
+        effect: mean size of d residual / d x of each that no other makes up for, as a share of the length, shape (P,).
+        correlation: of their estimates, from J' W J, shape (P, P).
+    """
+
+    half: Array
+    effect: Array
+    correlation: Array
+
+
+def estimate_uncertainty(solution: FitSolution, runs: Sequence[RecordedRun], columns: Sequence[int]) -> Uncertainty:
+    """Return how well some of a solution's numbers are determined, the others taken as they are.
+
+    Args:
+        solution: of a fit.
+        runs: that it was fitted to.
+        columns: of the numbers.
+    """
+    jacobian = [j[..., list(columns)] for j in solution.jacobian]
+    flat = np.concatenate([j[run.known] for j, run in zip(jacobian, runs, strict=True)])
+    weights = np.concatenate([w[run.known] for w, run in zip(solution.weights, runs, strict=True)])
+    size = np.maximum(np.sqrt((weights[:, None] * flat**2).sum(axis=0)), MIN_EFFECT)
+    inverse = np.linalg.pinv((flat / size).T @ (weights[:, None] * flat / size), rcond=1e-12, hermitian=True)
+    deviation = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
+    correlation = np.clip(inverse / np.outer(deviation, deviation), -1.0, 1.0)
+    effect = np.array([_own_effect(flat, weights, index) for index in range(len(columns))])
+    blocks, whole = [], []  # J' W r of each block of time, and of each run
+    for j, r, w, run in zip(jacobian, solution.residuals, solution.weights, runs, strict=True):
+        by_frame, block = np.einsum("knp,kn->kp", j / size, w * r), run.blocks
+        blocks += [by_frame[block == index].sum(axis=0) for index in np.unique(block)]
+        whole.append(by_frame.sum(axis=0))
+    half = _half(inverse, np.array(blocks))
+    if len(runs) >= 3:
+        half = np.maximum(half, _half(inverse, np.array(whole)))
+    return Uncertainty(half / size + CHAIN / np.maximum(effect, MIN_EFFECT), effect, correlation)
+
+
+def _half(inverse: Array, scores: Array) -> Array:
+    """Return half of each 95 % interval by the scores of blocks, shape (G, P)."""
+    count = len(scores)
+    if count < 2:
+        return np.full(scores.shape[1], np.inf)
+    middle = count / (count - 1.0) * scores.T @ scores
+    variance = np.maximum(np.diag(inverse @ middle @ inverse), 0.0)
+    return np.asarray(stdtrit(count - 1, 0.975) * np.sqrt(variance))
+
+
+def _own_effect(flat: Array, weights: Array, index: int) -> float:
+    """Return the mean size of a column of the Jacobian, less what the other columns make up for."""
+    own, others = flat[:, index], np.delete(flat, index, axis=1)
+    if others.shape[1]:
+        root = np.sqrt(weights)[:, None]
+        scale = np.maximum(np.linalg.norm(root * others, axis=0), MIN_EFFECT)
+        own = own - (others / scale) @ np.linalg.lstsq(root * others / scale, root[:, 0] * own, rcond=None)[0]
+    return float(np.abs(own).mean())
+
+
+def assess_identifiability(solution: FitSolution, runs: Sequence[RecordedRun]) -> list[Identifiability]:
+    """Return the identifiability of each parameter of a solution.
+
+    Args:
+        solution: of a fit to all that is unknown.
+        runs: that it was fitted to.
+    """
+    parameters, settings = solution.parameters, solution.settings
+    counts = np.array([parameter.counts(settings) for parameter in parameters])
+    found: dict[int, Identifiability] = {}
+    for index, parameter in enumerate(parameters):
+        if solution.at_bound(index):
+            reason = f"the fit ends at its bound, {parameter.from_fit(float(solution.x[index])):.3g}"
+            found[index] = Identifiability(reason, np.inf, 0.0)
+    left = [index for index in range(len(parameters)) if index not in found]
+    while left:
+        uncertainty = estimate_uncertainty(solution, runs, left)
+        half, effect = uncertainty.half.tolist(), (uncertainty.effect * counts[left]).tolist()
+        pairs = np.abs(uncertainty.correlation - np.eye(len(left)))
+        if pairs.max() <= 0.95:
+            for index, own_half, own_effect in zip(left, half, effect, strict=True):
+                reason = _reason(solution, index, own_effect, own_half, runs)
+                found[index] = Identifiability(reason, own_half, own_effect)
+            break
+        one, other = sorted(np.unravel_index(int(pairs.argmax()), pairs.shape), key=lambda place: effect[place])
+        name, value = parameters[left[other]].name, uncertainty.correlation[one, other]
+        reason = f"cannot be told apart from {name}: correlation {value:.2f}"
+        found[left.pop(one)] = Identifiability(reason, half[one], effect[one])
+    return [found[index] for index in range(len(parameters))]
+
+
+def _reason(solution: FitSolution, index: int, effect: float, half: float, runs: Sequence[RecordedRun]) -> str:
+    """Return why a parameter cannot be identified; empty if it can."""
+    parameter, settings, x = solution.parameters[index], solution.settings, float(solution.x[index])
+    length, speed, is_plain = settings.thread_length, min(run.speed for run in runs), parameter.kind == "plain"
+    if parameter is STIFFNESS_OVER_DRAG and speed > 0.0:
+        bend = float(np.cbrt(parameter.from_fit(x) / speed))
+        if bend < 0.07 * length:  # silk of 150 mm has 0.03, polyamide of 19 mm 0.2 to 0.6
+            part = f"{1e3 * bend:.1f} mm, {bend / length:.1%} of the thread"
+            return f"bending acts within {part} only; elsewhere it goes where it is pulled, however stiff"
+    if effect < FLOOR:
+        change = f"{parameter.counts(settings):.3g} {parameter.unit}" if is_plain else "a factor of two"
+        moved = f"{change} moves the prediction by {100.0 * effect:.2g} % of the length only"
+        return f"{moved}, less than the {100.0 * FLOOR:g} % that camera, tracker and model are wrong by"
+    if half > (parameter.counts(settings) if is_plain else np.log(1.5)):
+        low, high = parameter.interval(x, half)
+        return f"its 95 % interval is {low:.3g} to {high:.3g} {parameter.unit}".rstrip() + ", too wide to be of use"
+    return ""

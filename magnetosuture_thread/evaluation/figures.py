@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from magnetosuture_thread.evaluation.metrics import (
     Consistency,
-    HiddenShares,
     MinimumMargin,
     Percentiles,
     RunMetrics,
@@ -21,7 +21,6 @@ from magnetosuture_thread.thread.margins import SOLID
 STAGES = ("frame to needle pose", "frame to prediction", "command to currents")
 AGAINST = {"truth": "the ground truth", "seen": "the measured centreline"}
 EXACT = 1e-3  # of a segment's length: what the solvers' tolerance leaves
-TOUCH = 1e-6  # m; a node this deep in an obstacle still counts as touching it
 # Of threads on light and on dark ground, told apart by red-green blind readers too; as on the operator's page.
 COLOURS = {
     "measured": ("#2f7bff", "#5b8cff"),
@@ -144,8 +143,7 @@ class BagDetails:
     software: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Headline:
+class Headline(NamedTuple):
     """One figure of the page's head.
 
     Attributes:
@@ -165,8 +163,7 @@ class Headline:
 
 def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
     """Return the figures of the page's head, in their order."""
-    metrics, interval = figures.metrics, figures.interval
-    estimation = metrics.estimation
+    metrics, estimation = figures.metrics, figures.metrics.estimation
     kinds = {"estimate": metrics.errors("estimate_error")} if estimation.estimated else {}
     kinds["prediction"] = metrics.errors()
     found = [
@@ -176,19 +173,11 @@ def headlines(about: BagDetails, figures: Figures) -> list[Headline]:
         if target in errors
     ]
     if estimation.hidden is not None:
-        found += [_consistency(estimation.consistency), _hidden(estimation.hidden)]
+        found.append(_consistency(estimation.consistency))
     for parameter in estimation.learned:
         value, range_95 = str(parameter).split(", ", 1)
-        name = parameter.name.replace("_", " ")
-        found.append(Headline(name, value, range_95, "none", "learned by the estimate"))
-    found += [_frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
-    if math.isfinite(tension := metrics.maximum("tension")):
-        pull = f"of a segment; the thread pulls the needle with at most {micronewtons(metrics.maximum('pull'))}"
-        found.append(Headline("peak tension", micronewtons(tension), pull, "none", "by the model's multipliers"))
-    found.append(_duration("model step", metrics.percentiles("step_time"), interval, "one step of the thread model"))
-    if processing := Percentiles.of(metrics.observed.column("processing")):
-        found.append(_duration("tracker", processing, interval, "one camera frame"))
-    return [*found, _latency(figures)]
+        found.append(Headline(parameter.name.replace("_", " "), value, range_95, "none", "learned by the estimate"))
+    return [*found, _frames(figures), _margin(about, metrics), _strain(metrics.maximum("strain"))]
 
 
 def _grade(value: float, good: float, middling: float, *words: str) -> tuple[str, str]:
@@ -202,7 +191,9 @@ def _error(about: BagDetails, found: Mapping[str, float] | None, name: str, targ
         missing = "not in this bag" if target == "truth" else "no frame shows half of the thread"
         return Headline(name, "none", missing, "none", "not scored")
     millimetres = format_number(10.0 * found["mean"] * about.length)
-    detail = f"mean over {_frames_of(found['count'])}; {millimetres} mm. Maximum {format_number(found['maximum'])} %"
+    detail = (
+        f"mean over {_count(found['count'], 'frame')}; {millimetres} mm. Maximum {format_number(found['maximum'])} %"
+    )
     grade = _grade(found["mean"], 1.0, 5.0, "close", "off, but usable", "far off")
     return Headline(name, f"{format_number(found['mean'])} %", detail, *grade)
 
@@ -212,22 +203,14 @@ def _consistency(found: Consistency | None) -> Headline:
     if found is None:
         return Headline(name, "none", "no measurement went into the estimate", "none", "a prediction only")
     low, high = found.band
-    windows = "1 window" if found.windows == 1 else f"{found.windows} windows"
-    detail = f"mean; in its 95 % band, {low:.2f} to {high:.2f}, in {found.within} of {windows} of {found.width:.1f} s"
-    grade = _grade(-found.share, -0.9, -0.5, "consistent", "often off", "not consistent")
+    within = f"{found.within} of {_count(found.windows, 'window')} of {found.width:.1f} s"
+    detail = f"mean; in its 95 % band, {low:.2f} to {high:.2f}, in {within}"
+    grade = _grade(-found.within / found.windows, -0.9, -0.5, "consistent", "often off", "not consistent")
     return Headline(name, format_number(found.mean), detail, *grade)
 
 
-def _hidden(found: HiddenShares) -> Headline:
-    words = "never" if found.time == 0.0 else "always" if found.time > 1.0 - 1e-9 else "at times"
-    detail = f"of the time, in part or all; {100.0 * found.length:.1f} % of the length in the mean"
-    if found.all_time > 0.0:
-        detail += f"; nothing measured in {100.0 * found.all_time:.1f} % of the time"
-    return Headline("thread hidden", f"{100.0 * found.time:.1f} %", detail, "none" if found.time else "good", words)
-
-
-def _frames_of(count: float) -> str:
-    return "1 frame" if count == 1 else f"{count:.0f} frames"
+def _count(count: float, thing: str) -> str:
+    return f"1 {thing}" if count == 1 else f"{count:.0f} {thing}s"
 
 
 def _frames(figures: Figures) -> Headline:
@@ -251,16 +234,16 @@ def _margin(about: BagDetails, metrics: RunMetrics) -> Headline:
     worst = min(minima, key=lambda least: least.clearance - _min_clearance(about, least))
     if not broken:
         worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
-    touching = f"; touches in {_frames_of(metrics.contact_frames)}" if metrics.contact_frames else ""
+    touching = f"; touches in {_count(metrics.contact_frames, 'frame')}" if metrics.contact_frames else ""
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
-    grade, words = ("bad", f"broken: {', '.join(broken)}") if broken else ("good", "every barrier holds")
+    grade = ("bad", f"broken: {', '.join(broken)}") if broken else ("good", "every barrier holds")
     name = f"minimum margin, {worst.kind.replace('_', ' ')}"
-    return Headline(name, micrometres(worst.clearance), detail, grade, words)
+    return Headline(name, micrometres(worst.clearance), detail, *grade)
 
 
 def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
     """Return what a margin may be at the least, within the solvers' tolerance [m]."""
-    return -TOUCH if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
+    return -1e-6 if least.kind in SOLID else -EXACT * about.length / max(about.segments, 1)
 
 
 def _holds(about: BagDetails, least: MinimumMargin) -> bool:
@@ -276,34 +259,8 @@ def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
 
 
 def _strain(strain: float) -> Headline:
-    grade = "none", "not known"
-    if math.isfinite(strain):
-        grade = _grade(strain, EXACT, 0.01, "inextensible", "more than 0.1 %", "more than 1 %")
-    value = f"{format_number(100.0 * strain)} %" if math.isfinite(strain) else "none"
-    return Headline("maximum stretch", value, "of a segment, either way", *grade)
-
-
-def _duration(name: str, found: Percentiles | None, interval: float, detail: str) -> Headline:
-    if found is None:
-        return Headline(f"{name}, median", "none", detail, "none", "not known")
-    grade = "none", "frame rate not known"
-    if interval > 0.0:
-        fast = f"keeps up with {1.0 / interval:.3g} frames/s"
-        slow = "slower than the frames, on this machine"
-        grade = _grade(found.p99 / interval, 0.5, 1.0, fast, "just keeps up", slow)
-    detail = f"{detail}; 99th percentile {milliseconds(found.p99)}"
-    return Headline(f"{name}, median", milliseconds(found.median), detail, *grade)
-
-
-def _latency(figures: Figures) -> Headline:
-    name, live = "latency, frame to prediction", figures.live
-    found = live.latency.get("frame to prediction")
-    if found is None:
-        return Headline(name, "none", "measured only where the running graph was recorded", "none", live.remark)
-    detail = f"median; 99th percentile {milliseconds(found.p99)}"
-    soon = found.p99 <= 2.0 * figures.interval
-    grade, words = ("good", "within two frames") if soon else ("middling", "longer than two frames")
-    return Headline(name, milliseconds(found.median), detail, grade, words)
+    grade = _grade(strain, EXACT, 0.01, "inextensible", "more than 0.1 %", "more than 1 %")
+    return Headline("maximum stretch", f"{format_number(100.0 * strain)} %", "of a segment, either way", *grade)
 
 
 def format_number(value: float) -> str:

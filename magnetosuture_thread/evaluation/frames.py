@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,11 +25,15 @@ BIN = 0.5  # s; of each bin the worst frame is kept
 SILENT_PERIODS = 5.0  # usual intervals; a longer one without frames is a gap
 
 
+def _nothing() -> Array:
+    return np.empty(0)
+
+
 def _no_points() -> Points:
     return np.empty((0, 2))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Observation:
     """Measured needle and thread of one camera frame, or of one recorded pose.
 
@@ -47,15 +51,15 @@ class Observation:
     """
 
     stamp: int
-    tail: Array = field(default_factory=lambda: np.empty(0))
-    heading: Array = field(default_factory=lambda: np.empty(0))
+    tail: Array = field(default_factory=_nothing)
+    heading: Array = field(default_factory=_nothing)
     measured: Points = field(default_factory=_no_points)
     ground_truth: Points = field(default_factory=_no_points)
     reason: str = ""
     processing: float = math.nan
     observation: ThreadObservation | None = None
     deviation: tuple[float, float] = (0.0, 0.0)
-    true_pull: Array = field(default_factory=lambda: np.empty(0))
+    true_pull: Array = field(default_factory=_nothing)
 
     @property
     def found(self) -> bool:
@@ -78,7 +82,7 @@ class EstimatedThread:
 
     vertices: Points
     corrected: bool = False
-    squared: Array = field(default_factory=lambda: np.empty(0))
+    squared: Array = field(default_factory=_nothing)
     disturbances: tuple[Disturbance, ...] = ()
     hidden: float = 1.0
     learned: tuple[SlowParameter, ...] = ()
@@ -86,61 +90,40 @@ class EstimatedThread:
     @classmethod
     def of(cls, estimate: ThreadEstimate) -> EstimatedThread:
         """Return what is kept of an estimate."""
-        return cls(
-            estimate.positions,
-            estimate.corrected,
-            np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared,
-            estimate.disturbances,
-            estimate.hidden,
-            estimate.slow_parameters,
-        )
+        squared = np.empty(0) if estimate.innovations is None else estimate.innovations.normalised_squared
+        learned = estimate.slow_parameters
+        return cls(estimate.positions, estimate.corrected, squared, estimate.disturbances, estimate.hidden, learned)
 
 
-@dataclass
-class FrameResult:
-    """Predicted and estimated thread of one frame, beside the measured one and the ground truth.
+@dataclass(kw_only=True)
+class FrameResult(Observation):
+    """Predicted and estimated thread of one frame, with what was measured in it.
 
     Attributes:
-        stamp: of the frame [ns].
         vertices: predicted thread, shape (n + 1, 2) [m].
         strain: greatest absolute strain of a segment.
         residual: of the solves.
         step_time: of the model [s].
         tension: greatest tension of a segment [N]; nan where no force is known.
         pull: of the thread upon the needle, shape (2,) [N]; shape (0,) where no force is known.
-        true_pull: the same by the ground truth, shape (2,) [N]; shape (0,) where the bag does not hold it.
         margins: None if they prove nothing.
-        in_contact: whether the thread touches an obstacle or the wall.
-        measured: the thread's centreline, shape (m, 2) [m].
-        ground_truth: of the thread, if the bag holds it, shape (m, 2) [m].
-        tail: the needle's measured tail, shape (2,) [m].
-        heading: the needle's measured angle [rad].
         obstacles: in force.
         recorded: the prediction that the bag holds of the same frame, shape (n + 1, 2) [m].
         errors: prediction error by target, `truth` and `seen` [% of length]; set when it is computed.
         estimate: of the thread; None where there is none.
-        observation: pieces of the thread that were measured; None where there is the centreline alone.
     """
 
-    stamp: int
     vertices: Points = field(default_factory=_no_points)
     strain: float = math.nan
     residual: float = math.nan
     step_time: float = math.nan
     tension: float = math.nan
-    pull: Array = field(default_factory=lambda: np.empty(0))
+    pull: Array = field(default_factory=_nothing)
     margins: Margins | None = None
-    in_contact: bool = False
-    measured: Points = field(default_factory=_no_points)
-    ground_truth: Points = field(default_factory=_no_points)
-    tail: Points = field(default_factory=lambda: np.empty(0))
-    heading: float = math.nan
     obstacles: tuple[Obstacle, ...] = ()
     recorded: Points | None = None
     errors: dict[str, float] = field(default_factory=dict)
     estimate: EstimatedThread | None = None
-    observation: ThreadObservation | None = None
-    true_pull: Array = field(default_factory=lambda: np.empty(0))
 
     @classmethod
     def of(
@@ -155,7 +138,7 @@ class FrameResult:
         recorded: Points | None = None,
         obstacles: tuple[Obstacle, ...] = (),
     ) -> FrameResult:
-        """Return a prediction beside the observation that it is of.
+        """Return a prediction with the observation that it is of.
 
         Args:
             observation: with a needle.
@@ -167,27 +150,20 @@ class FrameResult:
             recorded: the prediction of the same frame that the bag holds.
             obstacles: in force.
         """
-        kept = EstimatedThread.of(estimate) if estimate is not None else None
+        instead = EstimatedThread(prediction.positions) if estimated else None
         forces = prediction.forces
         return cls(
-            stamp=observation.stamp,
+            **vars(observation),
             vertices=prediction.positions,
-            strain=float(np.maximum.reduce(np.abs(prediction.strain), initial=0.0)),
+            strain=float(np.abs(prediction.strain).max(initial=0.0)),
             residual=prediction.residual,
             step_time=step_time,
             tension=math.nan if forces is None else forces.peak_tension,
             pull=np.empty(0) if forces is None else np.asarray(forces.needle_force),
             margins=margins,
-            in_contact=margins is not None and bool(margins.in_contact),
-            measured=observation.measured,
-            ground_truth=observation.ground_truth,
-            tail=observation.tail,
-            heading=math.atan2(observation.heading[1], observation.heading[0]),
             obstacles=obstacles,
             recorded=recorded,
-            estimate=EstimatedThread(prediction.positions) if kept is None and estimated else kept,
-            observation=observation.observation,
-            true_pull=observation.true_pull,
+            estimate=instead if estimate is None else EstimatedThread.of(estimate),
         )
 
     def target_curve(self, target: str) -> Points:
@@ -219,34 +195,22 @@ class FrameResult:
 class TimeSeries:
     """Columns of numbers that grow by a row a frame, at 8 bytes a number.
 
-    An hour at 30 frames a second is 0.9 MB a column; threads and pictures are not kept here.
-
-    Args:
-        names: of the columns.
+    An hour at 30 frames a second is 0.9 MB a column; threads and pictures are not kept here. A column begins when it
+    first has a value, and is nan before.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self) -> None:
         self._times = array("d")
-        self._columns = {name: array("d") for name in names}
+        self._columns: dict[str, array[float]] = {}
 
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self._times)
 
     def add(self, time: float, values: Mapping[str, float]) -> None:
-        """Add a row; a column that is not named is nan there.
-
-        Args:
-            time: since the bag's start [s].
-            values: by column; a column of a user's barrier (`MARGIN`) begins when it first has a value.
-
-        Raises:
-            KeyError: there is no such column.
-        """
-        for name in values.keys() - self._columns.keys():
-            if not name.startswith(MARGIN):
-                raise KeyError(f"no such columns: {name}")
-            self._columns[name] = array("d", [math.nan] * len(self._times))
+        """Add a row at a time since the bag's start [s]; a column that is not named is nan there."""
+        for name in values:
+            self._columns.setdefault(name, array("d", [math.nan]) * len(self))
         self._times.append(time)
         for name, column in self._columns.items():
             column.append(values.get(name, math.nan))
@@ -262,12 +226,12 @@ class TimeSeries:
         return np.array(self._times)
 
     def column(self, name: str) -> Array:
-        """Return a column."""
-        return np.array(self._columns[name])
+        """Return a column; nan throughout if nothing was added to it."""
+        return np.array(self._columns[name]) if name in self._columns else np.full(len(self), math.nan)
 
     def known(self, name: str) -> Array:
-        """Return the finite numbers of a column; none of one that there is not."""
-        values = np.array(self._columns.get(name, ()), dtype=np.float64)
+        """Return the finite numbers of a column."""
+        values = self.column(name)
         return values[np.isfinite(values)]
 
 
@@ -292,24 +256,21 @@ class WorstFrames:
     """Keeps the frames with the greatest errors, few of them however long the bag is.
 
     Args:
-        count: of frames to find.
-        apart: minimum time between two of them [s].
-        of: whose errors are added, `prediction` or `estimate`.
+        count: of frames to find, `MIN_DISTANCE` apart.
     """
 
-    def __init__(self, count: int = 5, apart: float = MIN_DISTANCE, of: str = "prediction") -> None:
-        self._count, self._apart, self._of = count, apart, of
-        # A frame takes out the bins within `apart` of it, on both sides: no more of the worst bins are needed.
-        self._enough = count * (2 * math.ceil(apart / BIN) + 3)
+    def __init__(self, count: int = 5) -> None:
+        self._count = count
+        # A frame takes out the bins within MIN_DISTANCE of it, on both sides: no more of the worst bins are needed.
+        self._enough = count * (2 * math.ceil(MIN_DISTANCE / BIN) + 3)
         self._bins: dict[int, WorstFrame] = {}
 
-    def add(self, time: float, error: float, frame: FrameResult) -> None:
-        """Add one frame; one without an error is passed over."""
-        bin_ = math.floor(time / BIN)
-        held = self._bins.get(bin_)
-        if not math.isfinite(error) or (held is not None and held.error >= error):
+    def add(self, frame: WorstFrame) -> None:
+        """Add one frame."""
+        bin_ = math.floor(frame.time / BIN)
+        if bin_ in self._bins and self._bins[bin_].error >= frame.error:
             return
-        self._bins[bin_] = WorstFrame(time, error, frame, self._of)
+        self._bins[bin_] = frame
         if len(self._bins) > self._enough + 1:  # the bin that is being filled stays
             del self._bins[min(self._bins.keys() - {bin_}, key=lambda other: self._bins[other].error)]
 
@@ -317,7 +278,7 @@ class WorstFrames:
         """Return the worst frames, the worst first."""
         chosen: list[WorstFrame] = []
         for worst in sorted(self._bins.values(), key=lambda worst: (-worst.error, worst.time)):
-            if all(abs(worst.time - other.time) >= self._apart for other in chosen):
+            if all(abs(worst.time - other.time) >= MIN_DISTANCE for other in chosen):
                 chosen.append(worst)
         return chosen[: self._count]
 
@@ -356,8 +317,6 @@ class ErrorMap:
 
     def add(self, time: float, errors: Array) -> None:
         """Add the errors of one frame's nodes, in % of the length."""
-        if not np.isfinite(errors).any():
-            return
         if self._columns and self._filled < self._frames:
             self._columns[-1] = np.fmax(self._columns[-1], errors)
             self._filled += 1

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -25,10 +24,6 @@ from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
 from magnetosuture_thread.thread_observation import ThreadObservation
-
-TRACKED = 1  # as in the message TrackerState
-WRONG_TAIL = 0.3e-3  # m; a pose farther than this from the ground truth, or ...
-WRONG_HEADING = np.radians(5.0)  # ... turned by more, is wrong
 
 
 @dataclass(frozen=True)
@@ -67,25 +62,25 @@ class CurrentSeries:
         self._received[stamp] = np.asarray(message.current, dtype=np.float64), bool(message.stop)
 
     def against(self, recorded: CurrentSeries) -> CurrentDifference | None:
-        """Compare with the currents in force when recorded, which are so for 0.05 s; None where nothing can be."""
-        stamps = sorted(recorded._received)
-        pairs = []
-        for stamp, own in self._received.items():
-            index = bisect_right(stamps, stamp) - 1
-            if index >= 0 and stamp - stamps[index] <= 50_000_000:
-                other = recorded._received[stamps[index]]
-                if other[0].shape == own[0].shape:
-                    pairs.append((own, other))
+        """Compare with the currents in force when recorded; None where nothing can be."""
+        stamps, own = np.array(sorted(recorded._received), np.int64), sorted(self._received)
+        latest = np.searchsorted(stamps, own, side="right") - 1
+        pairs = [
+            (self._received[stamp], recorded._received[int(stamps[index])])
+            for stamp, index in zip(own, latest, strict=True)
+            if index >= 0 and stamp - stamps[index] <= 50_000_000  # ns, for which currents are in force
+        ]
+        pairs = [(now, then) for now, then in pairs if now[0].shape == then[0].shape]
         if not pairs:
             return None
-        difference = np.abs([own[0] - other[0] for own, other in pairs])
+        difference = np.abs([now[0] - then[0] for now, then in pairs])
         return CurrentDifference(
             compared=len(pairs),
             difference=float(np.median(difference)),
             p99=float(np.percentile(difference, 99)),
             greatest=float(difference.max()),
-            recorded=float(np.sqrt(np.mean(np.square([other[0] for _, other in pairs])))),
-            stopped_apart=float(np.mean([own[1] != other[1] for own, other in pairs])),
+            recorded=_rms(np.array([then[0] for _, then in pairs])),
+            stopped_apart=float(np.mean([now[1] != then[1] for now, then in pairs])),
         )
 
 
@@ -111,15 +106,42 @@ class GraphCollector:
         self.health: dict[str, str] = {}
 
     def add(self, topic: str, message: Any) -> None:
-        """Add one message; topics that concern no frame are ignored."""
-        if topic == interface.DIAGNOSTICS.recorded:
-            self.health.update({status.name.split(":")[0]: status.message for status in message.status})
-        elif topic == interface.CURRENTS.recorded and not message.stop:
-            self.applied.add(nanoseconds(message.command))
-        elif topic in _OF_FRAMES:
-            stamp = nanoseconds(message.header.stamp)
-            _OF_FRAMES[topic](self._frames.setdefault(stamp, FrameResult(stamp)), message)
-            self.poses += topic == interface.NEEDLE_POSE.recorded
+        """Add one message; topics that concern no frame are ignored, and a later message of a frame counts."""
+        match topic:
+            case interface.DIAGNOSTICS.recorded:
+                self.health.update({status.name.split(":")[0]: status.message for status in message.status})
+            case interface.CURRENTS.recorded if not message.stop:
+                self.applied.add(nanoseconds(message.command))
+            case interface.NEEDLE_POSE.recorded:
+                self.poses += 1
+            case interface.MEASURED_THREAD.recorded:
+                self._of(message).measured = _points(each.pose.position for each in message.poses)
+            case interface.GROUND_TRUTH_THREAD.recorded:
+                self._of(message).ground_truth = _points(each.pose.position for each in message.poses)
+            case interface.GROUND_TRUTH_PULL.recorded:
+                self._of(message).true_pull = _in_plane(message.wrench.force)
+            case interface.THREAD_OBSERVATION.recorded:
+                try:
+                    observation = thread_observation(message, interface.THREAD_OBSERVATION.name)
+                except InvalidInputError:
+                    observation = ThreadObservation()
+                self._of(message).observation = observation
+            case interface.ESTIMATED_THREAD.recorded:
+                self._of(message).estimate = _estimate(message)
+            case interface.MARGINS.recorded if message.valid:
+                self._of(message).margins = margins_of(message)
+            case interface.PREDICTED_THREAD.recorded:
+                frame = self._of(message)
+                frame.vertices = _points(message.positions)
+                frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
+                frame.residual, frame.step_time = message.residual, message.step_time
+                if len(tension := getattr(message, "tension", ())):  # older bags have none
+                    frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
+
+    def _of(self, message: Any) -> FrameResult:
+        """Return the frame that a message is about."""
+        stamp = nanoseconds(message.header.stamp)
+        return self._frames.setdefault(stamp, FrameResult(stamp))
 
     def frames(self, first: int = 0, last: int | None = None) -> list[FrameResult]:
         """Return the frames with a prediction, by time; their errors are set by `metrics`.
@@ -139,32 +161,7 @@ class GraphCollector:
         return metrics
 
 
-def _take_pose(frame: FrameResult, message: Any) -> None:
-    *tail, frame.heading = planar_pose(message.pose.pose)
-    frame.tail = np.array(tail)
-
-
-def _take_measured(frame: FrameResult, message: Any) -> None:
-    frame.measured = _points(each.pose.position for each in message.poses)
-
-
-def _take_ground_truth(frame: FrameResult, message: Any) -> None:
-    frame.ground_truth = _points(each.pose.position for each in message.poses)
-
-
-def _take_true_pull(frame: FrameResult, message: Any) -> None:
-    frame.true_pull = _in_plane(message.wrench.force)
-
-
-def _take_observation(frame: FrameResult, message: Any) -> None:
-    try:
-        frame.observation = thread_observation(message, interface.THREAD_OBSERVATION.name)
-    except InvalidInputError:
-        frame.observation = ThreadObservation()
-
-
-def _take_estimate(frame: FrameResult, message: Any) -> None:
-    """Take an estimate; a later one of the same frame takes its place."""
+def _estimate(message: Any) -> EstimatedThread:
     degrees = int(message.innovation_degrees)
     disturbances = tuple(
         Disturbance(
@@ -178,39 +175,9 @@ def _take_estimate(frame: FrameResult, message: Any) -> None:
         )
         for found in message.disturbances
     )
-    frame.estimate = EstimatedThread(
-        _points(message.positions),
-        not message.prediction_only,
-        np.full(degrees, message.innovation_squared / max(degrees, 1)),
-        disturbances,
-        message.hidden,
-    )
-
-
-def _take_prediction(frame: FrameResult, message: Any) -> None:
-    frame.vertices = _points(message.positions)
-    frame.strain = float(np.abs(np.asarray(message.strain)).max(initial=0.0))
-    frame.residual, frame.step_time = message.residual, message.step_time
-    if len(tension := getattr(message, "tension", ())):  # older bags have none
-        frame.tension, frame.pull = float(np.max(tension)), _in_plane(message.needle_force)
-
-
-def _take_margins(frame: FrameResult, message: Any) -> None:
-    if message.valid:
-        frame.margins = margins_of(message)
-        frame.in_contact = bool(frame.margins.in_contact)
-
-
-_OF_FRAMES: dict[str, Callable[[FrameResult, Any], None]] = {
-    interface.NEEDLE_POSE.recorded: _take_pose,
-    interface.MEASURED_THREAD.recorded: _take_measured,
-    interface.THREAD_OBSERVATION.recorded: _take_observation,
-    interface.PREDICTED_THREAD.recorded: _take_prediction,
-    interface.ESTIMATED_THREAD.recorded: _take_estimate,
-    interface.MARGINS.recorded: _take_margins,
-    interface.GROUND_TRUTH_THREAD.recorded: _take_ground_truth,
-    interface.GROUND_TRUTH_PULL.recorded: _take_true_pull,
-}
+    squared = np.full(degrees, message.innovation_squared / max(degrees, 1))
+    vertices = _points(message.positions)
+    return EstimatedThread(vertices, not message.prediction_only, squared, disturbances, message.hidden)
 
 
 def _in_plane(vector: Any) -> Array:
@@ -221,32 +188,67 @@ def _points(points: Iterable[Any]) -> Points:
     return np.array([[point.x, point.y] for point in points]).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class ReplaySummary:
-    """The figures of a replayed bag.
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """The figures that a replay and a closed loop have in common.
 
     Attributes:
-        bag: its path.
         setup: the setup's name.
-        simulated: what was simulated, empty if the bag does not say that anything was.
-        frames: camera frames played, or recorded poses.
-        tracked: frames in which the needle was found.
+        frames: camera frames, lost ones too, or recorded poses.
+        tracked: frames with a pose.
         predicted: frames with a predicted thread.
-        commands: needle velocity commands played.
-        driven: commands that reached the coils.
-        latency: of each stage [s].
+        latency: of each stage, or from a frame's stamp to the arrival of what was made of it [s].
         step_time: of the model's step [s].
-        least_margins: of each kind.
-        contact_frames: predicted frames in which the thread touches an obstacle.
-        stretch: greatest absolute stretch.
-        residual: greatest scaled residual of a solve.
-        peak_tension: greatest tension of a segment [N]; None where no force is known.
-        needle_pull: greatest force of the thread upon the needle [N]; None where no force is known.
+        stretch: greatest absolute stretch of a segment.
         seen_share: part of the thread's length that the camera saw, mean over the predicted frames.
         error_seen: prediction error against the seen centreline [% of length], over `count` frames.
         error_truth: the same against the truth, where the bag holds it.
         prediction: errors of the prediction; see `compare_errors`.
         estimate: errors of the estimate, under the same names.
+    """
+
+    setup: str
+    frames: int
+    tracked: int
+    predicted: int
+    latency: dict[str, Percentiles | None]
+    step_time: Percentiles | None
+    stretch: float
+    seen_share: float
+    error_seen: dict[str, float] | None
+    error_truth: dict[str, float] | None
+    prediction: dict[str, float | None] = field(default_factory=dict)
+    estimate: dict[str, float | None] = field(default_factory=dict)
+
+
+def figures_of(metrics: RunMetrics) -> dict[str, Any]:
+    """Return the fields of `RunSummary` that the metrics of a run give, by their names."""
+    errors = metrics.errors()
+    return {
+        "predicted": len(metrics.series),
+        "step_time": metrics.percentiles("step_time"),
+        "stretch": metrics.maximum("strain"),
+        "seen_share": metrics.mean("seen_share"),
+        "error_seen": errors["seen"],
+        "error_truth": errors["truth"],
+        **compare_errors(metrics.series),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySummary(RunSummary):
+    """The figures of a replayed bag.
+
+    Attributes:
+        bag: its path.
+        simulated: what was simulated, empty if the bag does not say that anything was.
+        commands: needle velocity commands played.
+        driven: commands that reached the coils.
+        least_margins: of each kind.
+        contact_frames: predicted frames in which the thread touches an obstacle.
+        residual: greatest scaled residual of a solve.
+        peak_tension: greatest tension of a segment [N]; None where no force is known.
+        needle_pull: greatest force of the thread upon the needle [N]; None where no force is known.
         estimation: what else there is of the estimate.
         currents: difference of the coils' currents from the recorded ones, where the bag holds any.
         source: `camera`, or `poses` where `frames` are recorded poses.
@@ -259,22 +261,15 @@ class ReplaySummary:
     """
 
     bag: str
-    setup: str
     simulated: str
-    frames: int
-    tracked: int
-    predicted: int
     commands: int
     driven: int
-    latency: dict[str, Percentiles | None]
-    step_time: Percentiles | None
     least_margins: list[MinimumMargin]
     contact_frames: int
-    stretch: float
     residual: float
-    seen_share: float
-    error_seen: dict[str, float] | None
-    error_truth: dict[str, float] | None
+    peak_tension: float | None = None
+    needle_pull: float | None = None
+    estimation: EstimationFigures = field(default_factory=EstimationFigures)
     currents: CurrentDifference | None = None
     source: str = "camera"
     speed: float | None = None
@@ -283,11 +278,6 @@ class ReplaySummary:
     damage: str = ""
     unverified: str = ""
     remark: str = ""
-    prediction: dict[str, float | None] = field(default_factory=dict)
-    estimate: dict[str, float | None] = field(default_factory=dict)
-    estimation: EstimationFigures = field(default_factory=EstimationFigures)
-    peak_tension: float | None = None
-    needle_pull: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
@@ -296,59 +286,35 @@ class ReplaySummary:
         return figures | self.estimation.to_json() | {"disturbances": events}
 
 
-@dataclass(frozen=True)
-class LoopSummary:
+@dataclass(frozen=True, kw_only=True)
+class LoopSummary(RunSummary):
     """The figures of a closed loop. Everything in it is simulated.
 
     Attributes:
-        setup: the scenario's name.
         duration: from the start of the steering until the path was done, or to the end; all figures are of
             this time [s].
-        frames: camera frames, lost ones too.
         skipped: frames that are missing: the rig had no time for them.
-        tracked: frames with a pose.
         lost: frames that the tracker looked at without giving a pose.
         wrong: poses farther from the truth than 0.3 mm or 5 degrees.
-        predicted: frames with a predicted thread.
         saturated: share of the currents at a limit.
         tail_error: distance of the tracked tail from the truth, root of the mean square [m].
         heading_error: of the tracked heading, the same [rad].
         path_error: distance of the needle's true tip from where the path wanted it, the same [m].
         path_error_greatest: greatest such distance [m].
         processing: of a frame in the tracker [s].
-        step_time: of the model's step [s].
-        latency: from a frame's stamp to the arrival of what was made of it [s].
-        error_truth: prediction error against the truth [% of length].
-        error_seen: the same against the seen centreline.
-        seen_share: part of the thread's length that the camera saw, mean.
-        stretch: greatest absolute stretch of a segment.
-        prediction: errors of the prediction; see `compare_errors`.
-        estimate: errors of the estimate, under the same names.
         procedure: what came of a procedure; None for a path that was followed.
     """
 
-    setup: str
     duration: float
-    frames: int
     skipped: int
-    tracked: int
     lost: int
     wrong: int
-    predicted: int
     saturated: float
     tail_error: float
     heading_error: float
     path_error: float
     path_error_greatest: float
     processing: Percentiles | None
-    step_time: Percentiles | None
-    latency: dict[str, Percentiles | None]
-    error_truth: dict[str, float] | None
-    error_seen: dict[str, float] | None
-    seen_share: float
-    stretch: float
-    prediction: dict[str, float | None] = field(default_factory=dict)
-    estimate: dict[str, float | None] = field(default_factory=dict)
     procedure: dict[str, Any] | None = None
 
     def to_json(self) -> dict[str, Any]:
@@ -376,11 +342,6 @@ class LoopCollector:
         self._truth: dict[int, Array] = {}
         self._tracked: dict[int, Array] = {}
         self._setpoints: dict[int, Array] = {}
-        self._poses = {
-            interface.GROUND_TRUTH_NEEDLE.recorded: self._truth,
-            interface.NEEDLE_POSE.recorded: self._tracked,
-            interface.TIP_SETPOINT.recorded: self._setpoints,
-        }
         self._arrived: dict[str, dict[int, int]] = {interface.NEEDLE_POSE.name: {}, interface.PREDICTED_THREAD.name: {}}
         self._states: dict[int, tuple[int, float]] = {}
         self._saturated: list[bool] = []
@@ -392,13 +353,17 @@ class LoopCollector:
         if not hasattr(message, "header"):
             return
         stamp = nanoseconds(message.header.stamp)
-        if topic in self._poses:
-            pose = message.pose.pose if topic == interface.NEEDLE_POSE.recorded else message.pose
-            self._poses[topic][stamp] = np.array(planar_pose(pose))
-        elif topic == interface.TRACKER_STATE.recorded:
-            self._states[stamp] = (message.state, message.processing_time)
-        elif topic == interface.CURRENTS.recorded:
-            self._saturated.append(bool(message.saturated))
+        match topic:
+            case interface.GROUND_TRUTH_NEEDLE.recorded:
+                self._truth[stamp] = np.array(planar_pose(message.pose))
+            case interface.TIP_SETPOINT.recorded:
+                self._setpoints[stamp] = np.array(planar_pose(message.pose))
+            case interface.NEEDLE_POSE.recorded:
+                self._tracked[stamp] = np.array(planar_pose(message.pose.pose))
+            case interface.TRACKER_STATE.recorded:
+                self._states[stamp] = (message.state, message.processing_time)
+            case interface.CURRENTS.recorded:
+                self._saturated.append(bool(message.saturated))
         if topic.lstrip("/") in self._arrived:
             self._arrived[topic.lstrip("/")].setdefault(stamp, time)
 
@@ -417,11 +382,8 @@ class LoopCollector:
             said = "; ".join(f"{name}: {text}" for name, text in sorted(self._threads.health.items()))
             raise GraphError(f"the needle was tracked in no frame; {said}")
         self.instants = self._threads.frames(first, last)
-        metrics = self._threads.metrics(frames=self.instants)
-        errors, compared = metrics.errors(), compare_errors(metrics.series)
         apart = np.array([self._tracked[stamp] - self._truth[stamp] for stamp in both])
-        tail = np.hypot(apart[:, 0], apart[:, 1])
-        heading = np.abs(np.angle(np.exp(1j * apart[:, 2])))
+        tail, heading = np.linalg.norm(apart[:, :2], axis=1), np.abs(np.angle(np.exp(1j * apart[:, 2])))
         off = np.array([np.linalg.norm(self._tip(s) - self._setpoints[s][:2]) for s in both if s in self._setpoints])
         states = [found for stamp, found in self._states.items() if stamp in frames]
         return LoopSummary(
@@ -430,23 +392,19 @@ class LoopCollector:
             frames=len(frames),
             skipped=max(0, round((last - first) * 1e-9 * self._rate) + 1 - len(frames)),
             tracked=len(both),
-            lost=sum(state != TRACKED for state, _ in states),
-            wrong=int(np.sum((tail > WRONG_TAIL) | (heading > WRONG_HEADING))),
-            predicted=len(self.instants),
+            lost=sum(state != 1 for state, _ in states),  # TrackerState.TRACKED
+            wrong=int(np.sum((tail > 0.3e-3) | (heading > np.radians(5.0)))),
             saturated=float(np.mean(self._saturated or [False])),
             tail_error=_rms(tail),
             heading_error=_rms(heading),
             path_error=_rms(off),
             path_error_greatest=float(off.max(initial=0.0)),
             processing=Percentiles.of([taken for _, taken in states]),
-            step_time=metrics.percentiles("step_time"),
-            latency={name: self._latency(arrived) for name, arrived in self._arrived.items()},
-            error_truth=errors["truth"],
-            error_seen=errors["seen"],
-            seen_share=metrics.mean("seen_share"),
-            stretch=metrics.maximum("strain"),
-            prediction=compared["prediction"],
-            estimate=compared["estimate"],
+            latency={
+                name: Percentiles.of([1e-9 * (at - stamp) for stamp, at in arrived.items() if stamp in self._setpoints])
+                for name, arrived in self._arrived.items()
+            },
+            **figures_of(self._threads.metrics(frames=self.instants)),
         )
 
     def _tip(self, stamp: int) -> Points:
@@ -454,9 +412,6 @@ class LoopCollector:
         x, y, heading = self._truth[stamp]
         points, _ = needle_axis(np.array([x, y]), heading, *self._needle, np.ones(1))
         return np.asarray(points[0])
-
-    def _latency(self, arrived: dict[int, int]) -> Percentiles | None:
-        return Percentiles.of([(time - stamp) * 1e-9 for stamp, time in arrived.items() if stamp in self._setpoints])
 
 
 def _rms(values: Array) -> float:

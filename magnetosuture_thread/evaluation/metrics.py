@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.estimator import SlowParameter
 from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import (
-    MARGIN,
     MIN_DISTANCE,
     SILENT_PERIODS,
     Array,
@@ -33,9 +32,7 @@ from magnetosuture_thread.thread.margins import Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
-COLUMNS = ("strain", "residual", "step_time", "tension", "pull", "true_pull", "pull_error", "seen_share")
 MIN_KNOWN_SHARE = 0.5  # of the thread's length must be known, or there is no error
-END_TOLERANCE = 1e-3  # of the length; the chords of a curve are always a little short, and its free end counts
 
 
 @dataclass(frozen=True)
@@ -51,9 +48,7 @@ class Percentiles:
         """Return the percentiles of the finite values, or None if there are none."""
         given = np.asarray(values, dtype=np.float64)
         kept = given[np.isfinite(given)]
-        if not len(kept):
-            return None
-        return cls(float(np.median(kept)), float(np.percentile(kept, 99)), float(kept.max()))
+        return cls(*np.percentile(kept, (50, 99, 100)).tolist()) if len(kept) else None
 
 
 def finite_or_none(value: Any) -> Any:
@@ -61,13 +56,12 @@ def finite_or_none(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def error_figures(errors: ArrayLike) -> dict[str, float] | None:
+def error_figures(errors: Array) -> dict[str, float] | None:
     """Return count, mean, median, p99 and maximum of errors in %; None if there are none."""
-    given = np.asarray(errors, dtype=np.float64)
-    percentiles = Percentiles.of(given)
+    percentiles = Percentiles.of(errors)
     if percentiles is None:
         return None
-    return {"count": int(np.isfinite(given).sum()), "mean": float(np.nanmean(given)), **asdict(percentiles)}
+    return {"count": int(np.isfinite(errors).sum()), "mean": float(np.nanmean(errors)), **asdict(percentiles)}
 
 
 def stage_latencies(
@@ -95,31 +89,27 @@ def stage_latencies(
     }
 
 
-def target_points(curves: Sequence[Points], length: float, segments: int) -> tuple[Array, Array]:
-    """Return where the nodes should be, by curves that start at the needle's tail.
+def target_points(curve: Points, length: float, segments: int) -> tuple[Array, float]:
+    """Return where the nodes should be, by a curve that starts at the needle's tail.
 
         X(s_i),    s_i = i L / n,    i = 1 ... n
 
     Args:
-        curves: centreline of each frame, shape (m, 2) [m]; m may differ, and be 0.
+        curve: centreline, shape (m, 2) [m]; m may be 0.
         length: of the thread, L [m].
         segments: n.
 
     Returns:
-        X, shape (b, n, 2) [m], nan past the end of a curve by more than 0.1 % of L; and the curves' lengths, shape
-        (b,) [m]. A node that is less past the end counts as at the end.
+        X, shape (n, 2) [m], nan past the end of the curve by more than 0.1 % of L; and the curve's length [m]. A node
+        that is less past the end counts as at the end.
     """
-    points, lengths = np.full((len(curves), segments, 2), np.nan), np.zeros(len(curves))
-    at = length * np.arange(1, segments + 1) / segments
-    for index, curve in enumerate(curves):
-        if len(curve) < 2 or not np.isfinite(curve).all():
-            continue
-        arc = arc_lengths(curve)
-        lengths[index] = arc[-1]
-        known = at <= arc[-1] + END_TOLERANCE * length
-        for axis in (0, 1):
-            points[index, known, axis] = np.interp(at[known], arc, curve[:, axis])
-    return points, lengths
+    points = np.full((segments, 2), np.nan)
+    if len(curve) < 2 or not np.isfinite(curve).all():
+        return points, 0.0
+    arc, at = arc_lengths(curve), length * np.arange(1, segments + 1) / segments
+    known = at <= arc[-1] + 1e-3 * length  # the chords of a curve are a little short, and its free end counts
+    points[known] = np.column_stack([np.interp(at[known], arc, axis) for axis in curve.T])
+    return points, float(arc[-1])
 
 
 def node_errors(vertices: Points, targets: Points, length: float) -> Array:
@@ -135,15 +125,7 @@ def node_errors(vertices: Points, targets: Points, length: float) -> Array:
     Returns:
         Shape (..., n); nan where X is not known.
     """
-    offset = vertices[..., 1:, :] - targets
-    return np.asarray(100.0 / length * np.hypot(offset[..., 0], offset[..., 1]))
-
-
-def mean_over_nodes(errors: Array, known: NDArray[np.bool_]) -> Array:
-    """Return the mean over the last axis of errors that are known; nan where none is."""
-    count = known.sum(axis=-1)
-    total = np.where(known, errors, 0.0).sum(axis=-1)
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    return np.asarray(100.0 / length * np.linalg.norm(vertices[..., 1:, :] - targets, axis=-1))
 
 
 def prediction_error_percent(vertices: Points, curve: Points, length: float) -> float:
@@ -163,13 +145,8 @@ def prediction_error_percent(vertices: Points, curve: Points, length: float) -> 
 
     Source: reference set, "How a prediction is scored". Deviation: none where the curve is whole.
     """
-    targets, lengths = target_points([curve], length, len(vertices) - 1)
-    return _mean_error(node_errors(vertices, targets[0], length), targets[0], float(lengths[0]) / length)
-
-
-def _mean_error(errors: Array, targets: Array, share: float) -> float:
-    """Return the mean error of the nodes that have a target; nan where too small a share of the length is known."""
-    return float(mean_over_nodes(errors, np.isfinite(targets[:, 0]))) if share >= MIN_KNOWN_SHARE else math.nan
+    targets, known = target_points(curve, length, len(vertices) - 1)
+    return float(np.nanmean(node_errors(vertices, targets, length))) if known >= MIN_KNOWN_SHARE * length else math.nan
 
 
 @dataclass(frozen=True)
@@ -231,13 +208,6 @@ class MinimumMargin:
     time: float
 
 
-ESTIMATE_COLUMNS = ("hidden", "corrected", "innovations", "innovation_squared")
-MIN_WINDOW = 4.95  # s; over which innovations are tested: 5 s or more, or all that there is
-BAND = 0.95  # of the means of a consistent filter are within
-WHOLE = 0.97  # of the length; a thread of which so much is measured is not hidden
-MAX_DISTURBANCES = 1000  # that are kept
-
-
 def hidden_part(frame: FrameResult, length: float) -> float:
     """Return the part of the thread that a frame's measurement does not show, 0 to 1.
 
@@ -249,16 +219,14 @@ def hidden_part(frame: FrameResult, length: float) -> float:
         frame: with what was measured in it.
         length: of the thread [m].
     """
-    if frame.estimate is not None and not frame.estimate.corrected:
+    observation, estimate = frame.observation, frame.estimate
+    if estimate is not None and not estimate.corrected:
         return 1.0
-    if frame.observation is None:
-        if frame.estimate is not None and not len(frame.measured):
-            return frame.estimate.hidden
-        pieces = [frame.measured]
-    elif frame.observation.complete:
+    if observation is not None and observation.complete:
         return 0.0
-    else:
-        pieces = [piece.points for piece in frame.observation.pieces]
+    if observation is None and estimate is not None and not len(frame.measured):
+        return estimate.hidden
+    pieces = [frame.measured] if observation is None else [piece.points for piece in observation.pieces]
     pieces = [points[np.isfinite(points).all(axis=1)] for points in pieces]
     measured = sum(float(arc_lengths(points)[-1]) for points in pieces if len(points) > 1)
     return max(0.0, 1.0 - measured / length)
@@ -285,24 +253,15 @@ class HiddenShares:
         known = np.isfinite(hidden) & np.isfinite(corrected)
         if not known.any():
             return None
-        weights = _durations(series.times)[known]
-        hidden, corrected = hidden[known], corrected[known]
-        return cls(
-            float(np.average(hidden > 1.0 - WHOLE, weights=weights)),
-            float(np.average(corrected == 0.0, weights=weights)),
-            float(np.average(hidden, weights=weights)),
-        )
+        steps = np.diff(series.times)
+        usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+        durations = np.append(steps, usual)  # the usual interval for the last one, and before a gap
+        durations = np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
+        shares = np.array([hidden > 0.03, corrected == 0.0, hidden])[:, known]
+        return cls(*np.average(shares, axis=1, weights=durations[known]).tolist())
 
 
-def _durations(times: Array) -> Array:
-    """Return the time from each frame to the next; the usual interval for the last one and before a gap [s]."""
-    steps = np.diff(times)
-    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
-    durations = np.append(steps, usual)
-    return np.where((durations > 0.0) & (durations <= SILENT_PERIODS * usual), durations, usual)
-
-
-def mean_band(count: ArrayLike) -> tuple[Array, Array]:
+def mean_band(count: Array) -> tuple[Array, Array]:
     """Return between what 95 % of the means of so many squared standard normal values are.
 
         chi2_N^{-1}(0.025) / N,    chi2_N^{-1}(0.975) / N
@@ -310,9 +269,8 @@ def mean_band(count: ArrayLike) -> tuple[Array, Array]:
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
     5.4. Deviation: none.
     """
-    given = np.asarray(count, dtype=np.float64)
-    low, high = (chdtri(given, 0.5 - side * 0.5 * BAND) / given for side in (-1.0, 1.0))
-    return np.asarray(low), np.asarray(high)
+    low, high = (np.asarray(chdtri(count, above) / count) for above in (0.975, 0.025))
+    return low, high
 
 
 @dataclass(frozen=True)
@@ -330,6 +288,9 @@ class Consistency:
         low: lower end of the band of each, shape (k,).
         high: upper end of it, shape (k,).
         mean: of all normalised innovations squared.
+        windows: number of windows in which anything was measured.
+        within: number of windows whose mean is within its band.
+        band: of a usual window: the median of both ends.
     """
 
     begins: Array
@@ -338,51 +299,31 @@ class Consistency:
     low: Array
     high: Array
     mean: float
+    windows: int
+    within: int
+    band: tuple[float, float]
 
     @classmethod
     def of(cls, series: TimeSeries) -> Consistency | None:
         """Return the consistency of a run; None if no measurement went into an estimate."""
-        squared, counts, times = series.column("innovation_squared"), series.column("innovations"), series.times
-        known = np.isfinite(squared)
-        if not known.any():
+        table = np.array([series.times, series.column("innovation_squared"), series.column("innovations")])
+        times, squared, counts = table[:, np.isfinite(table[1])]
+        if not len(times):
             return None
-        squared, counts, times = squared[known], counts[known], times[known]
         first, last = float(times.min()), float(times.max())
-        windows = max(1, math.floor((last - first) / MIN_WINDOW))
+        windows = max(1, math.floor((last - first) / 4.95))
         width = max((last - first) / windows, 1e-3)
         index = np.minimum(np.floor((times - first) / width).astype(np.int64), windows - 1)
-        total = np.bincount(index, squared * counts, windows)
         count = np.bincount(index, counts, windows)
-        with np.errstate(invalid="ignore"):
-            means = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
-        low, high = mean_band(np.where(count > 0, count, np.nan))
+        count[count == 0.0] = np.nan
+        means, (low, high) = np.bincount(index, squared * counts, windows) / count, mean_band(count)
+        within = int(((low <= means) & (means <= high)).sum())
+        mean, band = (
+            float((squared * counts).sum() / counts.sum()),
+            (float(np.nanmedian(low)), float(np.nanmedian(high))),
+        )
         begins = first + width * np.arange(windows, dtype=np.float64)
-        return cls(np.asarray(begins), width, means, low, high, float((squared * counts).sum() / counts.sum()))
-
-    @property
-    def ends(self) -> Array:
-        """End of each window, shape (k,) [s]."""
-        return self.begins + self.width
-
-    @property
-    def windows(self) -> int:
-        """Number of windows in which anything was measured."""
-        return int(np.isfinite(self.means).sum())
-
-    @property
-    def within(self) -> int:
-        """Number of windows whose mean is within its band."""
-        return int(((self.low <= self.means) & (self.means <= self.high)).sum())
-
-    @property
-    def share(self) -> float:
-        """Share of the windows whose mean is within its band."""
-        return self.within / self.windows
-
-    @property
-    def band(self) -> tuple[float, float]:
-        """The band of a usual window: the median of both ends."""
-        return float(np.nanmedian(self.low)), float(np.nanmedian(self.high))
+        return cls(begins, width, means, low, high, mean, int(np.isfinite(means).sum()), within, band)
 
 
 @dataclass(frozen=True)
@@ -412,48 +353,6 @@ class DisturbanceEvent:
     significance: float
 
 
-class DisturbanceLog:
-    """Collects the disturbances of a run; those with one beginning are one event.
-
-    Attributes:
-        events: by their beginning.
-        count: of all, also of those beyond the number that is kept.
-    """
-
-    def __init__(self) -> None:
-        self.events: list[DisturbanceEvent] = []
-        self.count = 0
-        self._since = math.nan
-
-    def add(self, time: float, frame: FrameResult) -> None:
-        """Add a frame at a time since the bag's start [s]."""
-        found = frame.estimate.disturbances if frame.estimate is not None else ()
-        if not found:
-            self._since = math.nan
-            return
-        strongest = max(found, key=lambda each: each.significance)
-        (x, y), (along_x, along_y) = strongest.position.tolist(), strongest.direction.tolist()
-        event = DisturbanceEvent(
-            begin_s=time - (frame.stamp * 1e-9 - strongest.since),
-            end_s=time,
-            arc_length_m=strongest.arc_length,
-            extent_m=strongest.extent,
-            x_m=x,
-            y_m=y,
-            direction_rad=math.atan2(along_y, along_x),
-            force_n=strongest.force,
-            significance=strongest.significance,
-        )
-        is_new, self._since = strongest.since != self._since, strongest.since
-        self.count += is_new
-        if is_new and self.count <= MAX_DISTURBANCES:
-            self.events.append(event)
-        elif not is_new and self.count <= MAX_DISTURBANCES:
-            before = self.events[-1]
-            larger = max(before, event, key=lambda each: each.significance)
-            self.events[-1] = replace(larger, begin_s=before.begin_s, end_s=time)
-
-
 def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
     """Return the errors of `prediction` and `estimate`, under the same names; None where there is none.
 
@@ -464,9 +363,8 @@ def compare_errors(series: TimeSeries) -> dict[str, dict[str, float | None]]:
     Args:
         series: columns of a run.
     """
-    found: dict[str, dict[str, float | None]] = {}
-    for kind, own in (("prediction", ""), ("estimate", "estimate_")):
-        found[kind] = {}
+    found: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
+    for kind, own in KINDS.items():
         for name, target in (("ground_truth", "truth"), ("measured", "seen")):
             means, nodes = series.known(f"{own}error_{target}"), series.known(f"max_node_{own}error_{target}")
             found[kind] |= {
@@ -486,7 +384,6 @@ class EstimationFigures:
         consistency: of the innovations; None where no measurement went in.
         hidden: how much of the thread was hidden; None where nothing was estimated.
         disturbances: what the model does not know, by its beginning.
-        disturbance_count: of all, also of those that are not kept.
         learned: slow parameters in the end, where any are learned.
     """
 
@@ -494,7 +391,6 @@ class EstimationFigures:
     consistency: Consistency | None = None
     hidden: HiddenShares | None = None
     disturbances: tuple[DisturbanceEvent, ...] = ()
-    disturbance_count: int = 0
     learned: tuple[SlowParameter, ...] = ()
 
     @property
@@ -505,23 +401,22 @@ class EstimationFigures:
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none."""
         hidden, found = self.hidden, self.consistency
-        low, high = found.band if found else (None, None)
         learned = self.learned[0] if self.learned else None
         return {
             "corrected_frames": self.corrected,
             "consistency": {
                 "normalised_innovation_squared_mean": found.mean if found else None,
-                "band_95_low": low,
-                "band_95_high": high,
+                "band_95_low": found.band[0] if found else None,
+                "band_95_high": found.band[1] if found else None,
                 "window_s": found.width if found else None,
                 "windows": found.windows if found else 0,
                 "windows_within_band": found.within if found else 0,
-                "windows_within_band_share": found.share if found else None,
+                "windows_within_band_share": found.within / found.windows if found else None,
             },
             "hidden_time_share": hidden.time if hidden else None,
             "all_hidden_time_share": hidden.all_time if hidden else None,
             "hidden_length_share": hidden.length if hidden else None,
-            "disturbances": self.disturbance_count,
+            "disturbances": len(self.disturbances),
             "learned": {
                 STIFFNESS_OVER_DRAG: learned.value if learned else None,
                 f"{STIFFNESS_OVER_DRAG}_95_low": learned.low if learned else None,
@@ -543,12 +438,13 @@ class RunMetrics:
 
     Attributes:
         targets: as given, the better one first.
+        recorded: as given.
         observed: column `processing` of all frames [s].
         tracked: frames with a needle.
         lost: from and to when the needle was not found, less than a second apart as one [s].
         reasons: why not.
         contact_frames: those in which the thread touches an obstacle or the wall.
-        disturbances: that the estimate reported.
+        disturbances: that the estimate reported; those with one beginning are one event.
         learned: slow parameters of the last estimate that has any.
         series: columns of all frames with a prediction, by time.
     """
@@ -557,22 +453,18 @@ class RunMetrics:
         self, length: float, start: int = 0, targets: Iterable[str] = TARGETS, *, recorded: bool = False
     ) -> None:
         self.targets = tuple(target for target in TARGETS if target in targets)
-        errors = [f"error_{target}" for target in self.targets]
-        kinds = ["", "estimate_", "max_node_", "max_node_estimate_", *(["recorded_"] if recorded else [])]
-        margins = [f"{MARGIN}{barrier}" for barrier in BUILT_IN]
-        names = [f"{kind}{name}" for kind in kinds for name in errors]
-        self.series = TimeSeries([*names, *margins, *COLUMNS, *ESTIMATE_COLUMNS])
-        self.observed = TimeSeries(["processing"])
+        self.recorded = recorded
+        self.series, self.observed = TimeSeries(), TimeSeries()
         self.tracked = self.contact_frames = 0
         self.lost: list[list[float]] = []
         self.reasons: Counter[str] = Counter()
-        self._found = True
+        self.disturbances: list[DisturbanceEvent] = []
+        self.learned: tuple[SlowParameter, ...] = ()
         self._length, self._start = length, start
+        self._found, self._disturbed_since = True, math.nan
         self._minimum: dict[str, MinimumMargin] = {}
         self._maps = {(kind, target): ErrorMap(length) for kind in KINDS for target in self.targets}
-        self._worst = {(kind, target): WorstFrames(of=kind) for kind in KINDS for target in self.targets}
-        self.disturbances = DisturbanceLog()
-        self.learned: tuple[SlowParameter, ...] = ()
+        self._worst = {key: WorstFrames() for key in self._maps}
         self._first: FrameResult | None = None
 
     def observe(self, observation: Observation) -> None:
@@ -582,11 +474,9 @@ class RunMetrics:
         self.tracked += observation.found
         if not observation.found:
             reason = observation.reason or "not said"
-            known = observation.reason in self.reasons or len(self.reasons) < 12
-            self.reasons[reason if known else "others"] += 1
-            if self._found and not (
-                self.lost and time - self.lost[-1][1] < MIN_DISTANCE
-            ):  # else no plot tells them apart
+            self.reasons[reason if reason in self.reasons or len(self.reasons) < 12 else "others"] += 1
+            # Two that are less than this apart look like one in a plot.
+            if self._found and not (self.lost and time - self.lost[-1][1] < MIN_DISTANCE):
                 self.lost.append([time, time])
             self.lost[-1][1] = time
         self._found = observation.found
@@ -596,9 +486,9 @@ class RunMetrics:
         time = self._time(frame.stamp)
         self._first = self._first or frame
         if frame.margins is not None:
-            self.contact_frames += frame.in_contact
+            self.contact_frames += bool(frame.margins.in_contact)
             self._lower(time, frame.margins)
-        self.disturbances.add(time, frame)
+        self._take_disturbances(time, frame)
         if frame.estimate is not None and frame.estimate.learned:
             self.learned = frame.estimate.learned
         columns = frame.columns() | {"hidden": hidden_part(frame, self._length)} | self._compare(time, frame)
@@ -613,6 +503,30 @@ class RunMetrics:
             lower = found if clearance < held.clearance else held
             self._minimum[row.barrier] = replace(lower, value=min(found.value, held.value))
 
+    def _take_disturbances(self, time: float, frame: FrameResult) -> None:
+        """Add the strongest disturbance of a frame to the event that it belongs to, or as a new one."""
+        found = frame.estimate.disturbances if frame.estimate is not None else ()
+        strongest = max(found, key=lambda each: each.significance, default=None)
+        before, self._disturbed_since = self._disturbed_since, strongest.since if strongest else math.nan
+        if strongest is None:
+            return
+        (x, y), (along_x, along_y) = strongest.position.tolist(), strongest.direction.tolist()
+        event = DisturbanceEvent(
+            begin_s=time - (frame.stamp * 1e-9 - strongest.since),
+            end_s=time,
+            arc_length_m=strongest.arc_length,
+            extent_m=strongest.extent,
+            x_m=x,
+            y_m=y,
+            direction_rad=math.atan2(along_y, along_x),
+            force_n=strongest.force,
+            significance=strongest.significance,
+        )
+        if strongest.since == before:
+            held = self.disturbances.pop()
+            event = replace(max(held, event, key=lambda each: each.significance), begin_s=held.begin_s, end_s=time)
+        self.disturbances.append(event)
+
     def _compare(self, time: float, frame: FrameResult) -> dict[str, float]:
         """Return the columns of a frame's errors."""
         row: dict[str, float] = {}
@@ -621,21 +535,18 @@ class RunMetrics:
             threads["estimate"] = frame.estimate.vertices
         for target in TARGETS:
             curve = frame.target_curve(target)
-            points, lengths = target_points([curve], self._length, len(frame.vertices) - 1)
-            share = float(lengths[0]) / self._length
+            points, known = target_points(curve, self._length, len(frame.vertices) - 1)
             if target == "seen":
-                row["seen_share"] = min(1.0, share)
+                row["seen_share"] = min(1.0, known / self._length)
             if target not in self.targets:
                 continue
-            for kind, vertices in threads.items():
-                errors = node_errors(vertices, points[0], self._length)
-                mean, column = _mean_error(errors, points[0], share), f"{KINDS[kind]}error_{target}"
-                row[column] = mean
-                if math.isfinite(mean):
-                    row[f"max_node_{column}"] = float(np.nanmax(errors))
-                    self._maps[kind, target].add(time, errors)
-                    self._worst[kind, target].add(time, mean, frame)
-            frame.errors[target] = row[f"error_{target}"]
+            frame.errors[target] = math.nan
+            for kind, vertices in threads.items() if known >= MIN_KNOWN_SHARE * self._length else ():
+                errors, column = node_errors(vertices, points, self._length), f"{KINDS[kind]}error_{target}"
+                row[column], row[f"max_node_{column}"] = float(np.nanmean(errors)), float(np.nanmax(errors))
+                self._maps[kind, target].add(time, errors)
+                self._worst[kind, target].add(WorstFrame(time, row[column], frame, kind))
+                frame.errors[target] = row[f"error_{target}"]
             if frame.recorded is not None:
                 row[f"recorded_error_{target}"] = prediction_error_percent(frame.recorded, curve, self._length)
         return row
@@ -670,22 +581,15 @@ class RunMetrics:
         return worst[0].frame if worst else self._first
 
     def errors(self, prefix: str = "error") -> dict[str, dict[str, float] | None]:
-        """Return the figures of the columns `PREFIX_TARGET` that there are, by target; see `error_figures`."""
-        columns = {target: f"{prefix}_{target}" for target in self.targets}
-        there = self.series.names
-        return {target: error_figures(self.series.column(name)) for target, name in columns.items() if name in there}
+        """Return the figures of the columns `PREFIX_TARGET` by target; see `error_figures`."""
+        return {target: error_figures(self.series.column(f"{prefix}_{target}")) for target in self.targets}
 
     @property
     def estimation(self) -> EstimationFigures:
         """What the run tells of its estimate beside the errors."""
-        return EstimationFigures(
-            int(np.nansum(self.series.column("corrected"))),
-            Consistency.of(self.series),
-            HiddenShares.of(self.series),
-            tuple(self.disturbances.events),
-            self.disturbances.count,
-            self.learned,
-        )
+        corrected = int(np.nansum(self.series.column("corrected")))
+        consistency, hidden = Consistency.of(self.series), HiddenShares.of(self.series)
+        return EstimationFigures(corrected, consistency, hidden, tuple(self.disturbances), self.learned)
 
     def percentiles(self, column: str) -> Percentiles | None:
         """Return the percentiles of a column."""

@@ -26,12 +26,6 @@ if TYPE_CHECKING:
     from magnetosuture_thread.evaluation.plots import ReportPicture
 
 MAX_POINTS = 5000  # of a line
-KINDS = (
-    ("estimate_", "estimate", "estimated"),
-    ("", "prediction", "predicted"),
-    ("recorded_", "recorded prediction", "kind5"),
-)  # of threads: beginning of their columns, name, colour
-LINE_COLOURS = ("kind0", "kind1", "kind3", "kind4")  # of the page
 
 Line = tuple[str, str, str, str, float]  # column, name, colour, dash, scale to the axis's unit
 
@@ -118,15 +112,16 @@ def page_data(metrics: RunMetrics, worst: Sequence[WorstFrame], limit: int = MAX
     series, observed, estimation = metrics.series, metrics.observed, metrics.estimation
     times, columns = thinned(series.times, {name: series.column(name) for name in series.names}, limit)
     frames, tracked = thinned(observed.times, {"processing": observed.column("processing")}, limit)
+    threads = [("estimate_", "estimate", "estimated"), ("", "prediction", "predicted")]
     errors = [
-        (f"{kind}error_{target}", f"{name} against {words}", colour, dash, 1.0)
-        for kind, name, colour in KINDS
+        (f"{prefix}error_{target}", f"{name} against {words}", colour, dash, 1.0)
+        for prefix, name, colour in [*threads, ("recorded_", "recorded prediction", "kind5")]
         for (target, words), dash in zip(AGAINST.items(), ("", "dot"), strict=True)
     ]
     solid = [(f"{MARGIN}{name}", name, colour, "", 1e3) for name, colour in zip(SOLID, ("good", "kind5"), strict=True)]
     others = [name for name in columns if name.startswith(MARGIN) and name.removeprefix(MARGIN) not in SOLID]
     margins = [
-        (column, column.removeprefix(MARGIN).replace("_", " "), LINE_COLOURS[k % len(LINE_COLOURS)], "", 1e6)
+        (column, column.removeprefix(MARGIN).replace("_", " "), f"kind{(0, 1, 3, 4)[k % 4]}", "", 1e6)
         for k, column in enumerate(others)
     ]
     forces = [
@@ -178,7 +173,7 @@ def _consistency_lines(
     mean = [("mean", f"mean over {found.width:.1f} s", "ink", "", 1.0)]
     lines += _lines({"mean": _paired(found.means, found.means)}, mean, at="windows")
     top = max(2.5, 1.1 * float(np.nanmax(found.means)), float(np.nanpercentile(columns["innovation_squared"], 98)))
-    return _paired(found.begins, found.ends), lines, round(top, 2)
+    return _paired(found.begins, found.begins + found.width), lines, round(top, 2)
 
 
 def _paired(first: Array, second: Array) -> Array:
@@ -208,14 +203,9 @@ def thinned(times: Array, columns: Mapping[str, Array], limit: int) -> tuple[Arr
     values = np.array(list(columns.values())).reshape(len(columns), len(times))
     if (count := len(times)) > limit:
         run = -(-count // (limit // 2))
-        runs = -(-count // run)
-        padded = np.full((len(columns), runs * run), np.nan)
-        padded[:, :count] = values
-        table = padded.reshape(len(columns), runs, run)
-        low, high = np.nan_to_num(table, nan=np.inf).argmin(axis=2), np.nan_to_num(table, nan=-np.inf).argmax(axis=2)
-        pair = np.stack([np.minimum(low, high), np.maximum(low, high)], axis=2)
-        values = np.take_along_axis(table, pair, axis=2).reshape(len(columns), 2 * runs)
-        first = np.arange(runs) * run
+        first = np.arange(0, count, run)
+        low, high = (extreme.reduceat(values, first, axis=1) for extreme in (np.fmin, np.fmax))  # nan if all are
+        values = np.stack([low, high], axis=2).reshape(len(columns), 2 * len(first))
         times = _paired(times[first], times[np.minimum(first + run // 2, count - 1)])
     times, values = with_gaps(times, values)
     return times, dict(zip(columns, values, strict=True))

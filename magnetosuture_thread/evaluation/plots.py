@@ -14,10 +14,11 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, PathPatch, Rectangle
 from matplotlib.path import Path as Outline
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from magnetosuture_thread.evaluation.figures import AGAINST, COLOURS, format_number
@@ -39,10 +40,7 @@ KIND_COLOURS = {
     "wall": ("#cbbfa9", "#6f624c"),
 }  # of a shape in a scene: face and edge
 BAD = "#c8102e"
-MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])
-FULL_CLEARANCE_MM = 1.0  # from which on a node is green
-CLOSE_UP = 0.08  # of the thread's length: half of the side of what is magnified
-BARS = (0.1e-3, 0.2e-3, 0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 100e-3)  # m; lengths of a scale bar
+MARGIN_COLOURS = LinearSegmentedColormap.from_list("margin", [BAD, "#f28c28", "#1f9d55"])  # from 0 to 1 mm
 
 
 class Photo(NamedTuple):
@@ -121,14 +119,14 @@ def draw_worst_frame(
         simulated: whether the frame is rendered.
     """
     shown, frame = photo or draw_plan(dish_diameter), worst.frame
-    targets = target_points([frame.target_curve(target)], length, len(frame.vertices) - 1)[0][0]
+    targets = target_points(frame.target_curve(target), length, len(frame.vertices) - 1)[0]
     vertices = frame.vertices if worst.of == "prediction" or frame.estimate is None else frame.estimate.vertices
     errors = node_errors(vertices, targets, length)
     node = int(np.nanargmax(errors)) + 1
     greatest = 0.01 * float(np.nanmax(errors)) * length
     ends = np.vstack([vertices[node], targets[node - 1]])
     figure = Figure(figsize=(12.0, 5.95), dpi=100, facecolor="#888e94")
-    half = max(CLOSE_UP * length, 0.75 * greatest)
+    half = max(0.08 * length, 0.75 * greatest)
     scene, close = _draw_dish_and_close_up(figure, shown, frame, ends.mean(axis=0), half)
     close.plot(*shown.view.to_pixels(ends).T, color=BAD, linewidth=1.6)
     if simulated:
@@ -153,7 +151,6 @@ def _draw_dish_and_close_up(
     view, (rows, columns) = photo.view, photo.image.shape[:2]
     scene, close = (figure.add_axes((left, 0.0, 0.4985, height)) for left in (0.0, 0.5015))
     for axes, magnified in ((scene, 1.0), (close, 1.8)):
-        axes.set_facecolor("#d5d9dd")
         draw_threads(axes, photo.image, view, frame, frame.obstacles, magnified)
     half_side = 0.5 * min(rows, columns)
     edge = half_side - 0.5
@@ -171,11 +168,10 @@ def draw_plan(dish_diameter: float) -> Photo:
     """Return a drawn dish, where no camera saw the real one."""
     side, share = 620, 0.94  # px; of it that the dish takes
     middle = 0.5 * (side - 1.0)
-    v, u = np.mgrid[:side, :side]
-    inside = np.hypot(u - middle, v - middle) < 0.5 * share * side
-    return Photo(
-        np.where(inside, 244, 200).astype(np.uint8), DishView((middle, middle), dish_diameter / (share * side))
-    )
+    from_middle = np.arange(side) - middle
+    inside = np.hypot(from_middle, from_middle[:, None]) < 0.5 * share * side
+    view = DishView((middle, middle), dish_diameter / (share * side))
+    return Photo(np.where(inside, 244, 200).astype(np.uint8), view)
 
 
 def draw_threads(
@@ -192,40 +188,24 @@ def draw_threads(
     of the estimated thread, else of the predicted one, have the colours of their margins.
     """
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(False)
+    axes.set_axis_off()
+    to_pixels = Affine2D().scale(1e-3 / view.metres_per_pixel).rotate(view.rotation).scale(1.0, -1.0)
+    to_pixels = to_pixels.translate(*view.centre_px) + axes.transData
     for obstacle in obstacles:
-        if isinstance(obstacle, Disc):
-            centre = view.to_pixels(np.asarray(obstacle.centre))
-            radius = obstacle.radius / view.metres_per_pixel
-            axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, color=INK, linewidth=0.9))
-        elif isinstance(obstacle, Polygon):
-            for ring in obstacle.rings:
-                axes.plot(*view.to_pixels(np.vstack([ring, ring[:1]])).T, color=INK, linewidth=0.9)
+        if isinstance(obstacle, (Disc, Polygon)):
+            axes.add_patch(shape_patch(obstacle, fill=False, edgecolor=INK, linewidth=0.9, transform=to_pixels))
     nodes = chosen.vertices if chosen.estimate is None else chosen.estimate.vertices
-    styles: list[tuple[Points, dict[str, Any]]] = [
-        (chosen.measured, {"color": SEEN, "linewidth": 5.0, "alpha": 0.45}),
-        (chosen.vertices, {"color": PREDICTED, "linewidth": 3.0}),
-        (nodes if chosen.estimate is not None else nodes[:0], {"color": ESTIMATED, "linewidth": 1.7}),
-        (chosen.ground_truth, {"color": TRUTH, "linewidth": 0.9, "linestyle": (0, (4, 4))}),
-    ]
-    for points, style in styles:
-        if len(points) > 1:
-            style["linewidth"] *= magnified
-            axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
+    for points, colour, width, alpha, dashes in (
+        (chosen.measured, SEEN, 5.0, 0.45, "solid"),
+        (chosen.vertices, PREDICTED, 3.0, 1.0, "solid"),
+        (nodes if chosen.estimate is not None else nodes[:0], ESTIMATED, 1.7, 1.0, "solid"),
+        (chosen.ground_truth, TRUTH, 0.9, 1.0, (0, (4, 4))),
+    ):
+        style: dict[str, Any] = {"color": colour, "linewidth": width * magnified, "alpha": alpha, "linestyle": dashes}
+        axes.plot(*view.to_pixels(points).T, solid_capstyle="round", **style)
+    close = np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, 1.0)
     u, v = view.to_pixels(nodes).T
-    axes.scatter(
-        u,
-        v,
-        s=9.0 * magnified**2,
-        c=np.clip(1e3 * chosen.clearance[: len(nodes)], 0.0, FULL_CLEARANCE_MM),
-        cmap=MARGIN_COLOURS,
-        norm=Normalize(0.0, FULL_CLEARANCE_MM),
-        linewidths=0.0,
-        zorder=2.5,
-    )
+    axes.scatter(u, v, s=9.0 * magnified**2, color=MARGIN_COLOURS(close), linewidths=0.0, zorder=2.5)
 
 
 def look_at(axes: Axes, centre: NDArray[np.float64], half: float) -> None:
@@ -243,7 +223,8 @@ def draw_scale_bar(axes: Axes, metres: float, share: float) -> None:
     """
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
-    bar = max((bar for bar in BARS if bar / metres <= share * (right - left)), default=BARS[0])
+    lengths = [figure * 10.0**power for power in range(-4, 0) for figure in (1, 2, 5)]  # m
+    bar = max((bar for bar in lengths if bar / metres <= share * (right - left)), default=lengths[0])
     x, y = left + 0.04 * (right - left), low + 0.04 * (high - low)
     for colour, width in (("white", 6.0), (INK, 3.0)):
         axes.plot([x, x + bar / metres], [y, y], color=colour, linewidth=width, solid_capstyle="butt", zorder=5)

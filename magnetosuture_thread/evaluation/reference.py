@@ -26,8 +26,8 @@ from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.workers import Progress
 
-Progress = Callable[[float], None]
 # What numpy and json raise on files that are something else.
 NOT_ONE = (
     *(OSError, ValueError, TypeError, AttributeError, LookupError, EOFError, MemoryError, RecursionError),
@@ -69,17 +69,6 @@ class ReferenceTrajectory:
         return between(self.tails), float(between(self.headings)), between(self.threads)
 
 
-def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], dict[str, Any]]:
-    packed = BytesIO(read_regular(path, MAX_FILE_BYTES))
-    with zipfile.ZipFile(packed) as archive:
-        if (size := sum(entry.file_size for entry in archive.infolist())) > MAX_FILE_BYTES:
-            raise ValueError(f"it unpacks to {size} bytes, more than {MAX_FILE_BYTES}")
-    packed.seek(0)
-    with np.load(packed, allow_pickle=False) as data:
-        times, poses, threads = (np.asarray(data[key], dtype=np.float64) for key in ("t", "pose", "X"))
-        return times, poses, threads, json.loads(str(data["meta"]))
-
-
 def read_reference(path: Path) -> ReferenceTrajectory:
     """Read a trajectory from an .npz file with the keys t, pose, X and meta.
 
@@ -87,7 +76,14 @@ def read_reference(path: Path) -> ReferenceTrajectory:
         BagError: the file is missing, damaged, or not of this format.
     """
     try:
-        times, poses, threads, metadata = _load(path)
+        packed = BytesIO(read_regular(path, MAX_FILE_BYTES))
+        with zipfile.ZipFile(packed) as archive:
+            if (size := sum(entry.file_size for entry in archive.infolist())) > MAX_FILE_BYTES:
+                raise ValueError(f"it unpacks to {size} bytes, more than {MAX_FILE_BYTES}")
+        packed.seek(0)
+        with np.load(packed, allow_pickle=False) as data:
+            times, poses, threads = (np.asarray(data[key], dtype=np.float64) for key in ("t", "pose", "X"))
+            metadata = json.loads(str(data["meta"]))
         obstacle = metadata.get("obstacle")
         discs = (Disc((float(obstacle["cx"]), float(obstacle["cy"])), float(obstacle["R"])),) if obstacle else ()
     except FileNotFoundError:
@@ -95,22 +91,16 @@ def read_reference(path: Path) -> ReferenceTrajectory:
     except NOT_ONE as error:
         problem = " ".join(str(error).split())
         raise BagError(path, f"is no reference trajectory with the keys t, pose, X, meta: {problem}") from None
-    count = len(times)
-    if (
-        times.ndim != 1
-        or count < 2
-        or poses.shape != (count, 3)
-        or threads.ndim != 3
-        or threads.shape[::2] != (count, 2)
-    ):
+    count = times.size
+    is_shaped = times.shape == (count,) and poses.shape == (count, 3) and threads.ndim == 3
+    if count < 2 or not is_shaped or threads.shape[::2] != (count, 2):
         shapes = f"t {times.shape}, pose {poses.shape}, X {threads.shape}"
         raise BagError(path, f"has shapes {shapes}; expected t (T,), pose (T, 3), X (T, m, 2)")
     finite = all(np.all(np.isfinite(values)) for values in (times, poses, threads))
     if not (finite and np.all(np.diff(times) > 0.0)):
         raise BagError(path, "has times that do not increase, or values that are not finite")
-    return ReferenceTrajectory(
-        str(metadata.get("name", path.stem)), times, poses[:, :2], poses[:, 2], threads, discs, metadata
-    )
+    name = str(metadata.get("name", path.stem))
+    return ReferenceTrajectory(name, times, poses[:, :2], poses[:, 2], threads, discs, metadata)
 
 
 @dataclass(frozen=True)
@@ -212,7 +202,7 @@ def score(
     formulation: str,
     solver: str,
     segments: int | None = None,
-    progress: Callable[[float], None],
+    progress: Progress,
     keep: Callable[[CaseResult], None] = lambda result: None,
 ) -> Evaluation:
     """Score a formulation on trajectories: each with its own thread and parameters, nothing tuned for a case.
@@ -246,16 +236,17 @@ def score(
         initial = resampled(reference.threads[0], thread.segments)
         predictor.start_at(poses[0], initial)
 
-        def figures(prediction: Prediction) -> StepFigures:
-            strain = float(prediction.strain.max())
-            return StepFigures(prediction.positions, strain, prediction.residual, int(prediction.status != SOLVED))
-
         def step(index: int) -> Prediction:
             return predictor.step(poses[index])
 
-        return run_case(reference, initial, thread.length, thread.diameter, step, figures, share)
+        return run_case(reference, initial, thread.length, thread.diameter, step, _figures, share)
 
     return Evaluation(formulation, solver, score_each(paths, score_case, progress, keep))
+
+
+def _figures(prediction: Prediction) -> StepFigures:
+    is_fallback = prediction.status != SOLVED
+    return StepFigures(prediction.positions, float(prediction.strain.max()), prediction.residual, int(is_fallback))
 
 
 def score_each(
@@ -328,38 +319,32 @@ def run_case(
 
     Source: reference set, "How a prediction is scored". Deviation: none.
     """
-    count = len(reference.times)
-    vertices, took = np.empty((count, *initial.shape)), np.zeros(count)
-    vertices[0] = initial
-    strain, depth, residual, fallbacks = -np.inf, 0.0, 0.0, 0
+    count, steps, took = len(reference.times), [], []
     for k in range(1, count):
         began = time.perf_counter()
         result = step(k)
-        took[k] = time.perf_counter() - began
-        found = figures(result)
-        vertices[k] = found.vertices
-        strain, residual = max(strain, found.strain), max(residual, found.residual)
-        fallbacks += found.fallbacks
-        for disc in reference.discs:
-            # The needle's own way is given, so only the thread's nodes can be blamed.
-            outside = disc.signed_distance(found.vertices[1:])[0] - 0.5 * diameter
-            depth = max(depth, -float(outside.min()))
+        took.append(time.perf_counter() - began)
+        steps.append(figures(result))
         if k % 50 == 0:
             progress(k / count)
+    vertices = np.array([initial, *(each.vertices for each in steps)])
+    # The needle's own way is given, so only the thread's nodes can be blamed.
+    nodes = vertices[1:, 1:].reshape(-1, 2)
+    gaps = [float(disc.signed_distance(nodes)[0].min()) - 0.5 * diameter for disc in reference.discs]
     truth = np.stack([resampled(curve, len(initial) - 1) for curve in reference.threads])
     error = node_errors(vertices, truth[:, 1:], length).mean(axis=1)
-    times = Percentiles.of(took[1:])
+    times = Percentiles.of(took)
     assert times is not None  # a trajectory has two samples or more
     score = CaseScore(
         name=reference.name,
         mean_error_percent=float(error.mean()),
         max_error_percent=float(error.max()),
-        max_stretch=strain,
-        max_penetration_m=depth,
+        max_stretch=max(each.strain for each in steps),
+        max_penetration_m=max(0.0, -min(gaps, default=0.0)),
         step_median_s=times.median,
         step_p99_s=times.p99,
-        max_residual=residual,
-        fallbacks=fallbacks,
+        max_residual=max(each.residual for each in steps),
+        fallbacks=sum(each.fallbacks for each in steps),
     )
     return CaseResult(reference, vertices, error, score)
 

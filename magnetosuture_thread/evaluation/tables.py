@@ -24,8 +24,9 @@ from magnetosuture_thread.evaluation.figures import (
     micronewtons,
     milliseconds,
 )
-from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary
+from magnetosuture_thread.evaluation.graph_outputs import LoopSummary, ReplaySummary, RunSummary
 from magnetosuture_thread.evaluation.metrics import (
+    KINDS,
     EstimationFigures,
     Percentiles,
     RunMetrics,
@@ -37,9 +38,9 @@ from magnetosuture_thread.texts import printable
 
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"
+Line: TypeAlias = "tuple[str, str, str]"  # of a table for a person: name, value, remark
 
-SIMULATED, UNVERIFIED, SILENT = "*", "?", "!"  # marks of a bag
-FORMULA = ("=", "+", "-", "@", "\t", "\r")  # what a spreadsheet takes the beginning of a formula for
+MARKS = {"simulated": "*", "unverified": "?", "silences": "!"}  # of a bag, by the column that says so
 
 
 def row_of(about: BagDetails, figures: Figures) -> Row:
@@ -104,18 +105,6 @@ _EMPTY = row_of(BagDetails("", "", ""), Figures.of(RunMetrics(1.0)))
 TIMES = tuple(column for column in _EMPTY if column.startswith(("step_", "tracker_")))  # differ from run to run
 
 
-def table_csv(rows: Sequence[Row]) -> str:
-    """Return the table as CSV (RFC 4180), with all digits; an empty cell where there is no value.
-
-    A text that a spreadsheet would take for a formula gets an apostrophe before it.
-    """
-    stream = io.StringIO(newline="")
-    writer = csv.DictWriter(stream, list(flat(_EMPTY)))
-    writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in flat(row).items()} for row in rows)
-    return stream.getvalue()
-
-
 def flat(row: Row) -> dict[str, Value]:
     """Return a row with a column for each value of its mappings, `estimate_error_measured_mean_percent` for example."""
     columns: dict[str, Value] = {}
@@ -124,10 +113,23 @@ def flat(row: Row) -> dict[str, Value]:
     return columns
 
 
-def _cell(value: Value) -> Value:
-    if not isinstance(value, str):
-        return value
-    return f"'{printable(value)}" if value.startswith(FORMULA) else printable(value)
+def table_csv(rows: Sequence[Row]) -> str:
+    """Return the table as CSV (RFC 4180), with all digits; an empty cell where there is no value.
+
+    A text that a spreadsheet would take for a formula gets an apostrophe before it.
+    """
+
+    def cell(value: Value) -> Value:
+        if not isinstance(value, str):
+            return value
+        is_formula = value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        return f"'{printable(value)}" if is_formula else printable(value)
+
+    stream = io.StringIO(newline="")
+    writer = csv.DictWriter(stream, list(flat(_EMPTY)))
+    writer.writeheader()
+    writer.writerows({name: cell(value) for name, value in flat(row).items()} for row in rows)
+    return stream.getvalue()
 
 
 def table_json(rows: Sequence[Row]) -> str:
@@ -136,28 +138,25 @@ def table_json(rows: Sequence[Row]) -> str:
     `bags` is a list of rows, `mean` and `worst` are over the mean errors of the bags that were evaluated, and
     `prediction` and `estimate` have the names of those of a bag: means of means, and maxima of maxima.
     """
-    return json.dumps({"bags": list(rows), **totals(rows), **compared(rows)}, indent=2, allow_nan=False) + "\n"
+    means = {column: _numbers(rows, column) for column in (f"error_{target}_mean_percent" for target in AGAINST)}
+    found = {
+        "bags": list(rows),
+        "mean": {column: float(np.mean(own)) if own else None for column, own in means.items()},
+        "worst": {column: max(own, default=None) for column, own in means.items()},
+        **compared(rows),
+    }
+    return json.dumps(found, indent=2, allow_nan=False) + "\n"
 
 
 def compared(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return the errors of `prediction` and `estimate` over bags; None where no bag has any."""
-    found: dict[str, dict[str, float | None]] = {}
-    for kind in ("prediction", "estimate"):
-        found[kind] = {}
+    found: dict[str, dict[str, float | None]] = {kind: {} for kind in KINDS}
+    for kind in KINDS:
         for name in cast("dict[str, Any]", _EMPTY[kind]):
             values = _numbers([cast("Row", row[kind]) for row in rows], name)
             whole = np.mean if name.endswith("_mean_percent") else np.max
             found[kind][name] = float(whole(values)) if values else None
     return found
-
-
-def totals(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return mean and worst over bags of their mean errors, by the column's name; None where no bag has any."""
-    values = {column: _numbers(rows, column) for column in (f"error_{target}_mean_percent" for target in AGAINST)}
-    return {
-        "mean": {column: float(np.mean(own)) if own else None for column, own in values.items()},
-        "worst": {column: max(own, default=None) for column, own in values.items()},
-    }
 
 
 def _numbers(rows: Sequence[Row], column: str) -> list[float]:
@@ -172,39 +171,34 @@ def bags_table(rows: Sequence[Row]) -> Table:
         "step: median of the model's"
     )
     if any(row["simulated"] for row in rows):
-        caption += f";\n{SIMULATED} simulated, as the bag itself says"
+        caption += f";\n{MARKS['simulated']} simulated, as the bag itself says"
     if any(row["unverified"] for row in rows):
-        caption += f";\n{UNVERIFIED} unverified: damaged, and nothing vouches for its messages"
+        caption += f";\n{MARKS['unverified']} unverified: damaged, and nothing vouches for its messages"
     if any(silences := _numbers(rows, "silent_s")):
         longest = max(_numbers(rows, "max_silence_s"))
-        caption += f";\n{SILENT} without frames for {sum(silences):.1f} s in all, {longest:.1f} s at the longest"
+        caption += (
+            f";\n{MARKS['silences']} without frames for {sum(silences):.1f} s in all, {longest:.1f} s at the longest"
+        )
     columns = ("frames", "ground\ntruth", "max", "measured", "max", "margin", "step")
     table = _table("1 bag" if len(rows) == 1 else f"{len(rows)} bags", "bag", columns, caption)
     table.show_edge = False  # which keeps it within 80 columns
+
+    def add_errors(name: str | Text, frames: str, found: Mapping[str, Any], *more: str) -> None:
+        errors = [f"error_{of}_{which}_percent" for of in ("ground_truth", "measured") for which in ("mean", "max")]
+        table.add_row(name, frames, *(_shown(found["estimate"][error], format_number) for error in errors), *more)
+        predicted = (_shown(found["prediction"][error], format_number) for error in errors)
+        table.add_row(Text(" predicted", style="dim"), "", *predicted)
+
     for row in rows:
         if row["problem"]:
             table.add_row(Text(str(row["bag"])), Text("failed", style="bold red"))
             continue
-        marks_of = ((SIMULATED, "simulated"), (UNVERIFIED, "unverified"), (SILENT, "silences"))
-        marks = [mark for mark, why in marks_of if row[why]]
-        table.add_row(
-            Text(" ".join([str(row["bag"]), *marks])),
-            f"{row['predicted']}/{row['frames']}",
-            *_errors_shown(row["estimate"]),
-            _shown(row["least_obstacle_m"], micrometres),
-            _shown(row["step_median_s"], milliseconds),
-        )
-        table.add_row(Text(" predicted", style="dim"), "", *_errors_shown(row["prediction"]))
-    found = compared(rows)
+        name = Text(" ".join([str(row["bag"]), *(mark for why, mark in MARKS.items() if row[why])]))
+        shown = _shown(row["least_obstacle_m"], micrometres), _shown(row["step_median_s"], milliseconds)
+        add_errors(name, f"{row['predicted']}/{row['frames']}", row, *shown)
     table.add_section()
-    table.add_row("all bags", "", *_errors_shown(found["estimate"]))
-    table.add_row(Text(" predicted", style="dim"), "", *_errors_shown(found["prediction"]))
+    add_errors("all bags", "", compared(rows))
     return table
-
-
-def _errors_shown(errors: Any) -> list[str]:
-    names = [f"error_{name}_{which}_percent" for name in ("ground_truth", "measured") for which in ("mean", "max")]
-    return [_shown(errors[name], format_number) for name in names]
 
 
 def _shown(value: Any, how: Callable[[float], str]) -> str:
@@ -240,10 +234,6 @@ def _table(title: str, first: str, columns: Sequence[str], caption: str) -> Tabl
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     return table
-
-
-Line = tuple[str, ...]
-"""A figure of a run: its name, its value, and a remark."""
 
 
 def summary_table(summary: ReplaySummary) -> Table:
@@ -325,7 +315,7 @@ def _figures_table(title: str, sections: Sequence[Sequence[Line]]) -> Table:
     return table
 
 
-def _errors(summary: ReplaySummary | LoopSummary) -> list[Line]:
+def _errors(summary: RunSummary) -> list[Line]:
     lines: list[Line] = [("thread measured, mean", f"{100.0 * summary.seen_share:.1f} %", "of its length")]
     for kind, errors in (("prediction", summary.prediction), ("estimate", summary.estimate)):
         found = [
@@ -334,8 +324,7 @@ def _errors(summary: ReplaySummary | LoopSummary) -> list[Line]:
             if (mean := errors.get(f"error_{name}_mean_percent")) is not None
         ]
         if found or kind == "prediction":
-            value = "" if found else "none"
-            lines += [(f"{kind} error, mean", value, "maximum; % of the length"), *found]
+            lines += [(f"{kind} error, mean", "" if found else "none", "maximum; % of the length"), *found]
     return lines
 
 
@@ -347,12 +336,12 @@ def _estimation(estimation: EstimationFigures) -> list[Line]:
         return [*lines, ("the estimate is a prediction only", "", "no measurement went in")]
     low, high = found.band
     within = f"{low:.2f} to {high:.2f} in {found.within} of {found.windows} windows of {found.width:.1f} s"
-    return [
-        *lines,
-        ("normalised innovation squared", f"{found.mean:.3f}", within),
-        ("disturbances", str(estimation.disturbance_count), "that the model does not know"),
-        *((f"learned {each.name}", *str(each).split(", ", 1)) for each in estimation.learned),
-    ]
+    lines.append(("normalised innovation squared", f"{found.mean:.3f}", within))
+    lines.append(("disturbances", str(len(estimation.disturbances)), "that the model does not know"))
+    for parameter in estimation.learned:
+        value, interval = str(parameter).split(", ", 1)
+        lines.append((f"learned {parameter.name}", value, interval))
+    return lines
 
 
 def _times(found: Mapping[str, Percentiles | None]) -> list[Line]:

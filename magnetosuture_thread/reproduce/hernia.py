@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.animation import PillowWriter
@@ -37,18 +37,15 @@ from magnetosuture_thread.thread.margins import FrictionState, Margins, friction
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread_model.session import ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.workers import Log, Progress
 
 RATE = 33.0  # Hz, of the paper's simulation
 COMMAND_TIMEOUT = 0.1  # s; a command that no other follows ends, as at the coil bridge
 SHOWN = (0.0, 12.0, 17.0, 27.0, 35.0, 55.0)  # s; the six instants of the paper's figure
 PAPER_SEGMENTS = 40  # of the thread in the paper's figure
 NODE_COLOURS = ("#0b3c5d", "#1f77b4", "#2a9d8f", "#8ab17d", "#e9a03b")  # of the first nodes, whose barriers are drawn
-FASTER, PICTURES = 6, 8  # of the animation: than it happened; pictures a second
 _MAX_DISTANCE = 1.0  # m; farther than any obstacle of a dish
 _AHEAD = np.array([1.0, 0.0])  # a point has no heading, and a thread that turns freely asks for none
-
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -145,8 +142,7 @@ class SteeredThread:
         return SteeredInstant(self._stamp * 1e-9, prediction, margins, command, took)
 
 
-@dataclass(frozen=True)
-class RecordedCommands:
+class RecordedCommands(NamedTuple):
     """Velocity commands that an operator gave.
 
     Attributes:
@@ -417,15 +413,16 @@ def draw_hernia(path: Path, run: HerniaRun) -> None:
 
 def draw_animation(path: Path, run: HerniaRun) -> None:
     """Draw the run, faster than it happened, and write it as GIF."""
+    faster, rate = 6, 8  # than it happened; pictures a second
     figure = Figure(figsize=(4.6, 5.0), dpi=96, facecolor="white")
-    writer = PillowWriter(fps=PICTURES)
+    writer = PillowWriter(fps=rate)
     with writer.saving(figure, str(path), 96):
-        for k in range(math.floor(run.instants[-1].time / FASTER * PICTURES) + 1):
-            instant = run.nearest(k * FASTER / PICTURES)
+        for k in range(math.floor(run.instants[-1].time / faster * rate) + 1):
+            instant = run.nearest(k * faster / rate)
             figure.clear()
             draw_instant(figure.add_axes((0.0, 0.0, 1.0, 0.9)), run.scene, instant)
             figure.text(0.03, 0.955, caption(instant), fontsize=10.5, color=INK)
-            words = f"{instant.time:.0f} s, shown {FASTER} times as fast; simulated, the thread model alone"
+            words = f"{instant.time:.0f} s, shown {faster} times as fast; simulated, the thread model alone"
             figure.text(0.03, 0.915, words, fontsize=8, color=FAINT)
             writer.grab_frame()
 

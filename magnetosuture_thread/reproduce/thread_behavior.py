@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,12 +26,10 @@ from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.images import decode_image
+from magnetosuture_thread.workers import Log, Progress
 
 TESTS = ("petri_35mm_polyamide", "petri_150mm_silk")
 SHOWN = 4  # instants of each run
-
-Log = Callable[[str], None]
-Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
