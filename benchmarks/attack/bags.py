@@ -21,11 +21,13 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
 from magnetosuture_thread.bags.check import write_repaired_bag
-from magnetosuture_thread.bags.message_types import MESSAGES, typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import METADATA_FILE
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import MagnetosutureError
+from magnetosuture_thread.messages.cdr import pack
+from magnetosuture_thread.messages.packing import packed_path, packed_pose
 
 MAX_SECONDS, MAX_MEGABYTES = 5.0, 300.0
 GRACE = 10.0  # s after `MAX_SECONDS`, after which a reader is ended
@@ -87,18 +89,17 @@ def attack_bags(count: int, seed: int, progress: Callable[[float], None]) -> tup
 
 def original_messages() -> list[Message]:
     """Return the messages of a bag: a needle that moves, its thread, and texts."""
-    store, found = typestore(), list[Message]()
+    found: list[Message] = []
     for index in range(MESSAGES_EACH):
         at = SECOND + index * PERIOD
-        header = MESSAGES.header(at, "dish")
         along = np.linspace(0.0, 0.015, 12)
-        bend = 0.002 * np.sin(300.0 * along + 0.05 * index)
-        upright = (0.0, 0.0, 0.0, 1.0)
-        points = [MESSAGES.pose((x, y, 0.0), upright) for x, y in zip(along, bend, strict=True)]
-        pose = MESSAGES.pose_with_covariance(header, points[0], np.zeros(36))
-        messages = (MESSAGES.path(header, points), pose, store.types["std_msgs/msg/String"](f"note {index}"))
-        for (topic, kind), message in zip(TYPES.items(), messages, strict=True):
-            found.append((topic, at, bytes(store.serialize_cdr(message, kind))))
+        points = np.stack([along, 0.002 * np.sin(300.0 * along + 0.05 * index)], axis=1)
+        messages = (
+            packed_path(at, points),
+            packed_pose(at, points[0], np.array([1.0, 0.0])),
+            pack("text", f"note {index}"),
+        )
+        found += [(topic, at, data) for topic, data in zip(TYPES, messages, strict=True)]
     return found
 
 

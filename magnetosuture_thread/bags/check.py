@@ -54,29 +54,27 @@ class TopicReport:
     unreadable: int = 0
     frames: set[str] = field(default_factory=set)
 
-    def add(self, record: RecordedMessage, time: float, *, is_cdr: bool) -> None:
-        """Add a message that was recorded at a time [s since the bag's start]."""
+    def add(self, record: RecordedMessage, time: float, serialization: str, recording: Recording) -> None:
+        """Add a message that was recorded at a time [s since the bag's start]; try to use it until one can be used."""
         self.times.append(time)
-        if is_cdr and record.decoder.has_header():
+        if serialization != CDR:
+            self._refuse(f"they are written as {serialization!r}, expected {CDR!r}")
+            return
+        if record.decoder.has_header():
             try:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
+                self.stamps.append(stamp)
+                self.frames.add(frame)
             except BagError:
                 self.unreadable += 1
-                return
-            self.stamps.append(stamp)
-            self.frames.add(frame)
+        if self.channel is not None and not self.known:
+            try:
+                recording.convert(record, self.channel).decode()
+                self.known, self.problem = True, ""
+            except (UnfitError, BagError) as error:
+                self._refuse(error.problem if isinstance(error, BagError) else error)
 
-    def try_to_use(self, record: RecordedMessage, recording: Recording) -> None:
-        """Convert a message for our graph, until one can be used; what is wrong with the first is the problem."""
-        if self.channel is None or self.known:
-            return
-        try:
-            recording.convert(record, self.channel).decode()
-            self.known, self.problem = True, ""
-        except (UnfitError, BagError) as error:
-            self.refuse(error.problem if isinstance(error, BagError) else error)
-
-    def refuse(self, why: object) -> None:
+    def _refuse(self, why: object) -> None:
         """Keep why the first message of a topic of ours cannot be used, until one can."""
         if self.channel is not None and not self.known:
             self.problem = self.problem or f"none of the messages on {self.topic} can be used: {why}"
@@ -112,20 +110,14 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
     recording = Recording(bag, dish_frame=dish_frame)
     topics: dict[str, TopicReport] = {}
     for name in sorted(bag.counts):
-        types = bag.conflicts.get(name) or (bag.topics[name],)
         channel = recording.channel_of(name)
         is_empty = channel is not None and not bag.counts[name]
-        problem = recording.unfit.get(name, "")
-        topics[name] = TopicReport(name, types, channel, is_empty, problem)
+        types = bag.conflicts.get(name) or (bag.topics[name],)
+        topics[name] = TopicReport(name, types, channel, is_empty, recording.unfit.get(name, ""))
     refused: Counter[str] = Counter()
     for connection, record in bag.every_record(refused):
         time = (record.time - bag.start) * 1e-9
-        is_cdr = connection.serialization == CDR
-        topics[record.topic].add(record, time, is_cdr=is_cdr)
-        if is_cdr:
-            topics[record.topic].try_to_use(record, recording)
-        else:
-            topics[record.topic].refuse(f"they are written as {connection.serialization!r}, expected {CDR!r}")
+        topics[record.topic].add(record, time, connection.serialization, recording)
         progress(time / max(bag.duration, 1e-9))
     return {
         "bag": str(bag.path),
@@ -155,8 +147,8 @@ def _damage(damage: DamageReport) -> dict[str, Any]:
         }
         for region in damage.regions
     ]
-    counts = {"chunks_lost": damage.chunks, "bytes_lost": damage.bytes, "messages_lost": damage.messages}
-    return {"text": str(damage), **counts, "places": places}
+    lost = {"chunks_lost": damage.chunks, "bytes_lost": damage.bytes, "messages_lost": damage.messages}
+    return {"text": str(damage), **lost, "places": places}
 
 
 @dataclass
@@ -210,9 +202,8 @@ def write_repaired_bag(
     report = RepairReport(dropped=bag.others)
     numbers: dict[Connection, int] = {}
     with BagWriter(folder, notes, name=name, custom_data=bag.custom_data) as writer:
-        for connection in bag.connections():
-            if connection not in numbers:
-                numbers[connection] = writer.add_connection(_defined(bag, connection, report))
+        for connection in dict.fromkeys(bag.connections()):
+            numbers[connection] = writer.add_connection(_defined(bag, connection, report))
         for item in bag.stored():
             try:
                 if item.time > MAX_TIME:

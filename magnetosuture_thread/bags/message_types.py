@@ -8,18 +8,14 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import make_typesdict
-from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
-from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.messages.building import MessageBuilder
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.untrusted import (
     MAX_DECODED,
@@ -33,7 +29,6 @@ from magnetosuture_thread.untrusted import (
 Types = dict[str, Any]  # constants and fields by type, as rosbags describes them
 
 HEADER = "std_msgs/msg/Header"
-_MAX_EMPTY = 16  # parts of a message that take no bytes
 
 
 @cache
@@ -45,32 +40,6 @@ def typestore() -> Typestore:
         own.update(get_types_from_msg(path.read_text(encoding="utf-8"), f"magnetosuture_msgs/msg/{path.stem}"))
     store.register(own)
     return store
-
-
-def make(type_name: str, **fields: Any) -> Any:
-    """Return a message; fields that are not named are zero, or empty."""
-    kinds = typestore().fielddefs[type_name][1]
-    if len(fields) < len(kinds):
-        fields = {name: fields[name] if name in fields else _zero(kind) for name, kind in kinds}
-    return typestore().types[type_name](**fields)
-
-
-def _zero(kind: Any) -> Any:
-    """Return what a field of a kind, as rosbags describes it, holds at first."""
-    node, detail = kind
-    if node is Nodetype.NAME:
-        return make(detail, w=1.0) if detail == "geometry_msgs/msg/Quaternion" else make(detail)  # its definition's
-    if node is Nodetype.BASE:
-        return {"string": "", "bool": False}.get(detail[0], 0.0 if detail[0].startswith("float") else 0)
-    (inner, element), count = detail
-    count = count if node is Nodetype.ARRAY else 0
-    if inner is Nodetype.BASE and element[0] != "string":
-        return np.zeros(count, element[0])
-    return [_zero((inner, element)) for _ in range(count)]
-
-
-MESSAGES = MessageBuilder(make)
-"""Builds messages of the bags' type store."""
 
 
 def own_definition(type_name: str) -> MessageDefinition:
@@ -85,8 +54,8 @@ class MessageDecoder:
     """Decodes messages of one type.
 
     Args:
-        definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that
-            cannot be parsed.
+        definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that is no
+            valid .msg text.
         budget: of the bag.
 
     Attributes:
@@ -99,29 +68,24 @@ class MessageDecoder:
     def __init__(self, definition: MessageDefinition, budget: ParserBudget) -> None:
         self.type_name = name = definition.type_name
         self.problem = ""
-        ours = typestore()
         self._store: Typestore = get_typestore(Stores.EMPTY)
-        extent, own = Extent({}), Types()
+        self._density = 0.0
+        ours = typestore()
+        types: Types = ours.fielddefs
         try:
-            own = _own_types(definition, budget)
-            types: Types = {**ours.fielddefs, **own}
-            extent = Extent(types)
+            types = {**types, **_parsed_types(definition, budget)}
             if name in types:
-                extent.check(name)
+                self._density = _density(name, types)
         except BudgetError as error:
             # Not ours in its place either: its messages are of that definition.
             self.problem = str(error)
-        self._density = extent.density
-        self.is_ours = (
-            not self.problem
-            and name in ours.fielddefs
-            and (name not in own or _closure(name, types, True) == _closure(name, ours.fielddefs, True))
-        )
+        fields = {} if self.problem or name not in types else _fields_within(name, types)
+        self.is_ours = bool(fields) and name in ours.fielddefs and fields == _fields_within(name, ours.fielddefs)
         if self.is_ours:
             self._store = ours
-        elif not self.problem and name in own:
+        elif fields:
             try:
-                self._store.register(_closure(name, types))
+                self._store.register({each: types[each] for each in fields})
             except Exception:  # A name that is no name in Python, for example.
                 self._store = get_typestore(Stores.EMPTY)
         self.is_known = name in self._store.fielddefs
@@ -169,7 +133,7 @@ class DecoderCache:
         return self._decoders[definition]
 
 
-class _Bounded(Parser):
+class _BoundedParser(MSGParser):
     """A parser that ends after a number of steps: some texts make it try every way to read them."""
 
     budget: ParserBudget
@@ -185,38 +149,23 @@ class _Bounded(Parser):
         return super().regex(pos, pattern, flags)
 
 
-class _BoundedMsgParser(_Bounded, MSGParser):
-    """Parser of .msg files."""
-
-
-class _BoundedIdlParser(_Bounded, IDLParser):
-    """Parser of .idl files, without operators in constants: those of ROS have none, and a shift may be huge."""
-
-    def _binop(self, pos: int, left: Any, op: str, right: Any) -> Any:
-        return Failure(pos, "", {"a constant without an operator"})
-
-
-def _own_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
+def _parsed_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
     """Return the types of a definition; none where it cannot be parsed, or uses types without definition.
 
     An empty definition is ignored for a type that we know: some recorders leave it out.
 
     Raises:
-        BudgetError: it asks for more than a message may be.
+        BudgetError: it takes too much to parse.
     """
     name, text = definition.type_name, definition.text
     ours = typestore().fielddefs
-    if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
+    if definition.encoding != "ros2msg" or (not text.strip() and name in ours):
         return {}
     if len(text) > MAX_DEFINITION_CHARS:
         raise BudgetError(f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
     budget.begin()
     try:
-        parser: _Bounded
-        if definition.encoding == "ros2msg":
-            parser = _BoundedMsgParser(f"MSG: {name}\n{text}")
-        else:
-            parser = _BoundedIdlParser(text)
+        parser = _BoundedParser(f"MSG: {name}\n{text}")
         parser.budget = budget
         own = dict(make_typesdict(parser.specification()))
     except BudgetError:
@@ -227,20 +176,15 @@ def _own_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
     return own if used <= {*own, *ours} else {}
 
 
-def _closure(name: str, types: Types, fields_only: bool = False) -> Types:
-    """Return a type and those within it; or of each its fields alone, by lower-case names, to be compared.
-
-    Raises:
-        KeyError: one of them is not defined.
-    """
+def _fields_within(name: str, types: Types) -> Types:
+    """Return the fields of a type and of all types in it, by type; those of ROS 1 have capitals in their names."""
     found: Types = {}
     waiting = [name]
     while waiting:
         each = waiting.pop()
         if each not in found:
-            fields = types[each][1]
-            found[each] = [(field.lower(), kind) for field, kind in fields] if fields_only else types[each]
-            waiting += [inner for _, kind in fields if (inner := _type_within(kind))]
+            found[each] = [(field.lower(), kind) for field, kind in types[each][1]]
+            waiting += [inner for _, kind in found[each] if (inner := _type_within(kind))]
     return found
 
 
@@ -252,62 +196,49 @@ def _type_within(kind: Any) -> str:
     return detail if node is Nodetype.NAME else ""
 
 
-class Extent:
-    """What the definition of a type makes of a message.
+def _density(type_name: str, types: Types) -> float:
+    """Return how many objects a byte of a sequence in a message may become, at most.
 
-    Args:
-        types: all types that it uses.
-
-    Attributes:
-        density: objects that a byte of a sequence may become, at most.
+    Raises:
+        BudgetError: messages have more parts than they may whatever their data, parts in parts too deep, or sequences
+            of parts that take no bytes.
     """
+    known: dict[str, tuple[int, int]] = {}
+    density = 0.0
 
-    def __init__(self, types: Types) -> None:
-        self._types = types
-        self._known: dict[str, tuple[int, int, int]] = {}
-        self.density = 0.0
-
-    def check(self, type_name: str) -> None:
-        """Refuse a type whose messages have more parts than may be, or parts in parts too deep.
-
-        Raises:
-            BudgetError: it does.
-        """
-        self._of(type_name, 0)
-
-    def _of(self, name: str, depth: int) -> tuple[int, int, int]:
-        """Return elements, least bytes and empty parts of a type."""
+    def extent_of(name: str, depth: int) -> tuple[int, int]:
+        """Return number of objects and least bytes of a type."""
         if depth > MAX_NESTING:
             raise BudgetError(f"a definition with types more than {MAX_NESTING} deep in each other")
-        if name not in self._known:
-            elements, size, empty = 1, 0, 0
-            for _, kind in self._types[name][1]:
-                more = self._of_field(kind, depth)
-                elements, size, empty = elements + more[0], size + more[1], empty + more[2]
-                if elements > MAX_ELEMENTS:
+        if name not in known:
+            objects, size = 1, 0
+            for _, kind in types[name][1]:
+                more, bytes_more = extent_of_field(kind, depth)
+                objects, size = objects + more, size + bytes_more
+                if objects > MAX_ELEMENTS:
                     raise BudgetError(f"a definition of more than {MAX_ELEMENTS} fields, nested ones counted")
-            empty += not size
-            if empty > _MAX_EMPTY:
-                raise BudgetError(f"a definition with more than {_MAX_EMPTY} parts that hold nothing")
-            self._known[name] = elements, size, empty
-        return self._known[name]
+            known[name] = objects, size
+        return known[name]
 
-    def _of_field(self, kind: Any, depth: int) -> tuple[int, int, int]:
+    def extent_of_field(kind: Any, depth: int) -> tuple[int, int]:
+        nonlocal density
         node, detail = kind
         if node is Nodetype.BASE:
-            return 1, 4 if detail[0] == "string" else 1, 0
+            return 1, 4 if detail[0] == "string" else 1
         if node is Nodetype.NAME:
-            return self._of(detail, depth + 1)
+            return extent_of(detail, depth + 1)
         inner, count = detail
         if count < 0:
             raise BudgetError(f"a definition of an array of {count} parts")
-        is_numeric = inner[0] is Nodetype.BASE and inner[1][0] != "string"
-        if is_numeric:  # one array, whatever its length
-            return 1, count if node is Nodetype.ARRAY else 4, 0
-        elements, size, empty = self._of_field(inner, depth)
+        if inner[0] is Nodetype.BASE and inner[1][0] != "string":  # one array of numbers, whatever its length
+            return 1, count if node is Nodetype.ARRAY else 4
+        objects, size = extent_of_field(inner, depth)
         if node is Nodetype.ARRAY:
-            return count * elements, count * size, count * empty
+            return count * objects, count * size
         if not size:
             raise BudgetError("a definition with a sequence of parts that hold nothing")
-        self.density = max(self.density, elements / size)
-        return 1, 4, 0
+        density = max(density, objects / size)
+        return 1, 4
+
+    extent_of(type_name, 0)
+    return density

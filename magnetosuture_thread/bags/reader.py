@@ -1,23 +1,29 @@
-"""Reads bags: verifies the whole bag as it is opened, then yields its messages by time."""
+"""Reads bags, in mcap or sqlite3: verifies the whole bag as it is opened, then yields its messages by time."""
 
 from __future__ import annotations
 
+import os
+import re
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import zstandard
 
 from magnetosuture_thread.bags import absolute_topic
-from magnetosuture_thread.bags.mcap.file import McapFile
+from magnetosuture_thread.bags.mcap import McapFile
 from magnetosuture_thread.bags.message_types import DecoderCache, MessageDecoder
-from magnetosuture_thread.bags.sqlite import SqliteFile
 from magnetosuture_thread.bags.storage import (
     CDR,
+    QOS,
+    TYPE_HASH,
     UNCHECKED_NOTE,
     UNVERIFIED_NOTE,
     Connection,
@@ -32,6 +38,179 @@ from magnetosuture_thread.bags.storage import (
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import is_url
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
+
+SQLITE_UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
+_SQLITE_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a name
+_SQLITE_MAGIC = b"SQLite format 3\0"
+_LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
+_STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
+_MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
+# sqlite3 does not enforce column types, so that a row may hold anything.
+_IS_VALID = (
+    "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
+)
+_COUNT = f"""
+    SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp), MAX(length(data)), SUM({_IS_VALID})
+    FROM messages GROUP BY topic_id
+"""
+
+
+class SqliteFile:
+    """A file of recorded messages in sqlite3, the older format of rosbag2; see `McapFile` for the attributes.
+
+    A database may be anything: tables that compute their rows, trees that lead back to themselves, rows of gigabytes.
+    Only plain tables are read, within a number of steps that depends on the size of the file. A damaged one is refused:
+    nothing tells its altered messages from the others.
+
+    Args:
+        path: the file.
+        progress: called with the number of bytes read since the last call.
+
+    Raises:
+        BagError: it cannot be read, is empty, damaged, or no such file.
+    """
+
+    def __init__(self, path: Path, progress: Callable[[int], None] = lambda count: None) -> None:
+        self.path = path
+        if is_url(path):
+            raise BagError(path, "is a database, which is read on its own machine only; copy it to this machine")
+        try:
+            size = path.stat().st_size
+            with path.open("rb") as stream:
+                magic = stream.read(len(_SQLITE_MAGIC))
+        except OSError as error:
+            raise BagError(path, f"cannot be read: {error.strerror or error}") from error
+        if magic != _SQLITE_MAGIC:
+            raise BagError(path, "is no sqlite3 file" if magic else "is empty, expected a sqlite3 file")
+        self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
+        self.notes: dict[str, str] = {}
+        self.unchecked = SQLITE_UNCHECKED
+        self.others: Counter[str] = Counter()
+        self.counts: dict[int, int] = {}
+        self.damage: DamageReport | None = None
+        try:
+            with closing(self._connect()) as database:
+                if (found := str(database.execute("PRAGMA integrity_check(1)").fetchone()[0])) != "ok":
+                    raise self._damaged(found)
+                self._check_tables(database)
+                self.connections = _sqlite_connections(database)
+                self._count_messages(database)
+        except _SQLITE_ERRORS as error:
+            # An OperationalError or DataError is no damage: no such column, for example, or too much work.
+            if isinstance(error, sqlite3.DatabaseError) and not isinstance(
+                error, (sqlite3.OperationalError, sqlite3.DataError)
+            ):
+                raise self._damaged(_reason_of(error)) from None
+            raise BagError(path, f"cannot be read as a bag: {_reason_of(error)}") from None
+        progress(size)
+        self.facts = {"format": "sqlite3", "bytes": str(size), "checksums": "none"}
+
+    def _check_tables(self, database: sqlite3.Connection) -> None:
+        """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
+        for table in ("topics", "messages"):
+            query = "SELECT type, sql FROM sqlite_master WHERE name = ?"
+            found = database.execute(query, (table,)).fetchone() or ("", "")
+            if found[0] != "table" or re.search(r"\b(as|virtual)\b", str(found[1]), re.IGNORECASE):
+                raise BagError(self.path, f"has no plain table {table}, which the database of a bag has")
+
+    def _count_messages(self, database: sqlite3.Connection) -> None:
+        lost = longest = 0
+        times: list[int] = []
+        for topic, count, first, last, size, valid in database.execute(_COUNT):
+            if topic not in self.connections or valid < count:
+                lost += count - (valid if topic in self.connections else 0)
+                continue
+            self.counts[topic] = count
+            times += first, last
+            longest = max(longest, size)
+        if lost:
+            raise self._damaged(f"{lost} rows without a valid time, topic or data")
+        if longest > MAX_BLOCK_BYTES:
+            raise BagError(self.path, f"has a message of {longest} bytes; at most {MAX_BLOCK_BYTES} are read")
+        self.start, self.end = min(times, default=0), max(times, default=0)
+
+    def _damaged(self, problem: str) -> BagError:
+        return BagError(self.path, f"is damaged ({problem}), and has no checksums (sqlite3): nothing of it is used")
+
+    def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
+        """Yield the messages of some connections from `start` to `end` [ns], both included, by time.
+
+        Raises:
+            BagError: the file has changed since it was verified, or cannot be read any more.
+        """
+        wanted = sorted(set(connections) & set(self.counts))
+        try:
+            with closing(self._connect()) as database:
+                marks = ",".join("?" * len(wanted))
+                query = (
+                    f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks})"
+                    f" AND {_IS_VALID} AND timestamp BETWEEN ? AND ? ORDER BY timestamp, id"
+                )
+                rows = database.execute(query, (*wanted, max(start, self.start), min(end, self.end)))
+                yield from (StoredMessage(time, self.connections[topic], data) for time, topic, data in rows)
+        except _SQLITE_ERRORS as error:
+            raise BagError(self.path, f"cannot be read any more: {_reason_of(error)}") from None
+
+    def _connect(self) -> sqlite3.Connection:
+        """Open the file read-only; nothing is written beside it either, unless a recorder left a journal."""
+        journals = [self.path.with_name(self.path.name + end) for end in ("-wal", "-journal", "-shm")]
+        for journal in journals:
+            if journal.exists() and not journal.is_file():
+                raise BagError(journal, "is a folder, pipe or device, expected the journal of a database")
+        has_journal = any(journal.exists() for journal in journals[:2])
+        mode = "mode=ro" if has_journal else "mode=ro&immutable=1"
+        database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
+        database.text_factory = _decode_text
+        if set_limit := getattr(database, "setlimit", None):  # from Python 3.11 on
+            set_limit(_LIMIT_LENGTH, 2 * MAX_BLOCK_BYTES)
+        left = self._max_steps
+
+        def step() -> int:
+            nonlocal left
+            left -= _STEP_INTERVAL
+            return int(left < 0)
+
+        database.set_progress_handler(step, _STEP_INTERVAL)
+        for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
+            database.execute(f"PRAGMA {pragma}")
+        return database
+
+
+def _decode_text(data: bytes) -> str | None:
+    """Return a text; None if it is not valid UTF-8."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def _reason_of(error: Exception) -> str:
+    """Return an error of sqlite3 in one line."""
+    if "interrupted" in str(error):
+        return "reading it takes more steps than a recording of its size does"
+    return " ".join(str(error).split())
+
+
+def _sqlite_connections(database: sqlite3.Connection) -> dict[int, Connection]:
+    definitions = {}
+    with suppress(*_SQLITE_ERRORS):  # Older files have none.
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        rows = database.execute(query)
+        definitions = {row[0]: MessageDefinition(*row) for row in rows if all(isinstance(word, str) for word in row)}
+    connections = {}
+    rows = database.execute("SELECT * FROM topics")
+    names = [column[0] for column in rows.description]
+    for row in rows:
+        values = dict(zip(names, row, strict=True))
+        number, topic, kind, form = (values.get(name) for name in ("id", "name", "type", "serialization_format"))
+        if number in connections:
+            raise sqlite3.DatabaseError("its table of topics leads back to itself")
+        if isinstance(number, int) and isinstance(topic, str) and isinstance(kind, str) and isinstance(form, str):
+            entries = {QOS: values.get("offered_qos_profiles"), TYPE_HASH: values.get("type_description_hash")}
+            metadata = {key: text for key, text in entries.items() if isinstance(text, str)}
+            connections[number] = Connection(topic, definitions.get(kind, MessageDefinition(kind)), form, metadata)
+    return connections
+
 
 Progress = Callable[[float], None]
 BagStorage = McapFile | SqliteFile
@@ -77,7 +256,7 @@ class Bag:
     """A recorded bag: mcap or sqlite3, one file or several, whole or damaged.
 
     All checksums are verified as it is opened, so that damage is known before any message is used. Intact data is read;
-    data that may be wrong never is (see `bags/mcap/file.py` for the rule). Of a bag by URL, only what is read is
+    data that may be wrong never is (see `bags/mcap.py` for the rule). Of a bag by URL, only what is read is
     fetched and verified, and reading ends with an error where it is damaged.
 
     Args:
@@ -290,21 +469,14 @@ def apply_remap(path: Path, topics: Collection[str], remap: Mapping[str, str]) -
     for before, after in remap.items():
         known = [topic for topic in topics if absolute_topic(topic) == absolute_topic(before)]
         if not known:
-            raise BagError(path, f"has no topic {absolute_topic(before)} to remap{_suggestion(before, topics)}")
+            close = get_close_matches(absolute_topic(before), topics, n=1)
+            meant = f"; did you mean {close[0]}?" if close else ""
+            its = ", ".join(sorted(topics)) or "none"
+            raise BagError(path, f"has no topic {absolute_topic(before)} to remap{meant}; its topics: {its}")
         names[known[0]] = absolute_topic(after)
-    sources: dict[str, list[str]] = {}
+    sources: dict[str, str] = {}
     for topic, name in sorted(names.items()):
-        sources.setdefault(name, []).append(topic)
-    for name, own in sources.items():
-        if len(own) > 1 and name in own:
-            other = next(topic for topic in own if topic != name)
-            raise BagError(path, f"has {name} itself; {other} cannot be remapped to it without mixing the two")
-        if len(own) > 1:
-            raise BagError(path, f"{own[0]} and {own[1]} cannot both be remapped to {name}")
+        if name in sources:
+            raise BagError(path, f"{sources[name]} and {topic} cannot both be {name}: their messages would be mixed")
+        sources[name] = topic
     return names
-
-
-def _suggestion(topic: str, topics: Collection[str]) -> str:
-    close = get_close_matches(absolute_topic(topic), topics, n=1)
-    meant = f"; did you mean {close[0]}?" if close else ""
-    return f"{meant}; its topics: {', '.join(sorted(topics)) or 'none'}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -14,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import interface
-from magnetosuture_thread.bags.message_types import MESSAGES, typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
-from magnetosuture_thread.messages.cdr import is_in_dish_frame, stamp_and_frame
+from magnetosuture_thread.messages.cdr import is_in_dish_frame, pack, stamp_and_frame
 from magnetosuture_thread.messages.markers import ADD, LINE_STRIP
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ class Recording:
         if name in bag.conflicts:
             self.unfit[name] = f"topic {name} has two types, {' and '.join(bag.conflicts[name])}; expected one"
         elif name in bag.topics:
-            accepted = {*CONVERSIONS.get(channel.type_name, {}), channel.type_name}
+            accepted = {*CONVERTED.get(channel.type_name, ()), channel.type_name}
             if bag.topics[name] in accepted:
                 self._topics[channel] = name
             else:
@@ -159,29 +159,26 @@ class Recording:
             UnfitError: that is impossible.
             BagError: its frame is never connected to the dish frame.
         """
-        conversions = CONVERSIONS.get(channel.type_name)
+        is_converted = channel.type_name in CONVERTED
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
-        if is_ours and (conversions is None or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
+        if is_ours and (not is_converted or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
             return RecordedMessage(channel.recorded, channel.type_name, record.time, record.data)
-        if conversions is None:
+        if not is_converted:
             raise UnfitError(f"its type {record.type_name} has another definition than ours")
-        frame, stamp = self._dish_frame, record.time
+        frame, stamp = self._dish_frame, record.time  # of a Twist, which has none
         try:
             if record.type_name != UNSTAMPED_TWIST:
                 stamp, frame = stamp_and_frame(record.topic, record.data)
-            message = conversions[record.type_name](record.decode(), record.time)
+            message = record.decode()
         except BagError as error:
             raise UnfitError(error.problem) from None
+        frame = frame.lstrip("/")
+        matrix = None if frame == self._dish_frame else self._transform_to_dish(record.topic, frame, stamp)
+        try:
+            data = converted(message, channel.type_name, stamp, matrix)
         except (AttributeError, TypeError, ValueError) as error:  # of another definition of the type
             raise UnfitError(str(error)) from None
-        frame = frame.lstrip("/")
-        if frame == self._dish_frame:
-            message.header.frame_id = DISH_FRAME
-        else:
-            message = moved(message, self._transform_to_dish(record.topic, frame, stamp), DISH_FRAME)
-        try:
-            data = bytes(typestore().serialize_cdr(message, channel.type_name))
-        except Exception:  # The serialiser raises any error, for example for a stamp out of range.
+        except struct.error:
             raise UnfitError("a value out of range of our type") from None
         return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
 
@@ -281,138 +278,115 @@ class TransformTree:
 
 def matrix_of(place: Any, turn: Any) -> Matrix | None:
     """Return the transform of a point or vector and a quaternion; None if it is not finite, or the quaternion 0."""
-    rotation = _rotation(turn)
     matrix = np.eye(4)
     matrix[:3, 3] = place.x, place.y, place.z
-    if rotation is None or not np.isfinite(matrix).all():
+    try:
+        matrix[:3, :3] = _rotations(np.array([[turn.x, turn.y, turn.z, turn.w]])).as_matrix()[0]
+    except UnfitError:
         return None
-    matrix[:3, :3] = rotation.as_matrix()
-    return matrix
+    return matrix if np.isfinite(matrix).all() else None
 
 
-def _rotation(turn: Any) -> Rotation | None:
-    """Return the rotation of a geometry_msgs/Quaternion; None if it is not finite or of length 0."""
+def _rotations(quaternions: NDArray[np.float64]) -> Rotation:
+    """Return the rotations of quaternions of any length, shape (n, 4).
+
+    Raises:
+        UnfitError: one is not finite, or of length 0.
+    """
     from scipy.spatial.transform import Rotation  # late, as bags of our own graph turn nothing
 
-    quaternion = np.array([turn.x, turn.y, turn.z, turn.w], dtype=float)
-    greatest = np.abs(quaternion).max()
-    if not np.isfinite(greatest) or not greatest:
-        return None
-    return Rotation.from_quat(quaternion / greatest)  # whose length neither vanishes nor overflows
-
-
-def _moved_points(matrix: Matrix, points: Matrix) -> Matrix:
-    """Return points, shape (3,) or (n, 3) [m], in the other frame."""
-    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3])
-
-
-def pose_stamped(message: Any, time: int) -> Any:
-    """Return a PoseStamped of anything that holds one pose."""
-    return MESSAGES.pose_stamped(_header_of(message), _pose_in(message))
-
-
-def pose_with_covariance(message: Any, time: int) -> Any:
-    """Return a PoseWithCovarianceStamped of anything that holds one pose; a covariance of zeros means unknown."""
-    holder = getattr(message, "pose", None)
-    covariance = getattr(holder, "covariance", None)
-    values = np.zeros(36) if covariance is None else np.array(covariance, dtype=float)
-    return MESSAGES.pose_with_covariance(_header_of(message), _pose_in(message), values)
-
-
-def path_of_marker(message: Any, time: int) -> Any:
-    """Return a Path of a Marker that is a line strip."""
-    if message.action != ADD or message.type != LINE_STRIP:
-        raise UnfitError("a marker that is no line strip being added")
-    points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
-    turn, place = message.pose.orientation, message.pose.position
-    if not np.any([turn.x, turn.y, turn.z, turn.w]):
-        turn = MESSAGES.pose((0.0, 0.0, 0.0), UPRIGHT).orientation  # RViz takes zeros for no rotation
-    matrix = matrix_of(place, turn)
-    if matrix is None:
+    greatest = np.abs(quaternions).max(axis=1, keepdims=True)
+    if not np.isfinite(greatest).all() or not greatest.all():
         raise UnfitError("an orientation that is none")
-    return _path(message, [MESSAGES.pose(xyz, UPRIGHT) for xyz in _moved_points(matrix, points)])
+    return Rotation.from_quat(quaternions / greatest)  # whose length neither vanishes nor overflows
 
 
-_POSES = (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry")
-# By the type that our graph takes, by the type that a bag may have.
-CONVERSIONS: dict[str, dict[str, Callable[[Any, int], Any]]] = {
-    POSE: dict.fromkeys(_POSES, pose_stamped),
-    POSE_WITH_COVARIANCE: dict.fromkeys(_POSES, pose_with_covariance),
-    PATH: {
-        PATH: lambda m, _: _path(m, [_pose(each.pose.position, each.pose.orientation) for each in m.poses]),
-        "geometry_msgs/msg/PoseArray": lambda m, _: _path(m, [_pose(e.position, e.orientation) for e in m.poses]),
-        "geometry_msgs/msg/PolygonStamped": lambda m, _: _path(m, [_pose(point) for point in m.polygon.points]),
-        "visualization_msgs/msg/Marker": path_of_marker,
-        "magnetosuture_msgs/msg/PredictedThread": lambda m, _: _path(m, [_pose(point) for point in m.positions]),
-    },
-    TWIST: {
-        TWIST: lambda m, _: MESSAGES.twist_stamped(_header_of(m), _twist(m.twist)),
-        # Stamped when it was recorded, in no frame.
-        UNSTAMPED_TWIST: lambda m, time: MESSAGES.twist_stamped(MESSAGES.header(time, ""), _twist(m)),
-    },
-}
+def _pose(position: Any, orientation: Any = None) -> list[float]:
+    """Return position [m] and quaternion of a pose."""
+    turn = UPRIGHT if orientation is None else (orientation.x, orientation.y, orientation.z, orientation.w)
+    return [position.x, position.y, position.z, *turn]
 
 
-def moved(message: Any, matrix: Matrix, frame: str) -> Any:
-    """Return a message of one of the types in `CONVERSIONS` in another frame.
-
-    Of a twist only the directions change: it stays the velocity of the same point, seen from a frame at rest.
-    A covariance C becomes M C M^T, where M turns position and rotation alike.
-    """
-    header = MESSAGES.header(message.header.stamp, frame)
-    kind = message.__msgtype__
-    if kind == POSE:
-        return MESSAGES.pose_stamped(header, _moved_pose(message.pose, matrix))
-    if kind == POSE_WITH_COVARIANCE:
-        both = np.kron(np.eye(2), matrix[:3, :3])
-        if len(message.pose.covariance) != 36:
-            raise UnfitError("a covariance of another size")
-        covariance = both @ np.reshape(message.pose.covariance, (6, 6)) @ both.T
-        return MESSAGES.pose_with_covariance(header, _moved_pose(message.pose.pose, matrix), covariance.ravel())
-    if kind == PATH:
-        return MESSAGES.path(header, [_moved_pose(each.pose, matrix) for each in message.poses])
-    return MESSAGES.twist_stamped(header, _twist(message.twist, matrix[:3, :3]))
-
-
-def _moved_pose(pose: Any, matrix: Matrix) -> Any:
-    from scipy.spatial.transform import Rotation
-
-    place = _moved_points(matrix, np.array([pose.position.x, pose.position.y, pose.position.z], dtype=float))
-    turn, rotation = pose.orientation, _rotation(pose.orientation)
-    if rotation is None:
-        raise UnfitError("an orientation that is none")
-    # Composed by hand, so that its length stays what it was: whoever takes it judges that.
-    turned = (Rotation.from_matrix(matrix[:3, :3]) * rotation).as_quat()
-    return MESSAGES.pose(place, turned * math.hypot(turn.x, turn.y, turn.z, turn.w))
-
-
-def _pose_in(message: Any) -> Any:
-    """Return the pose in a message, however deep."""
+def _needle_pose(message: Any) -> list[list[float]]:
+    """Return the pose in a message that holds one, however deep."""
     if hasattr(message, "transform"):
         if matrix_of(message.transform.translation, message.transform.rotation) is None:
             raise UnfitError("a transform that is none")
-        return _pose(message.transform.translation, message.transform.rotation)
+        return [_pose(message.transform.translation, message.transform.rotation)]
     pose = getattr(message.pose, "pose", message.pose)
-    return _pose(pose.position, pose.orientation)
+    return [_pose(pose.position, pose.orientation)]
 
 
-def _header_of(message: Any) -> Any:
-    return MESSAGES.header(message.header.stamp, message.header.frame_id)
+def _marker_poses(message: Any) -> list[list[float]]:
+    """Return the points of a Marker that is a line strip, as poses."""
+    if message.action != ADD or message.type != LINE_STRIP:
+        raise UnfitError("a marker that is no line strip being added")
+    own = np.array(_pose(message.pose.position, message.pose.orientation))
+    place, turn = own[:3], own[3:] if own[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
+    points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
+    return [[*point, *UPRIGHT] for point in _rotations(turn[None]).apply(points) + place]
 
 
-def _path(message: Any, poses: list[Any]) -> Any:
-    return MESSAGES.path(_header_of(message), poses)
+# By the type that a bag may have: what gives the poses in a message.
+_POSES: dict[str, Callable[[Any], list[list[float]]]] = dict.fromkeys(
+    (POSE, POSE_WITH_COVARIANCE, "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"), _needle_pose
+)
+_PATHS: dict[str, Callable[[Any], list[list[float]]]] = {
+    PATH: lambda m: [_pose(each.pose.position, each.pose.orientation) for each in m.poses],
+    "geometry_msgs/msg/PoseArray": lambda m: [_pose(each.position, each.orientation) for each in m.poses],
+    "geometry_msgs/msg/PolygonStamped": lambda m: [_pose(point) for point in m.polygon.points],
+    "visualization_msgs/msg/Marker": _marker_poses,
+    "magnetosuture_msgs/msg/PredictedThread": lambda m: [_pose(point) for point in m.positions],
+}
+CONVERTED = {
+    POSE: tuple(_POSES),
+    POSE_WITH_COVARIANCE: tuple(_POSES),
+    PATH: tuple(_PATHS),
+    TWIST: (TWIST, UNSTAMPED_TWIST),
+}
+"""Types that a bag may have, by the type that our graph takes."""
 
 
-def _pose(position: Any, orientation: Any = None) -> Any:
-    turn = UPRIGHT
-    if orientation is not None:
-        turn = (orientation.x, orientation.y, orientation.z, orientation.w)
-    return MESSAGES.pose((position.x, position.y, position.z), turn)
+def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -> bytes:
+    """Return a message as CDR bytes of one of our types, in the dish frame.
+
+    A covariance C becomes M C M^T, where M turns position and rotation alike. Of a twist only the directions change: it
+    stays the velocity of the same point, seen from a frame at rest.
+
+    Args:
+        message: of one of the types in `CONVERTED`.
+        type_name: our type.
+        stamp: of the message [ns].
+        matrix: the transform from its frame to the dish frame; None for no change.
+
+    Raises:
+        UnfitError: it holds no such thing.
+        struct.error: its stamp is out of range.
+    """
+    rotation = np.eye(3) if matrix is None else matrix[:3, :3]
+    if type_name == TWIST:
+        twist = getattr(message, "twist", message)
+        vectors = np.array([[each.x, each.y, each.z] for each in (twist.linear, twist.angular)])
+        return pack("header float64[6]", stamp, vectors @ rotation.T)
+    kind = message.__msgtype__
+    if type_name == PATH:
+        poses = _moved(_PATHS[kind](message), matrix)
+        fields = [field for pose in poses for field in (stamp, pose)]
+        return pack("header uint32" + " header float64[7]" * len(poses), stamp, len(poses), *fields)
+    (pose,) = _moved(_POSES[kind](message), matrix)
+    if type_name == POSE:
+        return pack("header float64[7]", stamp, pose)
+    both = np.kron(np.eye(2), rotation)
+    covariance = np.reshape(getattr(getattr(message, "pose", None), "covariance", np.zeros(36)), (6, 6))
+    return pack("header float64[7] float64[36]", stamp, pose, both @ covariance @ both.T)
 
 
-def _twist(twist: Any, rotation: Matrix | None = None) -> Any:
-    vectors = [[each.x, each.y, each.z] for each in (twist.linear, twist.angular)]
-    if rotation is not None:
-        vectors = [(rotation @ vector).tolist() for vector in vectors]
-    return MESSAGES.twist(*(MESSAGES.vector(*vector) for vector in vectors))
+def _moved(poses: list[list[float]], matrix: Matrix | None) -> Matrix:
+    """Return poses, shape (n, 7), in another frame; quaternions keep their length, which whoever takes them judges."""
+    moved = np.array(poses, dtype=float).reshape(-1, 7)
+    if matrix is not None and poses:
+        moved[:, :3] = moved[:, :3] @ matrix[:3, :3].T + matrix[:3, 3]
+        turns = _rotations(moved[:, 3:])
+        turned = type(turns).from_matrix(matrix[:3, :3]) * turns
+        moved[:, 3:] = turned.as_quat() * np.linalg.norm(moved[:, 3:], axis=1, keepdims=True)
+    return moved

@@ -9,6 +9,7 @@ import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,13 +98,12 @@ def merge_reports(reports: Iterable[DamageReport | None]) -> DamageReport | None
     damaged = [report for report in reports if report is not None]
     if not damaged:
         return None
-    lost = [report.messages for report in damaged]
-    known = [count for count in lost if count is not None]
+    lost = [report.messages for report in damaged if report.messages is not None]
     return DamageReport(
         regions=tuple(region for report in damaged for region in report.regions),
         chunks=sum(report.chunks for report in damaged),
         bytes=sum(report.bytes for report in damaged),
-        messages=sum(known) if len(known) == len(lost) else None,
+        messages=sum(lost) if len(lost) == len(damaged) else None,
     )
 
 
@@ -169,29 +169,21 @@ def merge_by_time(parts: Iterable[tuple[int, Callable[[], Iterator[StoredMessage
     Args:
         parts: start time of each part, and a function that yields its messages by time. Sorted by start time.
     """
-    waiting = iter(parts)
-    following = next(waiting, None)
     heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
-    number = 0
-    while heap or following is not None:
-        while following is not None and (not heap or following[0] <= heap[0][0]):
-            items = following[1]()
-            first = next(items, None)
-            if first is not None:
-                heapq.heappush(heap, (first.time, number, first, items))
-            number += 1
-            following = next(waiting, None)
-        if not heap:
-            continue
-        _, part, item, items = heapq.heappop(heap)
-        yield item
-        # What comes before anything of another part needs no sorting.
-        until = min(heap[0][0] if heap else math.inf, following[0] if following is not None else math.inf)
-        for item in items:
-            if item.time >= until:
-                heapq.heappush(heap, (item.time, part, item, items))
-                break
+    last: tuple[float, Callable[[], Iterator[StoredMessage]]] = (math.inf, lambda: iter(()))
+    for part, (start, read) in enumerate(chain(parts, [last])):
+        while heap and heap[0][0] < start:  # what comes before anything of this part
+            _, number, item, items = heap[0]
             yield item
+            following = next(items, None)
+            if following is None:
+                heapq.heappop(heap)
+            else:
+                heapq.heapreplace(heap, (following.time, number, following, items))
+        items = read()
+        first = next(items, None)
+        if first is not None:
+            heapq.heappush(heap, (first.time, part, first, items))
 
 
 @dataclass(frozen=True)

@@ -20,18 +20,17 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
 import yaml
 import zstandard
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
 
-from magnetosuture_thread.bags.mcap.records import MAGIC, MESSAGE_HEADER, RECORD_HEADER, encode_records
+from magnetosuture_thread.bags.mcap import MAGIC, RECORD_HEADER, encode_records
 from magnetosuture_thread.bags.message_types import own_definition, typestore
 from magnetosuture_thread.bags.storage import (
     METADATA_FILE,
@@ -48,316 +47,9 @@ from magnetosuture_thread.bags.storage import (
 )
 from magnetosuture_thread.errors import BagError
 
-_MESSAGE = struct.Struct("<BQHIQQ")  # the header of a message's record, and what is before the data
-_INDEX = struct.Struct("<BQHI")  # the header of a message index, its channel, and its size
-
-
-class PendingMessage(NamedTuple):
-    """A message that is not written yet: channel id, sequence number, times of recording and publishing [ns], bytes."""
-
-    channel: int
-    sequence: int
-    time: int
-    publish_time: int
-    data: bytes
-
-
-class BuiltChunk(NamedTuple):
-    """The content of a chunk to be written.
-
-    Attributes:
-        data: its records, uncompressed.
-        entries: time and offset of each message, by channel.
-        first: time of the first message [ns].
-        last: time of the last message [ns].
-    """
-
-    data: bytes
-    entries: dict[int, list[tuple[int, int]]]
-    first: int
-    last: int
-
-
-class ChunkBuilder:
-    """Collects messages for a chunk.
-
-    The only state is a list that grows: whatever interrupts a recorder between two messages or within one, as Ctrl-C
-    may, the messages stay complete.
-
-    Attributes:
-        size: number of bytes of the messages so far.
-    """
-
-    def __init__(self) -> None:
-        self._messages: list[PendingMessage] = []
-        self._first = self._last = 0
-        self.size = 0
-
-    def __len__(self) -> int:
-        """Return the number of messages."""
-        return len(self._messages)
-
-    @property
-    def span(self) -> int:
-        """Time from the first message to the last [ns]."""
-        return self._last - self._first
-
-    def add(self, message: PendingMessage) -> None:
-        """Add a message."""
-        time, is_first = message.time, not self._messages
-        self._messages.append(message)
-        self.size += len(message.data)
-        if is_first or time < self._first:
-            self._first = time
-        if is_first or time > self._last:
-            self._last = time
-
-    def build(
-        self, channels: Mapping[int, mcap_records.Channel], schemas: Mapping[int, mcap_records.Schema]
-    ) -> BuiltChunk:
-        """Return the content of the chunk: the messages, with the channels and schemas that they need."""
-        content: list[bytes] = []
-        size = 0
-        entries: dict[int, list[tuple[int, int]]] = {}
-        defined: set[int] = set()
-        for number, sequence, time, publish_time, data in self._messages:
-            if number not in entries:
-                channel = channels[number]
-                if channel.schema_id and channel.schema_id not in defined:
-                    content.append(encode_records(schemas[channel.schema_id]))
-                    size += len(content[-1])
-                    defined.add(channel.schema_id)
-                content.append(encode_records(channel))
-                size += len(content[-1])
-                entries[number] = []
-            entries[number].append((time, size))
-            length = MESSAGE_HEADER.size + len(data)
-            content += (_MESSAGE.pack(Opcode.MESSAGE, length, number, sequence, time, publish_time), data)
-            size += _MESSAGE.size + len(data)
-        times = [message.time for message in self._messages]
-        return BuiltChunk(b"".join(content), entries, min(times), max(times))
-
-
-def encode_message_index(channel: int, entries: list[tuple[int, int]]) -> bytes:
-    """Return the record with time and offset of each message of a channel in a chunk."""
-    offsets = struct.pack(f"<{2 * len(entries)}Q", *chain.from_iterable(entries))
-    length = _INDEX.size - RECORD_HEADER.size + len(offsets)
-    return _INDEX.pack(Opcode.MESSAGE_INDEX, length, channel, len(offsets)) + offsets
-
-
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
 MAX_SEQUENCE = (1 << 32) - 1
-
-
-@dataclass(frozen=True)
-class WriterState:
-    """What is on the disk and what is pending; replaced as one, so that no interruption leaves half of a change.
-
-    Attributes:
-        size: bytes on the disk, all of them complete records.
-        crc: their checksum.
-        chunks: number of chunks among them.
-        counts: messages in these, by channel.
-        start: time of the first of them [ns]; None if there are none.
-        end: time of the last of them [ns].
-        pending: messages for the next chunk.
-    """
-
-    size: int
-    crc: int
-    chunks: int
-    counts: Counter[int]
-    start: int | None
-    end: int
-    pending: ChunkBuilder
-
-
-class McapWriter:
-    """An mcap file being written.
-
-    Args:
-        stream: of the file, without a buffer.
-        metadata: metadata records by name, written at the head of the file, where truncation leaves them.
-
-    Attributes:
-        state: what is on the disk and what is pending.
-
-    Raises:
-        OSError: the disk is full, or fails.
-    """
-
-    def __init__(self, stream: BinaryIO, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        self._stream = stream
-        self._schemas: dict[int, mcap_records.Schema] = {}
-        self._channels: dict[int, mcap_records.Channel] = {}
-        self._numbers: dict[object, int] = {}  # of schemas, by their definition
-        self._sequences: Counter[int] = Counter()
-        self._index: list[bytes] = []  # entries of the chunk index
-        self._compressor = zstandard.ZstdCompressor()
-        self.state = WriterState(0, 0, 0, Counter(), None, 0, ChunkBuilder())
-        self.state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
-        self._metadata_index: list[mcap_records.MetadataIndex] = []
-        self._write_metadata(metadata)
-
-    def add_channel(self, connection: Connection) -> int:
-        """Define a channel and return its id."""
-        definition, schema = connection.definition, 0
-        if definition != MessageDefinition(""):
-            schema = self._numbers.setdefault(definition, len(self._numbers) + 1)
-            self._schemas[schema] = mcap_records.Schema(
-                schema, definition.text.encode("utf-8", "surrogateescape"), definition.encoding, definition.type_name
-            )
-        number = len(self._channels) + 1
-        self._channels[number] = mcap_records.Channel(
-            number, connection.topic, connection.serialization, dict(connection.metadata), schema
-        )
-        return number
-
-    def add_message(
-        self, channel: int, time: int, data: bytes, *, publish_time: int | None = None, sequence: int | None = None
-    ) -> bool:
-        """Add a message, and return whether a chunk was written with it.
-
-        Args:
-            channel: of the message.
-            time: when it was recorded [ns].
-            data: its bytes.
-            publish_time: when it was published [ns]; the time of recording if None.
-            sequence: its number; one more than that of the last on the channel if None.
-
-        Raises:
-            OSError: as `flush`.
-        """
-        pending = self.state.pending
-        sequence = self._sequences[channel] if sequence is None else sequence
-        pending.add(PendingMessage(channel, sequence, time, time if publish_time is None else publish_time, data))
-        self._sequences[channel] = (sequence + 1) & MAX_SEQUENCE
-        is_full = pending.size > MAX_CHUNK_BYTES or pending.span > MAX_CHUNK_SPAN
-        if is_full:
-            self.flush()
-        return is_full
-
-    def flush(self) -> None:
-        """Write the messages so far to the disk.
-
-        Raises:
-            OSError: they are dropped, and the file ends with the last complete chunk before them.
-        """
-        before = self.state
-        if not before.pending:
-            return
-        content, entries, first, last = before.pending.build(self._channels, self._schemas)
-        compressed = self._compressor.compress(content)
-        body = encode_records(mcap_records.Chunk("zstd", compressed, last, first, zlib.crc32(content), len(content)))
-        indices, offsets = b"", dict[int, int]()
-        for channel, messages in entries.items():
-            offsets[channel] = before.size + len(body) + len(indices)
-            indices += encode_message_index(channel, messages)
-        entry = mcap_records.ChunkIndex(
-            chunk_length=len(body),
-            chunk_start_offset=before.size,
-            compression="zstd",
-            compressed_size=len(compressed),
-            message_end_time=last,
-            message_index_length=len(indices),
-            message_index_offsets=offsets,
-            message_start_time=first,
-            uncompressed_size=len(content),
-        )
-        try:
-            after = self._append(body + indices)
-        except OSError:
-            self.state = replace(before, pending=ChunkBuilder())
-            raise
-        del self._index[before.chunks :]  # left there by an interruption
-        self._index.append(encode_records(entry))
-        self.state = replace(
-            after,
-            chunks=before.chunks + 1,
-            counts=before.counts + Counter({channel: len(messages) for channel, messages in entries.items()}),
-            start=first if before.start is None else min(before.start, first),
-            end=max(before.end, last),
-            pending=ChunkBuilder(),
-        )
-
-    def finish(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        """Write more metadata and the summary, and close the file; all messages must be flushed before.
-
-        Raises:
-            OSError: the file ends with the last complete chunk.
-        """
-        chunks = self.state
-        try:
-            self._write_metadata(metadata)
-            self.state = self._append(encode_records(mcap_records.DataEnd(self.state.crc)))
-            self.state = self._append(self._summary())
-            os.fsync(self._stream.fileno())
-        except OSError:
-            self.state = chunks
-            self._truncate()
-            raise
-        self._stream.close()
-
-    def abandon(self) -> None:
-        """Close the file without a summary: it ends with the last complete chunk."""
-        self._stream.close()
-
-    def _write_metadata(self, metadata: Mapping[str, Mapping[str, str]]) -> None:
-        """Write metadata, a record for each name."""
-        for name, entries in metadata.items():
-            record = encode_records(mcap_records.Metadata(name, dict(entries)))
-            entry = mcap_records.MetadataIndex(self.state.size, len(record), name)
-            self.state = self._append(record)
-            self._metadata_index.append(entry)
-
-    def _append(self, data: bytes) -> WriterState:
-        """Write all of the data or nothing, and return the new state."""
-        self._truncate()  # an interruption may have left something
-        try:
-            rest = memoryview(data)
-            while rest:
-                rest = rest[self._stream.write(rest) :]
-        except OSError:
-            self._truncate()
-            raise
-        return replace(self.state, size=self.state.size + len(data), crc=zlib.crc32(data, self.state.crc))
-
-    def _truncate(self) -> None:
-        self._stream.seek(self.state.size)
-        self._stream.truncate()
-
-    def _summary(self) -> bytes:
-        """Return all records after the data end."""
-        data, at = b"", self.state.size
-        offsets = b""
-        statistics = mcap_records.Statistics(
-            attachment_count=0,
-            channel_count=len(self._channels),
-            channel_message_counts=dict(self.state.counts),
-            chunk_count=self.state.chunks,
-            message_count=self.state.counts.total(),
-            message_end_time=self.state.end,
-            message_start_time=self.state.start or 0,
-            metadata_count=len(self._metadata_index),
-            schema_count=len(self._schemas),
-        )
-        for opcode, group in (
-            (Opcode.SCHEMA, encode_records(*self._schemas.values())),
-            (Opcode.CHANNEL, encode_records(*self._channels.values())),
-            (Opcode.STATISTICS, encode_records(statistics)),
-            (Opcode.CHUNK_INDEX, b"".join(self._index[: self.state.chunks])),
-            (Opcode.METADATA_INDEX, encode_records(*self._metadata_index)),
-        ):
-            if group:
-                offsets += encode_records(mcap_records.SummaryOffset(opcode, at + len(data), len(group)))
-                data += group
-        footer = (at, at + len(data))
-        data += offsets
-        crc = zlib.crc32(RECORD_HEADER.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", *footer), zlib.crc32(data))
-        return data + encode_records(mcap_records.Footer(*footer, crc)) + MAGIC
-
-
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
 
@@ -374,6 +66,60 @@ class RecordingEndedError(BagError):
     def __init__(self, folder: Path, cause: str, file: Path) -> None:
         self.cause, self.file = cause, file
         super().__init__(folder, f"{cause}; what was recorded before can be read: {file}")
+
+
+@dataclass
+class PendingChunk:
+    """Messages for a chunk.
+
+    What counts is a list that grows: whatever interrupts a recorder between two messages or within one, as Ctrl-C may,
+    the messages stay complete.
+
+    Attributes:
+        messages: in the order in which they came.
+        size: number of bytes of their data.
+        first: time of the first of them [ns].
+        last: time of the last of them [ns].
+    """
+
+    messages: list[mcap_records.Message] = field(default_factory=list)
+    size: int = 0
+    first: int = MAX_TIME
+    last: int = 0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the chunk is to be written."""
+        return self.size > MAX_CHUNK_BYTES or self.last - self.first > MAX_CHUNK_SPAN
+
+    def add(self, message: mcap_records.Message) -> None:
+        """Add a message."""
+        self.messages.append(message)
+        self.size += len(message.data)
+        self.first, self.last = min(self.first, message.log_time), max(self.last, message.log_time)
+
+
+@dataclass(frozen=True)
+class WriterState:
+    """What is on the disk and what is pending; replaced as one, so that no interruption leaves half of a change.
+
+    Attributes:
+        size: bytes on the disk, all of them complete records.
+        crc: their checksum.
+        chunks: number of chunks among them.
+        counts: messages in these, by channel.
+        start: time of the first of them [ns]; None if there are none.
+        end: time of the last of them [ns].
+        pending: messages for the next chunk.
+    """
+
+    size: int = 0
+    crc: int = 0
+    chunks: int = 0
+    counts: Counter[int] = field(default_factory=Counter)
+    start: int | None = None
+    end: int = 0
+    pending: PendingChunk = field(default_factory=PendingChunk)
 
 
 class BagWriter:
@@ -402,24 +148,33 @@ class BagWriter:
         custom_data: Mapping[str, str] | None = None,
     ) -> None:
         self.folder = folder
-        self._custom_data = dict(custom_data or {})
-        self._file_name = f"{name or folder.name}_0.mcap"
-        self._notes = dict(notes or {})
+        self._file = folder / f"{name or folder.name}_0.mcap"
+        self._notes, self._custom_data = add_checksum(notes) if notes else {}, dict(custom_data or {})
         self._topics: dict[str, int] = {}
         self._connections: dict[int, Connection] = {}
+        self._channels: dict[int, mcap_records.Channel] = {}
+        self._schemas: dict[int, mcap_records.Schema] = {}
+        self._schema_numbers: dict[MessageDefinition, int] = {}
+        self._sequences: Counter[int] = Counter()
+        self._index: list[bytes] = []  # entries of the chunk index
+        self._metadata_index: list[mcap_records.MetadataIndex] = []
+        self._compressor = zstandard.ZstdCompressor()
+        self._state = WriterState()
         self._closed = False
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any(folder.iterdir()):
                 raise BagError(folder, "is not empty; a bag is written to a new folder")
-            self._stream = (folder / self._file_name).open("wb", buffering=0)
+            self._stream = self._file.open("wb", buffering=0)
         except OSError as error:
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
         try:
-            self._writer = McapWriter(self._stream, {NOTES: add_checksum(self._notes)} if self._notes else {})
+            self._state = self._append(MAGIC + encode_records(mcap_records.Header("ros2", "magnetosuture_thread")))
+            if self._notes:
+                self._write_metadata(NOTES, self._notes)  # at the head of the file, where truncation leaves them
         except OSError as error:
             self._stream.close()
-            (folder / self._file_name).unlink(missing_ok=True)  # of no use, but in the way of the next attempt
+            self._file.unlink(missing_ok=True)  # of no use, but in the way of the next attempt
             raise BagError(folder, f"cannot be written: {error.strerror}") from None
 
     def __enter__(self) -> BagWriter:
@@ -452,11 +207,18 @@ class BagWriter:
 
     def add_connection(self, connection: Connection) -> int:
         """Add a connection, and return its number for `write_to`."""
-        if QOS in connection.metadata:
-            profiles = jazzy_qos_profiles(connection.metadata[QOS])
-            connection = replace(connection, metadata={**connection.metadata, QOS: profiles})
-        number = self._writer.add_channel(connection)
-        self._connections[number] = connection
+        definition, schema, metadata = connection.definition, 0, dict(connection.metadata)
+        if QOS in metadata:
+            metadata[QOS] = jazzy_qos_profiles(metadata[QOS])
+        if definition != MessageDefinition(""):
+            schema = self._schema_numbers.setdefault(definition, len(self._schema_numbers) + 1)
+            text = definition.text.encode("utf-8", "surrogateescape")
+            self._schemas[schema] = mcap_records.Schema(schema, text, definition.encoding, definition.type_name)
+        number = len(self._channels) + 1
+        self._connections[number] = replace(connection, metadata=metadata)
+        self._channels[number] = mcap_records.Channel(
+            number, connection.topic, connection.serialization, metadata, schema
+        )
         return number
 
     def write(self, topic: str, time: int, data: bytes) -> None:
@@ -480,15 +242,19 @@ class BagWriter:
         Otherwise as `write`.
         """
         if not 0 <= time <= MAX_TIME:
-            raise BagError(
-                self._connections[number].topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}"
-            )
+            topic = self._connections[number].topic
+            raise BagError(topic, f"a message of the time {time} ns; expected 0 to {MAX_TIME}")
         if self._closed:
             raise BagError(self.folder, "is closed; nothing more can be written to it")
-        try:
-            self._writer.add_message(number, time, data, publish_time=publish_time, sequence=sequence)
-        except OSError as error:
-            self._end(error)
+        sequence = self._sequences[number] if sequence is None else sequence
+        publish_time = time if publish_time is None else publish_time
+        self._state.pending.add(mcap_records.Message(number, time, data, publish_time, sequence))
+        self._sequences[number] = (sequence + 1) & MAX_SEQUENCE
+        if self._state.pending.is_full:
+            try:
+                self._flush()
+            except OSError as error:
+                self._end(error)
 
     def write_message(self, topic: str, time: int, message: Any) -> None:
         """Serialise a message of the type store and write it; otherwise as `write`."""
@@ -505,7 +271,7 @@ class BagWriter:
             return
         problem: OSError | None = None
         try:
-            self._writer.flush()
+            self._flush()
         except OSError as error:
             problem = error
         self._end(problem)
@@ -516,19 +282,92 @@ class BagWriter:
         try:
             self._finish()
         except OSError as error:
-            self._writer.abandon()
             problem = problem or error
+        finally:
+            self._stream.close()
         if problem is not None:
-            raise self._refusal(problem) from None
+            kept = pluralize(self._state.counts.total(), "message")
+            what = DISK_FULL_TEXTS.get(problem.errno or 0, f"fails ({problem.strerror})")
+            raise RecordingEndedError(self.folder, f"the disk {what} after {kept}", self._file) from None
 
-    def _refusal(self, problem: OSError) -> RecordingEndedError:
-        kept = pluralize(self._writer.state.counts.total(), "message")
-        what = DISK_FULL_TEXTS.get(problem.errno or 0, f"fails ({problem.strerror})")
-        return RecordingEndedError(self.folder, f"the disk {what} after {kept}", self.folder / self._file_name)
+    def _flush(self) -> None:
+        """Write the messages so far to the disk as a chunk.
+
+        Raises:
+            OSError: they are dropped, and the file ends with the last complete chunk before them.
+        """
+        before = self._state
+        if not before.pending.messages:
+            return
+        content, entries = self._chunk_content(before.pending.messages)
+        times = [message.log_time for message in before.pending.messages]
+        first, last = min(times), max(times)
+        compressed = self._compressor.compress(content)
+        body = encode_records(mcap_records.Chunk("zstd", compressed, last, first, zlib.crc32(content), len(content)))
+        indices, offsets = b"", dict[int, int]()
+        for channel, messages in entries.items():
+            offsets[channel] = before.size + len(body) + len(indices)
+            indices += encode_records(mcap_records.MessageIndex(channel, messages))
+        entry = mcap_records.ChunkIndex(
+            chunk_length=len(body),
+            chunk_start_offset=before.size,
+            compression="zstd",
+            compressed_size=len(compressed),
+            message_end_time=last,
+            message_index_length=len(indices),
+            message_index_offsets=offsets,
+            message_start_time=first,
+            uncompressed_size=len(content),
+        )
+        try:
+            after = self._append(body + indices)
+        except OSError:
+            self._state = replace(before, pending=PendingChunk())
+            raise
+        del self._index[before.chunks :]  # left there by an interruption
+        self._index.append(encode_records(entry))
+        self._state = replace(
+            after,
+            chunks=before.chunks + 1,
+            counts=before.counts + Counter({channel: len(messages) for channel, messages in entries.items()}),
+            start=first if before.start is None else min(before.start, first),
+            end=max(before.end, last),
+            pending=PendingChunk(),
+        )
+
+    def _chunk_content(self, messages: list[mcap_records.Message]) -> tuple[bytes, dict[int, list[tuple[int, int]]]]:
+        """Return the records of a chunk, with the channels and schemas of its messages; and time and offset of each."""
+        content = bytearray()
+        entries: dict[int, list[tuple[int, int]]] = {}
+        defined: set[int] = set()
+        for message in messages:
+            if message.channel_id not in entries:
+                channel = self._channels[message.channel_id]
+                if channel.schema_id and channel.schema_id not in defined:
+                    content += encode_records(self._schemas[channel.schema_id])
+                    defined.add(channel.schema_id)
+                content += encode_records(channel)
+                entries[message.channel_id] = []
+            entries[message.channel_id].append((message.log_time, len(content)))
+            content += encode_records(message)
+        return bytes(content), entries
 
     def _finish(self) -> None:
-        information = self._information()
-        self._writer.finish({"rosbag2": {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)}})
+        """Write the summary and metadata.yaml.
+
+        Raises:
+            OSError: the file ends with the last complete chunk.
+        """
+        information, chunks = self._information(), self._state
+        try:
+            self._write_metadata("rosbag2", {"serialized_metadata": yaml.safe_dump(information, sort_keys=False)})
+            self._state = self._append(encode_records(mcap_records.DataEnd(self._state.crc)))
+            self._state = self._append(self._summary())
+            os.fsync(self._stream.fileno())
+        except OSError:
+            self._state = chunks
+            self._truncate()
+            raise
         text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
         try:
             with (self.folder / METADATA_FILE).open("w", encoding="utf-8") as stream:
@@ -539,10 +378,62 @@ class BagWriter:
             (self.folder / METADATA_FILE).unlink(missing_ok=True)
             raise
 
+    def _write_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        record = encode_records(mcap_records.Metadata(name, dict(entries)))
+        entry = mcap_records.MetadataIndex(self._state.size, len(record), name)
+        self._state = self._append(record)
+        self._metadata_index.append(entry)
+
+    def _append(self, data: bytes) -> WriterState:
+        """Write all of the data or nothing, and return the new state."""
+        self._truncate()  # an interruption may have left something
+        try:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[self._stream.write(rest) :]
+        except OSError:
+            self._truncate()
+            raise
+        return replace(self._state, size=self._state.size + len(data), crc=zlib.crc32(data, self._state.crc))
+
+    def _truncate(self) -> None:
+        self._stream.seek(self._state.size)
+        self._stream.truncate()
+
+    def _summary(self) -> bytes:
+        """Return all records after the data end."""
+        data, at = b"", self._state.size
+        offsets = b""
+        statistics = mcap_records.Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._state.counts),
+            chunk_count=self._state.chunks,
+            message_count=self._state.counts.total(),
+            message_end_time=self._state.end,
+            message_start_time=self._state.start or 0,
+            metadata_count=len(self._metadata_index),
+            schema_count=len(self._schemas),
+        )
+        for opcode, group in (
+            (Opcode.SCHEMA, encode_records(*self._schemas.values())),
+            (Opcode.CHANNEL, encode_records(*self._channels.values())),
+            (Opcode.STATISTICS, encode_records(statistics)),
+            (Opcode.CHUNK_INDEX, b"".join(self._index[: self._state.chunks])),
+            (Opcode.METADATA_INDEX, encode_records(*self._metadata_index)),
+        ):
+            if group:
+                offsets += encode_records(mcap_records.SummaryOffset(opcode, at + len(data), len(group)))
+                data += group
+        footer = (at, at + len(data))
+        data += offsets
+        crc = zlib.crc32(RECORD_HEADER.pack(Opcode.FOOTER, 20) + struct.pack("<QQ", *footer), zlib.crc32(data))
+        return data + encode_records(mcap_records.Footer(*footer, crc)) + MAGIC
+
     def _information(self) -> dict[str, Any]:
         """Return the content of metadata.yaml."""
-        state = self._writer.state
-        notes = {NOTES_PREFIX + key: value for key, value in add_checksum(self._notes).items()} if self._notes else {}
+        state = self._state
+        notes = {NOTES_PREFIX + key: value for key, value in self._notes.items()}
         part = {
             "starting_time": {"nanoseconds_since_epoch": state.start or 0},
             "duration": {"nanoseconds": state.end - (state.start or 0)},
@@ -568,8 +459,8 @@ class BagWriter:
             "topics_with_message_count": topics,
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [self._file_name],
-            "files": [{"path": self._file_name, **deepcopy(part)}],  # a copy, as YAML would write aliases
+            "relative_file_paths": [self._file.name],
+            "files": [{"path": self._file.name, **deepcopy(part)}],  # a copy, as YAML would write aliases
             "custom_data": {**self._custom_data, **notes},
             "ros_distro": "jazzy",
         }

@@ -10,7 +10,6 @@ from itertools import combinations
 import numpy as np
 import shapely
 
-from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene.scene import Scene, SceneShape
 
@@ -65,59 +64,42 @@ def scene_warnings(scene: Scene, needle_width: float) -> list[SceneWarning]:
         needle_width: a gap or a hole narrower than this lets no needle pass [m].
     """
     found = [warning for shape in scene.shapes for warning in _shape_warnings(shape, scene.dish.radius, needle_width)]
-    solids = [(shape, shape.solid) for shape in scene.shapes]
-    for (first, one), (second, other) in combinations(solids, 2):
-        if shapely.box(*one.bounds).distance(shapely.box(*other.bounds)) < needle_width:
-            found += _pair_warnings(first, one, second, other, needle_width)
+    for first, second in combinations(scene.shapes, 2):
+        if shapely.box(*first.solid.bounds).distance(shapely.box(*second.solid.bounds)) < needle_width:
+            found += _pair_warnings(first, second, needle_width)
     return found
 
 
-def farthest_point(shape: SceneShape) -> tuple[float, float]:
-    """Return the point of a shape that is farthest from the dish's centre [m]."""
-    geometry = shape.geometry
-    if isinstance(geometry, Disc):
-        x, y = geometry.centre[0], geometry.centre[1]
-        away = math.hypot(x, y)
-        ahead = (x / away, y / away) if away > 0.0 else (1.0, 0.0)
-        return x + geometry.radius * ahead[0], y + geometry.radius * ahead[1]
-    outline = geometry.rings[0]
-    x, y = outline[int(np.argmax(np.hypot(*outline.T)))].tolist()
-    return x, y
-
-
 def _shape_warnings(shape: SceneShape, dish_radius: float, needle_width: float) -> Iterator[SceneWarning]:
-    place = farthest_point(shape)
-    room = dish_radius - math.hypot(*place)
+    outline = shapely.get_coordinates(shape.solid.exterior)
+    x, y = outline[np.argmax(np.hypot(*outline.T))].tolist()  # the point that is farthest from the dish's centre
+    room = dish_radius - math.hypot(x, y)
     if room < 0.0:
         text = f"{shape.name} lies across the wall: it reaches {_mm(-room)} mm beyond"
-        yield SceneWarning("wall", (shape.name,), -room, place, text)
+        yield SceneWarning("wall", (shape.name,), -room, (x, y), text)
     elif room < needle_width:
-        yield SceneWarning("gap", (shape.name,), room, place, _gap(f"{shape.name} and the wall", room, place))
-    for hole in [] if isinstance(shape.geometry, Disc) else shape.geometry.holes:
-        solid = shapely.Polygon(hole)
-        if solid.buffer(-0.5 * needle_width).is_empty:
-            circle = shapely.maximum_inscribed_circle(solid, tolerance=0.01 * needle_width)
+        yield SceneWarning("gap", (shape.name,), room, (x, y), _gap(f"{shape.name} and the wall", room, (x, y)))
+    for hole in map(shapely.Polygon, shape.solid.interiors):
+        if hole.buffer(-0.5 * needle_width).is_empty:
+            circle = shapely.maximum_inscribed_circle(hole, tolerance=0.01 * needle_width)
             x, y = circle.coords[0]
             width = 2.0 * circle.length
             text = f"a hole of {shape.name} at {_at((x, y))} is {_mm(width)} mm wide: narrower than the needle"
             yield SceneWarning("hole", (shape.name,), width, (x, y), text)
 
 
-def _pair_warnings(
-    first: SceneShape, one: shapely.Geometry, second: SceneShape, other: shapely.Geometry, needle_width: float
-) -> Iterator[SceneWarning]:
+def _pair_warnings(first: SceneShape, second: SceneShape, needle_width: float) -> Iterator[SceneWarning]:
     names = (first.name, second.name)
-    common = one.intersection(other)
+    common = first.solid.intersection(second.solid)
+    gap = float(first.solid.distance(second.solid))
     # Shapes that share a boundary do not overlap.
     if common.area > 1e-12:
         inside = common.representative_point()
         place = float(inside.x), float(inside.y)
         text = f"{first.name} and {second.name} overlap by {1e6 * common.area:.3g} mm^2 at {_at(place)}"
         yield SceneWarning("overlap", names, float(common.area), place, text)
-        return
-    gap = float(one.distance(other))
-    if gap < needle_width:
-        middle = shapely.shortest_line(one, other).interpolate(0.5, normalized=True)
+    elif gap < needle_width:
+        middle = shapely.shortest_line(first.solid, second.solid).interpolate(0.5, normalized=True)
         place = float(middle.x), float(middle.y)
         yield SceneWarning("gap", names, gap, place, _gap(f"{first.name} and {second.name}", gap, place))
 

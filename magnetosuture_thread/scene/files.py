@@ -1,139 +1,55 @@
-"""Scene files: a dish and named shapes in YAML, or GeoJSON, parsed with limits on size and depth; and their editing.
+"""Scene files in YAML or GeoJSON, and their editing.
 
 dish: {diameter: 0.05, depth: 0.004}     # [m]
 shapes:
   ring: {annulus: {center: [0.0, 0.005], inner_radius: 0.0045, outer_radius: 0.006}, kind: tissue}
+
+A GeoJSON file, for drawing programs and viewers, is a FeatureCollection in the dish frame, in metres. Its member `dish`
+has diameter and depth. A polygon is a Polygon, a disc a Point with the property `radius`; the properties `name`,
+`kind`, `friction` and `corner_radius` are those of a scene file. Geometry has its corners rounded already. The property
+`definition` keeps how a scene file describes the shape; it counts only while it still describes the geometry, so that
+what was moved elsewhere stays moved.
 """
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
-from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import shapely
+import shapely.geometry
 import yaml
 
-from magnetosuture_thread.configuration import Configuration, autostart_parameter, use_ros_numbers
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, read_yaml, read_yaml_text
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.resources import find_scene_file
-from magnetosuture_thread.scene.geojson import scene_from_geojson, scene_to_geojson
-from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, Scene, SceneShape, scene_error
-from magnetosuture_thread.scene.shapes import scene_from_mapping, scene_to_mapping, shape_from_mapping
+from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape
+from magnetosuture_thread.scene.shapes import (
+    DISH_FIELDS,
+    dish_from_mapping,
+    dish_to_mapping,
+    is_list,
+    located,
+    scene_from_mapping,
+    scene_to_mapping,
+    shape_from_mapping,
+)
 from magnetosuture_thread.shared_parameters import shared_parameter
-from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
+from magnetosuture_thread.untrusted import MAX_TEXT_BYTES
 
 GEOJSON_ENDINGS = (".json", ".geojson")
-MAX_SCALAR_CHARS = 1000
-_PLAIN_YAML = f"plain YAML, at most {MAX_YAML_DEPTH} deep"
-
-
-class _SceneLoader(yaml.CSafeLoader):  # the loader without libyaml takes ten times as long
-    """Reads YAML as setup files are read: 1e-5 is a number, nothing is a date, keys are unique."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return a mapping whose keys are text, each of them once."""
-        keys = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.tag != "tag:yaml.org,2002:str":
-                name = f"the name {key.value}" if isinstance(key, yaml.ScalarNode) else "a name"
-                raise yaml.constructor.ConstructorError(None, None, f"{name} that is no text", key.start_mark)
-            if key.value in keys:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value} is given twice", key.start_mark)
-            keys.add(key.value)
-        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
-        return mapping
-
-
-use_ros_numbers(_SceneLoader, decimal_integers=True)
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a regular file of at most `MAX_TEXT_BYTES`.
-
-    Raises:
-        ConfigurationError: it cannot be read, is a device or a pipe, is too large, or is no text.
-    """
-    expectation = f"a regular file of at most {MAX_TEXT_BYTES // 1000} kB of text"
-    try:
-        return read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise scene_error("scene file", "bytes that are no UTF-8 text", expectation, str(path)) from None
-    except (OSError, ValueError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        raise scene_error("scene file", problem, expectation, str(path)) from None
-
-
-def parse_yaml(text: str, source: str = "", what: str = "scene file") -> Any:
-    """Return the content of a YAML text: mappings with text for keys, lists, numbers, text, true, false and null.
-
-    Raises:
-        ConfigurationError: it is no YAML, or uses aliases or tags, or is too deep.
-    """
-    try:
-        check_yaml(text)
-        for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-            problem = ""
-            if isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_SCALAR_CHARS:
-                problem = f"a word of {len(event.value)} characters"
-            elif isinstance(event, yaml.NodeEvent) and getattr(event, "tag", None) not in (None, "!"):
-                problem = "a tag (!)"
-            if problem:
-                where = f" in line {event.start_mark.line + 1}" if event.start_mark else ""
-                raise scene_error(what, problem + where, _PLAIN_YAML, source)
-        return yaml.load(text, _SceneLoader)
-    except BudgetError as error:
-        raise scene_error(what, str(error), _PLAIN_YAML, source) from None
-    except yaml.YAMLError as error:
-        problem = " ".join(str(getattr(error, "problem", None) or error).split())
-        mark = getattr(error, "problem_mark", None)
-        raise scene_error(what, problem + (f" in line {mark.line + 1}" if mark else ""), "valid YAML", source) from None
-    except (ValueError, UnicodeError):
-        raise scene_error(what, "a character that YAML does not allow", "valid YAML", source) from None
-
-
-def parse_json(text: str, source: str = "", what: str = "scene file") -> Any:
-    """Return the content of a JSON text; duplicate names, NaN and Infinity are refused.
-
-    Raises:
-        ConfigurationError: it is no JSON, or is too deep.
-    """
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        mapping = dict(pairs)
-        if len(mapping) < len(pairs):
-            twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-            raise scene_error(what, f"{twice} is given twice", "each name once", source)
-        return mapping
-
-    def whole(digits: str) -> int:
-        if len(digits) > MAX_SCALAR_CHARS:
-            raise scene_error(what, digits, "a number that can be written", source)
-        return int(digits)
-
-    def constant(name: str) -> float:
-        raise scene_error(what, name, "finite numbers", source)
-
-    try:
-        # Its own depth is bounded by that of Python's stack: the error for it is caught below.
-        found = json.loads(text, object_pairs_hook=once, parse_int=whole, parse_constant=constant)
-    except json.JSONDecodeError as error:
-        raise scene_error(what, f"{error.msg} in line {error.lineno}", "valid JSON", source) from None
-    except RecursionError:
-        raise scene_error(what, "lists too deep", f"JSON at most {MAX_YAML_DEPTH} deep", source) from None
-    return found
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes lists that are the same object twice, as nothing that reads scenes takes aliases."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Return True: nothing is written as an alias."""
-        return True
+MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
+DISH = "dish"  # kind of the feature that is the dish
+GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
+PROPERTIES = ("name", "kind", "corner_radius", "friction", "radius", "definition", *DISH_FIELDS)
 
 
 def read_scene(name: str) -> Scene:
@@ -143,14 +59,17 @@ def read_scene(name: str) -> Scene:
         ConfigurationError: there is no such file, it is no regular file of at most 1 MB, or it holds anything
             invalid.
     """
+    path = find_scene_file(name)
+    source = str(path)
+    if path.suffix not in GEOJSON_ENDINGS:
+        return scene_from_mapping(read_yaml(path, "scene file"), source)
     try:
-        path = find_scene_file(name)
-    except ConfigurationError as error:
-        raise scene_error(error.name, error.value, error.expectation) from None
-    text = read_text(path)
-    if path.suffix in GEOJSON_ENDINGS:
-        return scene_from_geojson(parse_json(text, str(path)), str(path))
-    return scene_from_mapping(parse_yaml(text, str(path)), str(path))
+        return scene_from_geojson(json.loads(read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")), source)
+    except OSError as error:
+        problem = error.strerror or str(error)
+        raise ConfigurationError("scene file", problem, "a readable GeoJSON file", source) from None
+    except (ValueError, RecursionError) as error:  # no text, no JSON, a number of thousands of digits, lists too deep
+        raise ConfigurationError("scene file", str(error), "valid JSON", source) from None
 
 
 def write_scene(scene: Scene, path: Path) -> None:
@@ -162,17 +81,145 @@ def write_scene(scene: Scene, path: Path) -> None:
     if path.suffix in GEOJSON_ENDINGS:
         text = json.dumps(scene_to_geojson(scene), indent=1, allow_nan=False) + "\n"
     else:
-        content = scene_to_mapping(scene)
-        text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
-    if problem := output_problem(path):
-        raise scene_error("scene file", problem, "a file that can be written", str(path))
+        text = yaml.safe_dump(scene_to_mapping(scene), sort_keys=False, default_flow_style=None, width=120)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
+    problem = output_problem(path)
     try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        if not problem:
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(path)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise scene_error("scene file", error.strerror or str(error), "a file that can be written", str(path)) from None
+        problem = error.strerror or str(error)
+    if problem:
+        raise ConfigurationError("scene file", problem, "a file that can be written", str(path))
+
+
+def scene_to_geojson(scene: Scene) -> dict[str, Any]:
+    """Return a scene as a FeatureCollection."""
+    return {
+        "type": "FeatureCollection",
+        "dish": dish_to_mapping(scene.dish),
+        "features": [_feature(shape) for shape in scene.shapes],
+    }
+
+
+def _feature(shape: SceneShape) -> dict[str, Any]:
+    properties: dict[str, Any] = {"name": shape.name, "kind": shape.kind}
+    if shape.friction:
+        properties["friction"] = shape.friction
+    if "corner_radius" in shape.definition:
+        properties["corner_radius"] = shape.definition["corner_radius"]
+    geometry = shape.geometry
+    if isinstance(geometry, Disc):
+        properties["radius"] = geometry.radius
+        solid = shapely.Point(geometry.centre)
+    else:
+        solid = geometry.solid
+    if shape.definition:
+        properties["definition"] = dict(shape.definition)
+    return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(solid)}
+
+
+def scene_from_geojson(content: Any, source: str = "") -> Scene:
+    """Return a scene from a FeatureCollection.
+
+    The dish is the member `dish`, or a feature of kind `dish`: a Point at the origin with the property `diameter`,
+    and `depth` if it is known. Of a MultiPolygon with several parts each becomes a shape, named `name_1`, `name_2`
+    and so on. Other geometry is refused. Unknown properties belong to other programs and are ignored.
+
+    Args:
+        content: what the file holds.
+        source: its name, for errors.
+
+    Raises:
+        ConfigurationError: anything in it is missing or out of bounds.
+    """
+    kind = content.get("type") if isinstance(content, Mapping) else content
+    if kind != "FeatureCollection":
+        raise ConfigurationError("type", kind, "FeatureCollection, in metres in the dish frame", source)
+    features = content.get("features")
+    if not is_list(features) or len(features) > MAX_SHAPES + 1:
+        given = f"{len(features)} features" if is_list(features) else features
+        raise ConfigurationError("features", given, f"a list of at most {MAX_SHAPES} features and the dish", source)
+    dishes = [dish_from_mapping(content[DISH], source)] if DISH in content else []
+    shapes: list[SceneShape] = []
+    for index, feature in enumerate(features):
+        where = f"features[{index}]"
+        properties, solid = _checked_feature(where, feature, source)
+        if properties.get("kind") == DISH:
+            dishes.append(_dish(properties, solid, source))
+        elif isinstance(name := properties.get("name"), str):
+            shapes += _shapes(name, properties, solid, source)
+        else:
+            raise ConfigurationError(f"{where}.properties.name", name, "a name", source)
+    if len(dishes) != 1:
+        expectation = f"one: the member {DISH}, or a feature of kind {DISH}"
+        raise ConfigurationError(DISH, f"{len(dishes)} dishes" if dishes else "no dish", expectation, source)
+    with located(source):
+        return Scene(dishes[0], tuple(shapes))
+
+
+def _checked_feature(where: str, feature: Any, source: str) -> tuple[Mapping[str, Any], shapely.Geometry]:
+    """Return properties and geometry of a feature, whose names of properties are those of ours or far from them."""
+    properties = feature.get("properties") if isinstance(feature, Mapping) else None
+    if not isinstance(properties, Mapping) or feature.get("type") != "Feature":
+        raise ConfigurationError(where, feature, "a Feature with properties, of which name is needed", source)
+    for given in properties:
+        close = difflib.get_close_matches(given[:40], PROPERTIES, n=1, cutoff=0.85)
+        if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
+            expectation = f"no such property: {close[0]}?"
+            raise ConfigurationError(f"{where}.properties.{given}", properties[given], expectation, source)
+    try:
+        solid = shapely.force_2d(shapely.geometry.shape(feature.get("geometry")))
+    except Exception:  # shapely raises whatever the content makes it stumble over.
+        solid = None
+    if solid is None or solid.is_empty or solid.geom_type not in ("Point", "Polygon", "MultiPolygon"):
+        expectation = "a Point, Polygon or MultiPolygon"
+        raise ConfigurationError(f"{where}.geometry", feature.get("geometry"), expectation, source)
+    return properties, solid
+
+
+def _dish(properties: Mapping[str, Any], solid: shapely.Geometry, source: str) -> Dish:
+    if solid != shapely.Point(0.0, 0.0):
+        raise ConfigurationError(f"{DISH}.geometry", solid.wkt, "a Point at 0, 0, the dish's centre", source)
+    if properties.get("diameter") is None and properties.get("radius") is not None:
+        raise ConfigurationError(f"{DISH}.properties.radius", properties["radius"], "diameter, for a dish", source)
+    given = {name: properties[name] for name in DISH_FIELDS if properties.get(name) is not None}
+    return dish_from_mapping(given, source)
+
+
+def _shapes(name: str, properties: Mapping[str, Any], solid: shapely.Geometry, source: str) -> Iterator[SceneShape]:
+    """Yield the shapes of a feature: one, or one for each part of a MultiPolygon."""
+    common = {"kind": properties.get("kind") or "tissue"}
+    common |= {key: properties[key] for key in ("friction", "corner_radius") if properties.get(key) is not None}
+    if solid.geom_type == "Point":
+        common.pop("corner_radius", None)
+        fields = {"center": [solid.x, solid.y], "radius": properties.get("radius")}
+        yield _defined(shape_from_mapping(name, {**common, "disc": fields}, source), properties, source)
+        return
+    parts = getattr(solid, "geoms", [solid])
+    for number, part in enumerate(parts, 1):
+        outline, *holes = ([list(point) for point in ring.coords] for ring in (part.exterior, *part.interiors))
+        own = name if len(parts) == 1 else f"{name}_{number}"
+        shape = shape_from_mapping(own, {**common, "polygon": {"outline": outline, "holes": holes}}, source)
+        yield _defined(shape, properties, source) if len(parts) == 1 else shape
+
+
+def _defined(shape: SceneShape, properties: Mapping[str, Any], source: str) -> SceneShape:
+    """Return the shape of the property `definition`, where it still matches the geometry."""
+    definition = properties.get("definition")
+    if definition is None:
+        return shape
+    if not isinstance(definition, Mapping):
+        raise ConfigurationError(
+            f"{shape.name}.properties.definition", definition, "a shape as in a scene file", source
+        )
+    defined = shape_from_mapping(shape.name, {**definition, "kind": shape.kind, "friction": shape.friction}, source)
+    # Equal to the rounding of drawing programs.
+    apart = defined.solid.symmetric_difference(shape.solid).area
+    same = type(defined.geometry) is type(shape.geometry) and apart <= GEOMETRY_TOLERANCE * shape.solid.length
+    return defined if same else shape
 
 
 @dataclass(frozen=True)
@@ -183,9 +230,6 @@ class SceneServerSettings(Configuration):
 
     autostart: str = autostart_parameter()
     scene: str = shared_parameter("scene")
-
-
-MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
 
 
 class SceneEditor:
@@ -223,17 +267,16 @@ class SceneEditor:
     def _require_scene(self) -> Scene:
         if self.scene is None:
             expectation = "a scene that is loaded first, of which the dish is known"
-            raise scene_error("scene", "a change of a shape", expectation)
+            raise ConfigurationError("scene", "a change of a shape", expectation)
         return self.scene
 
 
 def _parse_shape(name: str, text: str) -> SceneShape:
     _require_length("name", name, MAX_NAME_CHARS)
     _require_length("shape", text, MAX_SHAPE_CHARS)
-    description: Any = parse_yaml(text, what="shape")
-    return shape_from_mapping(name, description)
+    return shape_from_mapping(name, read_yaml_text(text, "shape"))
 
 
 def _require_length(field: str, text: str, max_chars: int) -> None:
     if len(text) > max_chars:
-        raise scene_error(field, f"{len(text)} characters", f"at most {max_chars}")
+        raise ConfigurationError(field, f"{len(text)} characters", f"at most {max_chars}")

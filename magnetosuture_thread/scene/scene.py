@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import reprlib
 import struct
 from collections import Counter
 from collections.abc import Mapping
@@ -18,43 +17,6 @@ import shapely
 from magnetosuture_thread.arguments import bounded, checked_arguments
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
-
-MAX_VALUE_CHARS = 80  # of a value in an error
-MAX_ERROR_NAME_CHARS = 120
-_SHORT_REPR = reprlib.Repr()
-_SHORT_REPR.maxlevel = _SHORT_REPR.maxdict = _SHORT_REPR.maxlist = _SHORT_REPR.maxtuple = 3
-_SHORT_REPR.maxstring = _SHORT_REPR.maxlong = _SHORT_REPR.maxother = MAX_VALUE_CHARS
-
-
-class _ShortRepr:
-    """A value as an error shows it: the beginning of its representation."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __repr__(self) -> str:
-        return self._text
-
-
-def scene_error(name: str, value: Any, expectation: str, source: str = "") -> ConfigurationError:
-    """Return the error for a part of a scene.
-
-    Args:
-        name: of the field, for example `post.disc.radius`; of a long one the beginning is shown.
-        value: what was given; of a long or deep one the beginning is shown.
-        expectation: what would have been accepted, with its unit.
-        source: the file.
-    """
-    text = _SHORT_REPR.repr(value)
-    if len(text) > 2 * MAX_VALUE_CHARS:
-        text = f"{text[: 2 * MAX_VALUE_CHARS]}…"
-    short = _ShortRepr(text) if isinstance(value, (str, list, tuple, dict)) or len(text) > MAX_VALUE_CHARS else value
-    # A name comes from a file too: control characters and line ends are shown as escapes.
-    name = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in name[: MAX_ERROR_NAME_CHARS + 1])
-    return ConfigurationError(
-        name if len(name) <= MAX_ERROR_NAME_CHARS else f"{name[:MAX_ERROR_NAME_CHARS]}…", short, expectation, source
-    )
-
 
 KINDS = ("tissue", "instrument", "wall")
 """What a shape is: tissue, an instrument or post, or a rigid wall inside of the dish."""
@@ -82,7 +44,7 @@ def is_number(value: Any) -> bool:
 
 def _check_friction(name: str, value: Any) -> None:
     if not (is_number(value) and 0.0 <= value <= MAX_FRICTION):
-        raise scene_error(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
+        raise ConfigurationError(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
 
 
 @checked_arguments("dish")
@@ -151,21 +113,21 @@ class SceneShape:
     def __post_init__(self) -> None:
         """Check name, kind and bounds."""
         if not is_name(self.name):
-            raise scene_error("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
+            raise ConfigurationError("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
         if self.kind not in KINDS:
-            raise scene_error(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+            raise ConfigurationError(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
         _check_friction(f"{self.name}.friction", self.friction)
         if isinstance(self.geometry, Disc):
             if len(self.geometry.centre) != 2:
-                raise scene_error(f"{self.name}.disc.centre", self.geometry.centre, "two coordinates x, y [m]")
+                raise ConfigurationError(f"{self.name}.disc.centre", self.geometry.centre, "two coordinates x, y [m]")
             return
         farthest = float(np.abs(self.geometry.outline).max())
         if farthest > MAX_COORDINATE:
             expectation = f"coordinates of at most {MAX_COORDINATE:g}, in metres"
-            raise scene_error(f"{self.name}.polygon.outline", farthest, expectation)
+            raise ConfigurationError(f"{self.name}.polygon.outline", farthest, expectation)
         shortest = min(float(np.hypot(*(ring - np.roll(ring, 1, axis=0)).T).min()) for ring in self.geometry.rings)
         if shortest < MIN_EDGE:
-            raise scene_error(f"{self.name}.polygon", shortest, f"edges of at least {MIN_EDGE:g} m")
+            raise ConfigurationError(f"{self.name}.polygon", shortest, f"edges of at least {MIN_EDGE:g} m")
 
     @cached_property
     def solid(self) -> shapely.Geometry:
@@ -221,7 +183,7 @@ class Scene:
     def __post_init__(self) -> None:
         """Check the shapes together."""
         if len(self.shapes) > MAX_SHAPES:
-            raise scene_error("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
+            raise ConfigurationError("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
         polygons = [shape.geometry for shape in self.shapes if isinstance(shape.geometry, Polygon)]
         rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
         for count, what, most in (
@@ -229,20 +191,20 @@ class Scene:
             (sum(map(len, rings)), "vertices", MAX_VERTICES),
         ):
             if count > most:
-                raise scene_error("shapes", f"{count} {what}", f"at most {most} in all")
+                raise ConfigurationError("shapes", f"{count} {what}", f"at most {most} in all")
         names = Counter(shape.name for shape in self.shapes)
         for shape in self.shapes:
             if names[shape.name] > 1:
-                raise scene_error(shape.name, "a name given twice", "a name of its own for each shape")
+                raise ConfigurationError(shape.name, "a name given twice", "a name of its own for each shape")
             near, far = _distance_and_coverage(shape, self.dish.radius)
             if near >= self.dish.radius:
-                raise scene_error(
+                raise ConfigurationError(
                     shape.name,
                     f"a shape outside of the dish, {near:.4g} m from its centre",
                     f"a part of it within the dish, less than {self.dish.radius:g} m",
                 )
             if not far:
-                raise scene_error(
+                raise ConfigurationError(
                     shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres"
                 )
 
@@ -327,7 +289,7 @@ class Scene:
     def _require(self, name: str) -> None:
         if name not in self.names:
             known = ", ".join(self.names) or "none: the scene has no shapes"
-            raise scene_error("shape.name", name, f"one of {known}"[:400])
+            raise ConfigurationError("shape.name", name, f"one of {known}"[:400])
 
 
 def is_name(text: Any) -> bool:

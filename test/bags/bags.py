@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
@@ -28,9 +29,27 @@ SECOND = 10**9
 Message = tuple[str, int, bytes]
 
 
-def make(name: str, *fields: Any) -> Any:
-    """Return a message of our type store."""
-    return typestore().types[name](*fields)
+def make(name: str, /, *values: Any, **fields: Any) -> Any:
+    """Return a message of our type store; fields that are not given are zero, or empty."""
+    kinds = typestore().fielddefs[name][1]
+    fields |= dict(zip((field for field, _ in kinds), values, strict=False))
+    return typestore().types[name](
+        **{field: fields[field] if field in fields else _zero(kind) for field, kind in kinds}
+    )
+
+
+def _zero(kind: Any) -> Any:
+    """Return what a field of a kind, as rosbags describes it, holds at first."""
+    node, detail = kind
+    if node is Nodetype.NAME:
+        return make(detail, w=1.0) if detail == "geometry_msgs/msg/Quaternion" else make(detail)
+    if node is Nodetype.BASE:
+        return {"string": "", "bool": False}.get(detail[0], 0.0 if detail[0].startswith("float") else 0)
+    (inner, element), count = detail
+    count = count if node is Nodetype.ARRAY else 0
+    if inner is Nodetype.BASE and element[0] != "string":
+        return np.zeros(count, element[0])
+    return [_zero((inner, element)) for _ in range(count)]
 
 
 def stamped(index: int, frame: str = "dish") -> Any:

@@ -5,6 +5,7 @@ Where the chunks are is found out on the undamaged file, by the package `mcap` a
 
 from __future__ import annotations
 
+import contextlib
 import random
 from collections import Counter
 from collections.abc import Callable
@@ -19,20 +20,12 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError
 from test.bags.bags import STRING, Message, chunks_of, read, texts, write_many_chunks, write_mcap
 
-FLIPS, CUTS = 300, 60
-
-
 Untouched = Callable[[int, int], bool]
 
 
-def around(place: int) -> Untouched:
-    """Return what says of a chunk between two places whether one byte is in another."""
-    return lambda start, end: not start <= place < end
-
-
-def outside(first: int, after: int | None) -> Untouched:
+def outside(first: int, after: int) -> Untouched:
     """Return what says of a chunk whether it lies before `first` or from `after` on."""
-    return lambda start, end: end <= first or (after is not None and start >= after)
+    return lambda start, end: end <= first or start >= after
 
 
 class Whole:
@@ -84,30 +77,27 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 
 
 def test_no_flipped_bit_passes_on_a_wrong_value(whole: Whole, tmp_path: Path):
+    """Anywhere, and in each byte of a chunk's head, of the file's head and of the summary."""
     chance = random.Random(1)
-    for _ in range(FLIPS):
-        place, bit = chance.randrange(len(whole.data)), chance.randrange(8)
+    start, _, _ = whole.chunks[3]
+    size = len(whole.data)
+    places = [chance.randrange(size) for _ in range(250)]
+    for place in (*places, *range(start, start + 60), *range(size - 900, size, 4), *range(50)):
         data = bytearray(whole.data)
-        data[place] ^= 1 << bit
-        bag = whole.judge(tmp_path / "flip.mcap", data, around(place))
+        data[place] ^= 1 << chance.randrange(8)
+        bag = whole.judge(tmp_path / "flip.mcap", data, outside(place, place + 1))
         assert bag is not None
-        assert bag.damage is not None, f"bit {bit} of byte {place} is not noticed"
+        assert bag.damage is not None, f"byte {place} is not noticed"
         assert bag.damage.messages is not None
 
 
-def test_a_cut_bag_gives_every_chunk_before_the_cut(whole: Whole, tmp_path: Path):
-    chance = random.Random(2)
-    for _ in range(CUTS):
-        size = chance.randrange(len(whole.data))
-        bag = whole.judge(tmp_path / "cut.mcap", whole.data[:size], outside(size, None))
-        # What says that a bag is simulated must not be the first that goes.
-        assert bag is None or (bag.damage is not None and bag.notes == whole.notes != {})
-
-
-def test_bytes_put_in_or_taken_away(whole: Whole, tmp_path: Path):
+def test_cut_bags_and_bytes_put_in_or_taken_away(whole: Whole, tmp_path: Path):
     chance = random.Random(5)
-    for _ in range(60):
+    for _ in range(50):
         place, size = chance.randrange(len(whole.data)), chance.randrange(1, 9000)
+        cut = whole.judge(tmp_path / "cut.mcap", whole.data[:place], outside(place, len(whole.data)))
+        # What says that a bag is simulated must not be the first that goes.
+        assert cut is None or (cut.damage is not None and cut.notes == whole.notes != {})
         grown = whole.data[:place] + chance.randbytes(size) + whole.data[place:]
         bag = whole.judge(tmp_path / "grown.mcap", grown, outside(place, place))
         assert bag is not None
@@ -143,16 +133,7 @@ def test_damage_says_where_and_when(whole: Whole, tmp_path: Path):
     assert "\n" not in str(bag.damage)
 
 
-def test_heads_and_the_summary_byte_by_byte(whole: Whole, tmp_path: Path):
-    start, _, _ = whole.chunks[3]
-    for place in (*range(start, start + 60), *range(len(whole.data) - 900, len(whole.data), 4), *range(50)):
-        data = bytearray(whole.data)
-        data[place] ^= 1 << place % 8
-        bag = whole.judge(tmp_path / "byte.mcap", data, around(place))
-        assert bag is not None
-
-
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(data=st.binary(max_size=300))
 def test_arbitrary_bytes_are_refused_in_one_line(tmp_path_factory: pytest.TempPathFactory, data: bytes):
     for begin in (b"", b"\x89MCAP0\r\n"):
@@ -177,28 +158,28 @@ def test_other_writers_with_checksums(tmp_path: Path, compression: CompressionTy
         place = chance.randrange(len(other.data))
         data = bytearray(other.data)
         data[place] ^= 1 << chance.randrange(8)
-        other.judge(tmp_path / "flip.mcap", data, around(place))
+        other.judge(tmp_path / "flip.mcap", data, outside(place, place + 1))
 
 
-@pytest.mark.parametrize("options", [{"enable_crcs": False}, {"use_chunking": False}])
-def test_without_checksums_a_whole_bag_is_read_and_says_so(tmp_path: Path, options: dict[str, bool]):
+BARE = pytest.mark.parametrize("options", [{"enable_crcs": False}, {"use_chunking": False}])
+
+
+@BARE
+def test_without_checksums_a_whole_bag_is_read_and_a_damaged_one_gives_nothing(
+    tmp_path: Path, options: dict[str, bool]
+):
     messages = texts(300)
     path = write_mcap(tmp_path / "bare.mcap", messages, {"/text": STRING}, **options)
     bag = Bag(path)
     assert read(bag) == messages
     assert bag.damage is None
     assert "no checksums" in bag.unchecked
-
-
-@pytest.mark.parametrize("options", [{"enable_crcs": False}, {"use_chunking": False}])
-def test_without_checksums_a_damaged_bag_gives_nothing(tmp_path: Path, options: dict[str, bool]):
-    path = write_mcap(tmp_path / "bare.mcap", texts(300), {"/text": STRING}, **options)
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(BagError, match="which may be wrong"):
         Bag(path)
 
 
-@pytest.mark.parametrize("options", [{"enable_crcs": False}, {"use_chunking": False}])
+@BARE
 def test_a_checksum_of_all_data_vouches_for_what_has_none(tmp_path: Path, options: dict[str, bool]):
     messages = texts(300)
     path = write_mcap(tmp_path / "bare.mcap", messages, {"/text": STRING}, enable_data_crcs=True, **options)
@@ -209,14 +190,12 @@ def test_a_checksum_of_all_data_vouches_for_what_has_none(tmp_path: Path, option
     assert read(bag) == messages
     assert bag.damage is not None
     chance = random.Random(8)
-    for _ in range(200):
-        place = chance.randrange(len(whole))
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ (1 << chance.randrange(8))]) + whole[place + 1 :])
-        try:
-            found = read(Bag(path))
-        except BagError:
-            continue
-        assert set(found) <= set(messages)
+    for _ in range(100):
+        data = bytearray(whole)
+        data[chance.randrange(len(whole))] ^= 1 << chance.randrange(8)
+        path.write_bytes(data)
+        with contextlib.suppress(BagError):
+            assert set(read(Bag(path))) <= set(messages)
 
 
 def test_a_message_index_that_becomes_a_message_is_not_passed_on(tmp_path: Path):

@@ -21,7 +21,6 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import TIMES
 from magnetosuture_thread.files import RANGE_BYTES, open_ranges, parse_location
 from test.bags.bags import (
-    HEADER,
     IMAGE,
     SECOND,
     STRING,
@@ -103,13 +102,12 @@ def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     noise = np.random.default_rng(5)
     folder = tmp_path_factory.mktemp("bags") / "long"
     with BagWriter(folder, {"setup": "example"}) as bag:
-        for topic, kind in (("/camera", IMAGE), ("/header", HEADER), ("/text", STRING)):
-            bag.add_topic(topic, kind)
+        bag.add_topic("/camera", IMAGE)
+        bag.add_topic("/text", STRING)
         for index in range(40):
             at = SECOND * (1 + 3 * index)
             picture = noise.integers(0, 256, PICTURE_BYTES, dtype=np.uint8)
             bag.write_message("/camera", at, make(IMAGE, stamped(index), "jpeg", picture))
-            bag.write("/header", at + 10, cdr(HEADER, stamped(index).stamp, f"frame {index}"))
             if index == 30:
                 bag.write("/text", at + 20, cdr(STRING, "once"))
     return folder
@@ -118,22 +116,21 @@ def long_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_of_a_bag_on_s3_only_what_is_read_is_fetched(s3: CountingServer, long_bag: Path):
     place = upload(long_bag, "s3://lab/runs/long")
     local, (file,) = Bag(long_bag), long_bag.glob("*.mcap")
-    key = f"/lab/runs/long/{file.name}"
+    key, size = f"/lab/runs/long/{file.name}", file.stat().st_size
     far = Bag(place)
     assert (far.topics, far.counts, far.notes) == (local.topics, local.counts, local.notes)
     assert (far.start, far.end, far.damage, far.unchecked) == (local.start, local.end, None, "")
     opened = sum(s3.served[key])
-    assert opened < 2.5 * RANGE_BYTES < file.stat().st_size / 4
+    assert opened < 2.5 * RANGE_BYTES < size / 4
     (record,) = far.records({"/text"})
     assert record.decode().data == "once"
     one_chunk = sum(s3.served[key]) - opened
     assert PICTURE_BYTES < one_chunk < PICTURE_BYTES + RANGE_BYTES + 10_000
     some = [record.time for record in far.records(start=9.0, duration=12.0)]
     assert some == [record.time for record in local.records(start=9.0, duration=12.0)]
-    assert sum(s3.served[key]) < file.stat().st_size / 2
+    assert sum(s3.served[key]) < size / 2
     assert read(far) == read(local)
-    assert sum(s3.served[key]) < 2 * file.stat().st_size
-    assert max(s3.served[key]) < PICTURE_BYTES + RANGE_BYTES + 10_000
+    assert sum(s3.served[key]) < 2 * size
     assert key not in s3.whole
 
 
@@ -148,22 +145,19 @@ def test_a_bag_on_s3_is_found_and_evaluated_as_one_of_this_machine(s3: CountingS
 
 
 def test_an_absent_url_gives_one_line(s3: CountingServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    for url, problem in (
-        ("s3://lab/nothing", "does not exist"),
-        ("s3://none/nothing", "does not exist"),
-        ("memory://nothing", "does not exist"),
-    ):
-        assert cli.main(["evaluate", url, "--output", str(tmp_path / "out")]) == 1
-        assert problem in capsys.readouterr().err
+    output = ["--output", str(tmp_path / "out")]
+    for url in ("s3://lab/nothing", "s3://none/nothing", "memory://nothing"):
+        assert cli.main(["evaluate", url, *output]) == 1
+        assert "does not exist" in capsys.readouterr().err
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
         patch.setenv("AWS_MAX_ATTEMPTS", "1")
         s3fs.S3FileSystem.clear_instance_cache()
-        assert cli.main(["evaluate", "s3://lab/runs", "--output", str(tmp_path / "out")]) == 1
+        assert cli.main(["evaluate", "s3://lab/runs", *output]) == 1
         s3fs.S3FileSystem.clear_instance_cache()
     assert "cannot be read: Could not connect" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        cli.main(["evaluate", "nowhere://x", "--output", str(tmp_path / "out")])
+        cli.main(["evaluate", "nowhere://x", *output])
     assert "no URL of a known file system" in capsys.readouterr().err
 
 
@@ -193,7 +187,7 @@ def test_a_file_of_a_bag_that_cannot_be_fetched_is_no_damage(tmp_path: Path, mon
             raise OSError(5, "Input/output error")
         return open_ranges(path)
 
-    monkeypatch.setattr("magnetosuture_thread.bags.mcap.file.open_ranges", open_first)
+    monkeypatch.setattr("magnetosuture_thread.bags.mcap.open_ranges", open_first)
     assert "Input/output error" in str(Bag(folder).damage)
     with pytest.raises(BagError, match=r"run_1\.mcap: cannot be read: Input/output error"):
         Bag(parse_location("memory://run"))

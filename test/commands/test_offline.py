@@ -17,8 +17,7 @@ import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
 from magnetosuture_thread import interface
-from magnetosuture_thread.bags.message_types import MESSAGES as BUILDER
-from magnetosuture_thread.bags.message_types import make, typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
@@ -33,7 +32,7 @@ from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.scene import Scene, SceneShape
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.images import decode_image
-from test.bags.bags import changed
+from test.bags.bags import changed, make
 
 SETUP = read_setup("petri_35mm_polyamide")
 SCENE, POSE, FRAME = interface.SCENE, interface.NEEDLE_POSE.recorded, interface.COMPRESSED_IMAGE.recorded
@@ -91,7 +90,8 @@ def with_changes(bag: Path, folder: Path, *changes: tuple[float, Scene, str], ma
         if material:
             numbers = dict.fromkeys(("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"), 0.0)
             empty = {"rest_curvature": np.empty(0), "attachment": "", "attachment_offset": np.empty(0)}
-            header = BUILDER.header(stamp, "dish")
+            time_of = make("builtin_interfaces/msg/Time", *divmod(stamp, 10**9))
+            header = make("std_msgs/msg/Header", time_of, "dish")
             thread = make(interface.MATERIAL.type_name, header=header, name=material, **numbers, **empty)
             writer.write_message(interface.MATERIAL.recorded, stamp, thread)
     return folder

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.bags.message_types import make, typestore
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.live import GraphInput
@@ -20,6 +20,7 @@ from magnetosuture_thread.interface import COMPRESSED_IMAGE, IMAGE, SCENE
 from magnetosuture_thread.messages.scene import packed_scene, parse_scene_message
 from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
 from magnetosuture_thread.vision.images import decode_image
+from test.bags.bags import make
 
 POST = Scene(Dish(0.035), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.001)),))
 OLD = "vision_tracker: {ros__parameters: {dish_diameter: 0.035}}\nthread_model: {ros__parameters: {length: 0.019}}\n"

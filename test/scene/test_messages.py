@@ -24,9 +24,7 @@ LARGE = Polygon(
 SCENES = {
     "every shape": every_shape(),
     "hernia_ring": read_scene("hernia_ring"),
-    "empty": Scene(),
     "touching": Scene(Dish(self_contact=True)),
-    "crossing": Scene(Dish(depth=1e-4, self_contact=False)),
     "large": Scene(Dish(), (SceneShape("large", "tissue", LARGE),)),
 }
 
@@ -41,23 +39,12 @@ def recorded(scene: Scene) -> Any:
     return typestore().deserialize_cdr(messages.packed_scene(7, scene), SCENE.type_name)
 
 
-WAYS = pytest.mark.parametrize("way", [sent, recorded])
-
-
-@WAYS
+@pytest.mark.parametrize("way", [sent, recorded])
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_goes_there_and_back(way: Callable[[Scene], Any], name: str):
     again = messages.parse_scene_message(way(SCENES[name]))
     assert again == SCENES[name]
     assert again.version == SCENES[name].version
-
-
-def harm_a_corner(message: Any) -> None:
-    message.shapes[1].polygon[0].outline.corners[3].x += 1e-12
-
-
-def harm_a_radius(message: Any) -> None:
-    message.shapes[0].disc[0].radius = np.nextafter(message.shapes[0].disc[0].radius, 1.0)
 
 
 def swap_two(message: Any) -> None:
@@ -78,36 +65,26 @@ def of_one(of: str, value: Any) -> Callable[[Any], None]:
 
 
 DAMAGE: list[tuple[Callable[[Any], None], str]] = [
-    (harm_a_corner, "scene.version: got '"),
-    (harm_a_radius, "scene.version: got '"),
+    (of_one("shapes.1.polygon.0.outline.corners.3.x", 0.00501), "scene.version: got '"),
+    (of_one("shapes.0.disc.0.radius", np.nextafter(0.0015, 1.0)), "scene.version: got '"),
     (swap_two, "scene.version: got '"),
-    (of_one("version", ""), "scene.version: got '', expected '"),
     (of_one("version", "x" * 10_000), "scene.version: got 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx', expected '"),
-    (of_one("dish_diameter", 0.051), "scene.version: got '"),
     (of_one("dish_diameter", 50.0), "scene.dish.diameter: got 50.0, expected a number from 0.005 to 0.5 m"),
-    (of_one("self_contact", 1), "scene.version: got '"),
-    (of_one("self_contact", 3), "scene.self_contact: got 3, expected 0, 1 or 2"),
     (of_one("dish_diameter", float("nan")), "scene.dish.diameter: got nan, expected a number"),
     (of_one("header.frame_id", "map"), "scene.header.frame_id: got 'map', expected 'dish'"),
     (of_one("shapes.0.kind", "bone"), "scene.post.kind: got 'bone', expected one of tissue"),
-    (of_one("shapes.0.kind", "b" * 10_000), "scene.shapes[0].kind: got 10000, expected at most 64"),
     (of_one("shapes.0.name", "p" * 10_000), "scene.shapes[0].name: got 10000, expected at most 64"),
     (of_one("shapes.0.name", "a\nb"), r"scene.shape.name: got 'a\nb', expected 1 to 64 printable characters"),
-    (of_one("shapes.0.name", "ring"), "scene.ring: got 'a name given twice', expected a name of its own"),
     (of_one("shapes.0.disc", []), "scene.shapes[0]: got 0 discs and 0 polygons, expected one disc or one polygon"),
     (of_one("shapes.0.disc.0.radius", float("inf")), "scene.post.disc.radius: got inf, expected a number from"),
-    (of_one("shapes.0.disc.0.radius", 5e-7), "scene.post.disc.radius: got 5e-07, expected a number from 1e-06"),
-    (of_one("shapes.0.disc.0.x", 0.5), "scene.post: got 'a shape outside of the dish"),
     (of_one("shapes.1.polygon.0.outline.corners", []), "scene.ring.polygon.outline: got '0 distinct points', expected"),
-    (of_one("shapes.1.polygon.0.outline.corners.0.x", float("nan")), "scene.ring.polygon.outline[0]: got (nan"),
     (of_one("shapes.1.polygon.0.outline.corners.5.y", -0.01), "scene.ring.polygon.outline: got 'Self-inter"),
 ]
 
 
-@WAYS
 @pytest.mark.parametrize(("harm", "words"), DAMAGE, ids=[words for _, words in DAMAGE])
-def test_a_damaged_message_is_refused_in_one_line(way: Callable[[Scene], Any], harm: Callable[[Any], None], words: str):
-    message = way(every_shape())
+def test_a_damaged_message_is_refused_in_one_line(harm: Callable[[Any], None], words: str):
+    message = recorded(every_shape())
     harm(message)
     with pytest.raises(InvalidInputError) as caught:
         messages.parse_scene_message(message)
@@ -116,9 +93,8 @@ def test_a_damaged_message_is_refused_in_one_line(way: Callable[[Scene], Any], h
     assert len(str(caught.value)) < 400
 
 
-@WAYS
-def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it(way: Callable[[Scene], Any]):
-    message = way(every_shape())
+def test_more_than_a_scene_may_have_is_refused_before_anything_is_made_of_it():
+    message = recorded(every_shape())
     ring = message.shapes[1].polygon[0]
     ring.holes = [ring.holes[0]] * 41
     with pytest.raises(InvalidInputError, match=r"^scene\.shapes\.polygon: got 4\d, expected at most 40$"):

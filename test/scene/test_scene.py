@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 POST = SceneShape("post", "instrument", Disc((0.001, 0.002), 0.003))
 OUTLINE = ((0.0, 0.0), (0.01, 0.0), (0.0, 0.01))
@@ -27,6 +27,9 @@ def test_any_change_gives_another_version():
     changed = [
         SCENE,
         Scene(Dish(0.035 + 1e-15, 0.003), SCENE.shapes),
+        *(Scene(Dish(0.035, 0.003, self_contact=touches), SCENE.shapes) for touches in (True, False)),
+        Scene(Dish(0.035, 0.003, wall_friction=0.1), SCENE.shapes),
+        altered(POST, friction=0.1),
         Scene(Dish(0.035, 0.003 + 1e-15), SCENE.shapes),
         Scene(SCENE.dish, (POST,)),
         Scene(SCENE.dish, ()),
@@ -56,28 +59,12 @@ def test_shapes_are_added_at_the_end_replaced_in_their_place_and_removed():
     assert more.remove("extra") == SCENE
     assert SCENE.names == ("post", "block")
     for change in (lambda: SCENE.remove("none"), lambda: SCENE.replace(extra), lambda: SCENE.remove("x" * 10_000)):
-        with pytest.raises(ConfigurationError, match=r"^shape\.name: got '[\w.]{1,80}', expected one of post, block$"):
+        with pytest.raises(ConfigurationError, match=r"^shape\.name: got '[\w…']{1,100}, expected one of post, block$"):
             change()
     with pytest.raises(ConfigurationError, match=r"^post: got 'a name given twice'"):
         SCENE.add(POST)
     with pytest.raises(ConfigurationError, match="expected one of none: the scene has no shapes"):
         Scene().remove("post")
-
-
-@pytest.mark.parametrize(
-    ("dish", "words"),
-    [
-        ((35.0, 0.003), "dish.diameter: got 35.0, expected a number from 0.005 to 0.5 m"),
-        ((float("nan"), 0.003), "dish.diameter: got nan"),
-        ((True, 0.003), "dish.diameter: got True"),
-        ((0.035, 3.0), "dish.depth: got 3.0, expected a number from 1e-05 to 0.1 m"),
-        ((10**400, 0.003), "dish.diameter: got 1000000"),
-    ],
-)
-def test_a_dish_out_of_bounds_is_refused(dish: tuple[float, float], words: str):
-    with pytest.raises(ConfigurationError) as caught:
-        Dish(*dish)
-    assert str(caught.value).startswith(words)
 
 
 @pytest.mark.parametrize(
@@ -133,16 +120,7 @@ def test_an_edge_below_what_contacts_resolve_is_refused():
         cut(1.9e-6)
 
 
-@pytest.mark.parametrize("name", ["", " a", "a\nb", "\x1b[31m", "x" * 65])
+@pytest.mark.parametrize("name", ["", " a", "a\nb", "x" * 65])
 def test_a_name_that_cannot_be_printed_is_refused(name: str):
     with pytest.raises(ConfigurationError, match=r"^shape\.name: got .*, expected 1 to 64 printable characters$"):
         SceneShape(name, "tissue", Disc((0.0, 0.0), 0.001))
-
-
-@pytest.mark.parametrize("name", ["hernia_ring", "dish_35mm", "dish_35mm_post", "dish_150mm"])
-def test_the_scenes_that_ship_can_be_read(name: str):
-    scene = read_scene(name)
-    assert scene.dish.diameter in (0.035, 0.05, 0.15)
-    assert scene.names == {"hernia_ring": ("ring", "left_tissue", "right_tissue"), "dish_35mm_post": ("post",)}.get(
-        name, ()
-    )

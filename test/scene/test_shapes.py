@@ -114,62 +114,32 @@ def test_a_polygon_keeps_its_points_bit_for_bit_and_its_holes():
     assert len(soft.outline) > 20
 
 
-def test_a_corner_radius_has_to_fit_into_the_outline_and_not_beside_its_holes():
-    hole = [[0.001, 0.001], [0.009, 0.001], [0.009, 0.009], [0.001, 0.009]]
-    frame = polygon(polygon={"outline": SQUARE, "holes": [hole]}, corner_radius=0.002)
-    # What the outline's corners lose, those of the hole give back.
-    assert frame.area == pytest.approx(1e-4 - 6.4e-5, abs=ARC_TOLERANCE * 4.0 * math.pi * 0.002)
-
-
 RING = {"center": [0.0, 0.0], "inner_radius": 0.001, "outer_radius": 0.002}
 SECTOR = {**RING, "start_angle": 0.0, "end_angle": 1.0}
 SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01]]
 DISC = {"center": [0.0, 0.0], "radius": 0.001}
+PLATE = {"center": [0, 0], "width": 0.01, "height": 0.002}
 
 BAD: list[tuple[Any, str]] = [
     (None, "post: got None, expected a shape, one of disc, annulus"),
-    ({}, "post: got 'no shape', expected kind, corner_radius, friction and one of disc"),
     ({"disc": DISC, "annulus": RING}, "post: got ['disc', 'annulus'], expected"),
     ({"disc": DISC, "kind": "bone"}, "post.kind: got 'bone', expected one of tissue, instrument, wall"),
     ({"disc": 0.001}, "post.disc: got 0.001, expected fields by name"),
-    ({"disc": {"center": [0.0, 0.0]}}, "post.disc.radius: got None, expected a value"),
-    ({"disc": {**DISC, "angle": 1.0}}, "post.disc.angle: got 1.0, expected one of center, radius"),
-    ({"disc": {"center": [0.0, 0.0], "raduis": 0.1}}, "post.disc.radius: got None, expected a value; what is left"),
+    ({"disc": {"center": [0.0, 0.0]}}, "post.disc.radius: got None, expected a number from"),
+    ({"disc": {**DISC, "raduis": 0.1}}, "post.disc.raduis: got 0.1, expected one of center, radius (did you mean"),
     ({"disc": {**DISC, "radius": 1.5}}, "post.disc.radius: got 1.5, expected a number from 1e-06 to 1 m"),
-    ({"disc": {**DISC, "radius": math.nan}}, "post.disc.radius: got nan"),
-    ({"disc": {**DISC, "radius": True}}, "post.disc.radius: got True"),
-    ({"disc": {**DISC, "radius": 0.0}}, "post.disc.radius: got 0.0"),
     ({"disc": {**DISC, "radius": 10**400}}, "post.disc.radius: got 1000000000"),
-    ({"disc": {**DISC, "radius": {}}}, "post.disc.radius: got {}"),
     ({"disc": {**DISC, "center": [7.7, 3.9]}}, "post.disc.center: got [7.7, 3.9], expected two coordinates x, y of at"),
     ({"disc": DISC, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected 0 m: a disc has no corners"),
     ({"annulus": {**RING, "inner_radius": 0.002}}, "post.annulus.inner_radius: got 0.002, expected less than outer"),
     ({"annular_sector": {**SECTOR, "end_angle": 0.0}}, "post.annular_sector.end_angle: got 0.0, expected more than"),
-    ({"annular_sector": {**SECTOR, "inset": 0.001}}, "post.annular_sector.inset: got 0.001, expected less than inner"),
     ({"annular_sector": {**SECTOR, "inset": 0.0006}}, "post.annular_sector.inset: got 0.0006, expected less than half"),
-    ({"annular_sector": SECTOR, "corner_radius": 0.0006}, "post.corner_radius: got 0.0006, expected a radius with"),
-    (
-        {"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}},
-        "post.capsule.end: got [0.0, 0.0], expected anoth",
-    ),
-    (
-        {"rectangle": {"center": [0, 0], "width": 0.01, "height": 0.002}, "corner_radius": 0.001},
-        "post.corner_radius: got 0.001, expected at most 0.49 of the shorter side, 0.00098 m",
-    ),
-    (
-        {"rectangle": {"center": [0, 0], "width": 0.01, "height": 0.002}, "corner_radius": 2.0},
-        "post.corner_radius: got",
-    ),
+    ({"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}}, "post.capsule.end: got [0.0, 0.0], expected an"),
+    ({"rectangle": PLATE, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected at most 0.49 of the sh"),
     ({"polygon": {"outline": SQUARE[:2]}}, "post.polygon.outline: got [[0.0, 0.0], [0.01, 0.0]], expected at least 3"),
     ({"polygon": {"outline": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "post.polygon.outline: got 'Self-intersection"),
     ({"polygon": {"outline": [[0, 0], [0.1, 0.1], [0.2, 0.2]]}}, "post.polygon.outline: got 'zero area'"),
-    ({"polygon": {"outline": [[0, 0], [1e-8, 0], [0, 1e-8]]}}, "post.polygon.outline: got 1e-08, expected an extent"),
     ({"polygon": {"outline": SQUARE, "holes": [SQUARE]}}, "post.polygon.holes[0]: got 'a hole"),
-    ({"polygon": {"outline": SQUARE, "holes": [[[0.1, 0.1], [0.2, 0.1], [0.1, 0.2]]]}}, "post.polygon.holes[0]: got"),
-    (
-        {"polygon": {"outline": SQUARE, "holes": [SQUARE] * 101}},
-        "post.polygon.holes: got '101 outlines', expected at m",
-    ),
     ({"polygon": {"outline": SQUARE * 376}}, "post.polygon.outline: got '1504 points', expected at most 1500"),
     ({"polygon": {"outline": SQUARE}, "corner_radius": 0.006}, "post.corner_radius: got 0.006, expected a radius of"),
 ]

@@ -1,1 +1,0 @@
-"""The mcap format: scanning with every checksum, salvage of intact data, and writing."""
