@@ -27,6 +27,14 @@ def predictor_of(self_contact: bool | None, thread: Thread | None = None, depth:
     return ThreadPredictor(thread or soft(), Scene(Dish(0.035, depth, self_contact=self_contact)))
 
 
+def loop_behind(length: float, gap: float) -> np.ndarray:
+    """Return a thread that goes round a circle and ends beside its beginning, a gap outside of the circle [m]."""
+    radius = length / (2.0 * math.pi + 1.5)
+    turn = np.linspace(0.0, length / radius, 400)
+    away = radius + gap * np.clip(turn - 2.0 * math.pi + 0.5, 0.0, 1.0)
+    return np.column_stack([-away * np.sin(turn), away * np.cos(turn) - radius])
+
+
 def test_the_rows_are_the_distances_of_nodes_from_segments():
     """The closest places of segments that do not cross are a node of one and a place of the other."""
     random = np.random.default_rng(3)
@@ -93,6 +101,32 @@ def test_no_random_motion_takes_a_thread_through_itself(seed: int, steps: int):
     done = move_model(seed, True, steps)
     assert done.crossed == 0
     assert done.unconverged + done.refused <= 0.1 * done.steps
+
+
+def test_a_loop_closes_and_opens_again():
+    """The needle draws its end of a loop against the other, farther, and back: crossed in between if it may."""
+    clearances, crossings, ends = {}, {}, {}
+    for may_touch in (True, False):
+        predictor = predictor_of(may_touch)
+        nodes = loop_behind(0.0195, 1.2e-3)
+        predictor.start(NeedlePose(0.0, nodes[0], EAST), nodes, strict=False)
+        simple, clearance = [], []
+        for k in range(1, 161):
+            out = 2.4e-3 * math.sin(math.pi * k / 160) ** 2
+            prediction = predictor.step(NeedlePose(k / RATE, nodes[0] + (0.0, out), EAST))
+            assert prediction.converged
+            assert prediction.residual < 1e-6
+            simple.append(shapely.LineString(prediction.positions).is_simple)
+            clearance.append(prediction.margins["self_contact"].minimum_clearance if may_touch else math.inf)
+        clearances[may_touch], crossings[may_touch] = np.array(clearance), simple.count(False)
+        ends[may_touch] = prediction.positions
+    assert crossings[True] == 0
+    assert crossings[False] > 40
+    touching = clearances[True] < 1e-6
+    assert touching[80]
+    assert clearances[True].min() > -2e-7
+    assert not touching[0]
+    assert not touching[-1]
 
 
 def test_the_depth_decides_where_the_scene_says_nothing():
