@@ -10,7 +10,7 @@ of the actuators.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
+from enum import Enum, StrEnum
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
 SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
@@ -23,15 +23,6 @@ ALL_NODES = (*NODES, SCENE_SERVER, PLANNER, *RIG_NODES)
 DISH_FRAME = "dish"
 CAMERA_FRAME = "camera"
 STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
-
-
-@dataclass(frozen=True)
-class ServiceInterface:
-    """A service: its type, for example `std_srvs/srv/Trigger`, the node that offers it, and what it does."""
-
-    type_name: str
-    node: str
-    about: str
 
 
 class Quality(Enum):
@@ -71,7 +62,7 @@ class Channel:
 
 
 IMAGE = Channel(
-    "camera/image_raw", "sensor_msgs/msg/Image", "camera frames, in place of the compressed ones", Quality.FRAMES
+    "camera/image_raw", "sensor_msgs/msg/Image", "camera frames, instead of compressed ones", Quality.FRAMES
 )
 COMPRESSED_IMAGE = Channel(
     "camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "camera frames", Quality.FRAMES
@@ -106,9 +97,7 @@ NEEDLE_COMMAND = Channel(
     "geometry_msgs/msg/TwistStamped",
     "velocity of the tip, followed while no operator commands; of one node at a time",
 )
-NEEDLE_SETPOINT = Channel(
-    "needle/setpoint_cv", "geometry_msgs/msg/TwistStamped", "applied velocity, that the currents give"
-)
+NEEDLE_SETPOINT = Channel("needle/setpoint_cv", "geometry_msgs/msg/TwistStamped", "velocity that the currents give")
 MEASURED_THREAD = Channel(
     "thread/measured",
     "nav_msgs/msg/Path",
@@ -138,18 +127,13 @@ MARGINS = Channel(
     "every barrier, its minimum and 99 % bound, contact, friction; of the estimated thread if there is one",
 )
 THREAD_MARKERS = Channel(
-    "thread/markers",
-    "visualization_msgs/msg/MarkerArray",
-    "for RViz and Foxglove, in the namespaces thread, margins, deviation, predicted, disturbances, forecast",
+    "thread/markers", "visualization_msgs/msg/MarkerArray", "thread, margins and forecast, for RViz and Foxglove"
 )
 SCENE = Channel(
     "scene", "magnetosuture_msgs/msg/Scene", "the dish and the named shapes in it, from now on", Quality.LATCHED
 )
 SCENE_MARKERS = Channel(
-    "scene/markers",
-    "visualization_msgs/msg/MarkerArray",
-    "the dish and its shapes, for RViz and Foxglove",
-    Quality.LATCHED,
+    "scene/markers", "visualization_msgs/msg/MarkerArray", "the scene, for RViz and Foxglove", Quality.LATCHED
 )
 MATERIAL = Channel(
     "thread/material",
@@ -158,15 +142,10 @@ MATERIAL = Channel(
     Quality.LATCHED,
 )
 CURRENTS = Channel(
-    "coils/currents",
-    "magnetosuture_msgs/msg/CoilCurrents",
-    "currents that are commanded to the driver, and why they are zero",
+    "coils/currents", "magnetosuture_msgs/msg/CoilCurrents", "currents commanded to the driver, why they are zero"
 )
 BRIDGE_STATE = Channel(
-    "coils/state",
-    "magnetosuture_msgs/msg/CoilBridgeState",
-    "state, armed, reasons, velocities, driver",
-    Quality.LATCHED,
+    "coils/state", "magnetosuture_msgs/msg/CoilBridgeState", "state, armed, reasons, driver", Quality.LATCHED
 )
 PROCEDURE_STATE = Channel(
     "procedure/state",
@@ -175,93 +154,79 @@ PROCEDURE_STATE = Channel(
     Quality.LATCHED,
 )
 PROCEDURE_PLAN = Channel(
-    "procedure/plan",
-    "nav_msgs/msg/Path",
-    "where the middle of the needle is to go, from where it was when it was planned",
-    Quality.LATCHED,
+    "procedure/plan", "nav_msgs/msg/Path", "where the middle of the needle is to go, as planned", Quality.LATCHED
 )
-PROCEDURE_HOLD = Channel(
-    "procedure/hold", "std_msgs/msg/Header", "a person holds the page's button now", Quality.NEWEST
-)
+PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", "a person holds the page's button", Quality.NEWEST)
 DIAGNOSTICS = Channel(
     "diagnostics", "diagnostic_msgs/msg/DiagnosticArray", "what every node reports of itself", absolute=True
 )
-
-# Services of the coil bridge, of the thread model where it forecasts, of the scene server, of the needle planner, of a
-# replayed bag and of the simulated rig.
-ARM, EMERGENCY_STOP, RESET = "coils/arm", "coils/emergency_stop", "coils/reset"
-FORECAST_PATH = "thread/forecast_path"
-LOAD_SCENE, ADD_SHAPE, REPLACE_SHAPE, REMOVE_SHAPE = "scene/load", "scene/add", "scene/replace", "scene/remove"
-PLAN_PROCEDURE = "procedure/make_plan"
-PAUSE_PROCEDURE, RESUME_PROCEDURE, ABORT_PROCEDURE = "procedure/pause", "procedure/resume", "procedure/abort"
-PAUSE_REPLAY, PAUSE_RIG = "replay/pause", "rig/pause"
-
-EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
-
-_SET, _TRIGGER, _EDIT = "std_srvs/srv/SetBool", "std_srvs/srv/Trigger", "magnetosuture_msgs/srv/EditShape"
-SERVICES = {
-    ARM: ServiceInterface(_SET, "coil_bridge", "arm, or disarm"),
-    EMERGENCY_STOP: ServiceInterface(_TRIGGER, "coil_bridge", "zero currents at once, in any state, latched"),
-    RESET: ServiceInterface(_TRIGGER, "coil_bridge", "clear an emergency stop or a fault; the bridge stays disarmed"),
-    LOAD_SCENE: ServiceInterface("magnetosuture_msgs/srv/LoadScene", SCENE_SERVER, "take another scene"),
-    ADD_SHAPE: ServiceInterface(_EDIT, SCENE_SERVER, "add a shape to the scene"),
-    REPLACE_SHAPE: ServiceInterface(_EDIT, SCENE_SERVER, "replace the shape of the same name"),
-    REMOVE_SHAPE: ServiceInterface("magnetosuture_msgs/srv/RemoveShape", SCENE_SERVER, "remove a shape"),
-    FORECAST_PATH: ServiceInterface(
-        "magnetosuture_msgs/srv/ForecastPath",
-        "thread_model",
-        "forecast of a path of the tip, where forecast_horizon is above 0; nothing moves",
-    ),
-    PLAN_PROCEDURE: ServiceInterface("magnetosuture_msgs/srv/PlanProcedure", PLANNER, "check a procedure and plan it"),
-    PAUSE_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "pause the procedure"),
-    RESUME_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "begin what is planned, or go on"),
-    ABORT_PROCEDURE: ServiceInterface(_TRIGGER, PLANNER, "give the procedure up"),
-    PAUSE_REPLAY: ServiceInterface(_SET, "replay", "let the time of a replayed bag stand still"),
-    PAUSE_RIG: ServiceInterface(_SET, "rig_simulator", "let the rig's time stand still"),
-}
+RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents", "the wires to the simulated coils")
+FAULT_REQUEST = Channel("rig/fault", "std_msgs/msg/String", "kind and duration of a fault, from now on; by you")
+CLOCK = Channel("clock", "rosgraph_msgs/msg/Clock", "simulated time, of rig or replay", Quality.SENSOR, absolute=True)
 
 # What only a simulation knows; never an input of the graph.
-GROUND_TRUTH_NEEDLE = Channel(
-    "ground_truth/needle", "geometry_msgs/msg/PoseStamped", "simulated ground truth of the needle"
-)
-GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "simulated ground truth of the thread")
+GROUND_TRUTH_NEEDLE = Channel("ground_truth/needle", "geometry_msgs/msg/PoseStamped", "the simulated needle")
+GROUND_TRUTH_THREAD = Channel("ground_truth/thread", "nav_msgs/msg/Path", "the simulated thread")
 GROUND_TRUTH_PULL = Channel(
     "ground_truth/thread_pull",
     "geometry_msgs/msg/WrenchStamped",
-    "simulated ground truth of what the thread exerts on the needle at its tail, in the frame of the dish",
+    "what the simulated thread exerts on the needle at its tail, in the frame of the dish",
 )
+
+EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
+
+
+class Service(StrEnum):
+    """Services: the name of each, its type, the node that offers it, and what it does."""
+
+    type_name: str
+    node: str
+    about: str
+
+    def __new__(cls, name: str, type_name: str, node: str, about: str) -> Service:
+        """Return a service, which is its name as a text."""
+        made = str.__new__(cls, name)
+        made._value_, made.type_name, made.node, made.about = name, type_name, node, about
+        return made
+
+    ARM = "coils/arm", "std_srvs/srv/SetBool", "coil_bridge", "arm, or disarm"
+    EMERGENCY_STOP = "coils/emergency_stop", "std_srvs/srv/Trigger", "coil_bridge", "zero currents at once, latched"
+    RESET = "coils/reset", "std_srvs/srv/Trigger", "coil_bridge", "clear a stop or a fault; it stays disarmed"
+    LOAD_SCENE = "scene/load", "magnetosuture_msgs/srv/LoadScene", SCENE_SERVER, "take another scene"
+    ADD_SHAPE = "scene/add", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER, "add a shape to the scene"
+    REPLACE_SHAPE = "scene/replace", "magnetosuture_msgs/srv/EditShape", SCENE_SERVER, "replace the shape of a name"
+    REMOVE_SHAPE = "scene/remove", "magnetosuture_msgs/srv/RemoveShape", SCENE_SERVER, "remove a shape"
+    FORECAST_PATH = (
+        "thread/forecast_path",
+        "magnetosuture_msgs/srv/ForecastPath",
+        "thread_model",
+        "forecast of a path of the tip, where forecast_horizon is above 0; nothing moves",
+    )
+    PLAN_PROCEDURE = (
+        "procedure/make_plan",
+        "magnetosuture_msgs/srv/PlanProcedure",
+        PLANNER,
+        "check a procedure, plan it",
+    )
+    PAUSE_PROCEDURE = "procedure/pause", "std_srvs/srv/Trigger", PLANNER, "pause the procedure"
+    RESUME_PROCEDURE = "procedure/resume", "std_srvs/srv/Trigger", PLANNER, "begin what is planned, or go on"
+    ABORT_PROCEDURE = "procedure/abort", "std_srvs/srv/Trigger", PLANNER, "give the procedure up"
+    PAUSE_REPLAY = "replay/pause", "std_srvs/srv/SetBool", "replay", "let the time of a replayed bag stand still"
+    PAUSE_RIG = "rig/pause", "std_srvs/srv/SetBool", "rig_simulator", "let the rig's time stand still"
+
+
+SERVICES = {each.value: each for each in Service}  # by name
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
-RIG_CURRENTS = Channel("rig/currents", "magnetosuture_msgs/msg/CoilCurrents", "the wires to the simulated coils")
-FAULT_REQUEST = Channel(
-    "rig/fault", "std_msgs/msg/String", "kind and duration of a fault, in force from now on; by you"
-)
-CLOCK = Channel(
-    "clock",
-    "rosgraph_msgs/msg/Clock",
-    "simulated time, for every node with use_sim_time; also by a replay",
-    Quality.SENSOR,
-    absolute=True,
-)
-
 INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND)
 OUTPUTS = (
-    NEEDLE_POSE,
-    TRACKER_STATE,
-    MEASURED_THREAD,
-    THREAD_OBSERVATION,
-    PREDICTED_THREAD,
-    ESTIMATED_THREAD,
-    FORECAST,
-    MARGINS,
-    THREAD_MARKERS,
-    FILTER_STATE,
-    NEEDLE_SETPOINT,
-    CURRENTS,
-    BRIDGE_STATE,
-    DIAGNOSTICS,
+    *(NEEDLE_POSE, TRACKER_STATE, MEASURED_THREAD, THREAD_OBSERVATION),
+    *(PREDICTED_THREAD, ESTIMATED_THREAD, FORECAST, MARGINS, THREAD_MARKERS),
+    *(FILTER_STATE, NEEDLE_SETPOINT, CURRENTS, BRIDGE_STATE, DIAGNOSTICS),
 )
 SETTINGS = (SCENE, SCENE_MARKERS, MATERIAL)  # what may be told at any time, or never
 GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
+SIMULATED = (*GROUND_TRUTH, TIP_SETPOINT, FAULT_REQUEST)
+ON_REQUEST = (FORECAST,)  # outputs that nobody publishes unless a parameter asks for them
 PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle planner, where there is one

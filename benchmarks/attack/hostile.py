@@ -29,7 +29,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, PAUSE_RIG, RESET
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode
 from magnetosuture_thread.nodes.run import run
@@ -37,7 +37,7 @@ from magnetosuture_thread.nodes.topics import Topic
 
 TOPICS = (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS, *topics.SIMULATED, topics.RIG_CURRENTS)
 # Whatever their content, these requests are orders, not attacks: only who may give them could be asked.
-ORDERS = (ARM, EMERGENCY_STOP, RESET, PAUSE_RIG)
+ORDERS = (Service.ARM, Service.EMERGENCY_STOP, Service.RESET, Service.PAUSE_RIG)
 FIRST_IMPOSSIBLE_TRANSITION = 9
 NUMBERS = (0.0, -0.0, 1.0, -1.0, 0.01, -0.02, 5e-324, 1e308, -1e308, math.inf, -math.inf, math.nan)
 TEXTS = ("", " ", "dish", "map", "no_such", "use_sim_time", "viscosity", "a..b", "\x1b[2J", "‮", "../../etc/passwd", "{")
@@ -224,9 +224,9 @@ class ProbeNode(GuardedNode):
         super().__init__("probe", **options)
         names = self.declare_parameter("nodes", [""]).value
         self._nodes = {name: self.create_client(GetParameters, f"{name}/get_parameters") for name in names}
-        self._stop = self.create_client(Trigger, EMERGENCY_STOP)
-        self._reset = self.create_client(Trigger, RESET)
-        self._arm = self.create_client(SetBool, ARM)
+        self._stop = self.create_client(Trigger, Service.EMERGENCY_STOP)
+        self._reset = self.create_client(Trigger, Service.RESET)
+        self._arm = self.create_client(SetBool, Service.ARM)
         self._turns = itertools.cycle(names)
         self._asked = 0
         self._silent = set(names)  # who have not answered yet

@@ -274,7 +274,7 @@ def replay_live(
                         live.wait_for_graph()
                         speed = f" at {rate:g} times the speed" if rate != 1.0 else ""
                         log(f"playing {given.duration:.1f} s{speed}")
-                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.PAUSE_REPLAY}"
+                        pause = f"ROS_DOMAIN_ID={graph.domain} ros2 service call /{interface.Service.PAUSE_REPLAY}"
                         log(f'to pause: {pause} std_srvs/srv/SetBool "{{data: true}}", to go on: false')
                         length = max(given.duration, 1e-9)
                         live.play(source.records(), lambda time: progress(min(1.0, time / length)))

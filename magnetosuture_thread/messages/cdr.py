@@ -15,7 +15,7 @@ from magnetosuture_thread.interface import DISH_FRAME
 BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian, as every ROS 2 machine of today writes it
 _DISH = struct.pack("<I", len(DISH_FRAME) + 1) + DISH_FRAME.encode() + b"\0"
 DISH_END = len(BEGIN) + 8 + len(_DISH)  # where a header in the dish frame ends, behind its stamp
-_TIME, _COUNT = struct.Struct("<iI"), struct.Struct("<I")
+_COUNT = struct.Struct("<I")
 
 Stamp = Any  # nanoseconds as int, or a time message of any library
 
@@ -74,7 +74,7 @@ def _fields(layout: str) -> tuple[tuple[str, Any, int], ...]:
 
 def _put_time(data: bytearray, stamp: Stamp) -> None:
     data += bytes(-len(data) % 4)
-    data += _TIME.pack(*(divmod(stamp, 10**9) if isinstance(stamp, int) else (stamp.sec, stamp.nanosec)))
+    data += struct.pack("<iI", *(divmod(stamp, 10**9) if isinstance(stamp, int) else (stamp.sec, stamp.nanosec)))
 
 
 def _put_text(data: bytearray, text: str) -> None:

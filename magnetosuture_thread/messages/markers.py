@@ -11,8 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.barrier import COMPRESSION, CONNECTIVITY, ENHANCED_CONNECTIVITY, STIFFNESS
-from magnetosuture_thread.estimator import ThreadEstimate
-from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
 from magnetosuture_thread.geometry.obstacles import Disc, triangulate
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.cdr import Stamp, pack
@@ -22,11 +20,11 @@ from magnetosuture_thread.thread.margins import UNKNOWN, Margins, friction_colou
 from magnetosuture_thread.thread.prediction import Prediction
 
 if TYPE_CHECKING:
+    from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
     from magnetosuture_thread.forecast import Forecast
 
 ADD, LINE_STRIP = 0, 4  # as in Marker.msg; the other types below
 LIFETIME = 500_000_000  # ns of a text, an arrow or a forecast; poses come far more often
-GHOSTS = 3  # instants of a forecast
 
 Colour = tuple[float, ...]
 Place = Sequence[float] | NDArray[np.float64]
@@ -68,7 +66,19 @@ class Marker(NamedTuple):
     caption: str = ""
     lifetime: int = 0  # ns; 0 for ever
     action: int = ADD
-    turn: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+
+def _line(name: str, number: int, width: float, colour: Colour, points: Points, opacity: float = 1.0) -> Marker:
+    return Marker(name, number, LINE_STRIP, (width, 0.0, 0.0), colour, opacity, points=points)
+
+
+def _triangles(name: str, number: int, colour: Colour, corners: Points, opacity: float) -> Marker:
+    return Marker(name, number, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, opacity, points=corners)
+
+
+def _text(name: str, number: int, colour: str, place: Place, caption: str, size: float = 8e-4) -> Marker:
+    kind, scale = MarkerType.TEXT_VIEW_FACING, (0.0, 0.0, size)
+    return Marker(name, number, kind, scale, COLOURS[colour], place=place, caption=caption, lifetime=LIFETIME)
 
 
 # Header to points; then colours, a texture and its coordinates, the text, and a mesh, all empty but the text.
@@ -82,7 +92,7 @@ def packed_markers(stamp: Stamp, markers: Sequence[Marker]) -> bytes:
     """Return a MarkerArray."""
     values: list[object] = []
     for each in markers:
-        pose = (*each.place, 0.0, 0.0, 0.0)[:3] + each.turn
+        pose = (*(*each.place, 0.0)[:3], 0.0, 0.0, 0.0, 1.0)
         values += [stamp, each.namespace, each.number, each.kind, each.action, pose, each.scale]
         values += [(*each.colour, each.opacity), *divmod(each.lifetime, 10**9), False, each.points]
         values += [0, "", 0, "", "", 0, 0, each.caption, "", "", 0, False]
@@ -122,9 +132,10 @@ def packed_thread_markers(
     width = max(4.0 * diameter, 2e-4)  # wider than it is, so that it can be seen
     friction = UNKNOWN if margins is None else margins.friction
     colour, nodes = friction_colour(friction), thread.positions
+    spheres = (2.0 * width, 2.0 * width, 2.0 * width)
     markers = [
-        Marker("thread", 0, LINE_STRIP, (width, 0.0, 0.0), colour, points=nodes),
-        Marker("thread", 1, MarkerType.SPHERE_LIST, (2.0 * width,) * 3, colour, points=nodes[list(friction.nodes)]),
+        _line("thread", 0, width, colour, nodes),
+        Marker("thread", 1, MarkerType.SPHERE_LIST, spheres, colour, points=nodes[list(friction.nodes)]),
     ]
     of_segments = (CONNECTIVITY, ENHANCED_CONNECTIVITY, COMPRESSION, STIFFNESS)
     shown = [each for each in (() if margins is None else margins.minima) if each.barrier not in of_segments]
@@ -133,41 +144,32 @@ def packed_thread_markers(
         x, y = nodes[minimum.node[0]]
         place = (x, y + (number + 1) * 1e-3)  # several may be closest at the same node
         caption = f"{minimum.barrier} {1e3 * clearance:.2f} mm"
-        markers.append(_text("margins", number, COLOURS["alarm" if clearance <= 0.0 else "ink"], place, caption))
+        markers.append(_text("margins", number, "alarm" if clearance <= 0.0 else "ink", place, caption))
     if estimate is not None:
-        markers += _estimate_markers(prediction, estimate, 0.4 * width)
+        markers.append(_triangles("deviation", 0, COLOURS["deviation"], deviation_band(estimate), 0.35))
+        if prediction is not None:
+            markers.append(_line("predicted", 0, 0.4 * width, COLOURS["predicted"], prediction.positions, 0.9))
+        for number, found in enumerate(estimate.disturbances):
+            markers += _disturbance_markers(number, found, 0.4 * width)
     return packed_markers(stamp, markers)
 
 
-def _text(namespace: str, number: int, colour: Colour, place: Place, caption: str) -> Marker:
-    size = (0.0, 0.0, 8e-4)
-    return Marker(
-        namespace, number, MarkerType.TEXT_VIEW_FACING, size, colour, place=place, caption=caption, lifetime=LIFETIME
-    )
-
-
-def _estimate_markers(prediction: Prediction | None, estimate: ThreadEstimate, width: float) -> list[Marker]:
-    band = deviation_band(estimate)
-    markers = [
-        Marker("deviation", 0, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), COLOURS["deviation"], 0.35, points=band)
+def _disturbance_markers(number: int, found: Disturbance, width: float) -> list[Marker]:
+    """Return an arrow of 2.5 mm whose head is where the force acts, and its text."""
+    arrow = np.array([found.position - 2.5e-3 * found.direction, found.position])
+    scale, place = (width, 4.0 * width, 4.0 * width), found.position - 3.25e-3 * found.direction
+    name, colour = "disturbances", COLOURS["alarm"]
+    return [
+        Marker(name, 2 * number, MarkerType.ARROW, scale, colour, points=arrow, lifetime=LIFETIME),
+        _text(name, 2 * number + 1, "alarm", place, str(found)),
     ]
-    if prediction is not None:
-        line = prediction.positions
-        markers.append(Marker("predicted", 0, LINE_STRIP, (width, 0.0, 0.0), COLOURS["predicted"], 0.9, points=line))
-    for number, found in enumerate(estimate.disturbances):
-        length = 2.5e-3  # m; the head is where it acts
-        arrow = np.array([found.position - length * found.direction, found.position])
-        sizes, name = (width, 4.0 * width, 4.0 * width), "disturbances"
-        markers.append(
-            Marker(name, 2 * number, MarkerType.ARROW, sizes, COLOURS["alarm"], points=arrow, lifetime=LIFETIME)
-        )
-        place = found.position - 1.3 * length * found.direction
-        markers.append(_text(name, 2 * number + 1, COLOURS["alarm"], place, str(found)))
-    return markers
 
 
 def deviation_band(estimate: ThreadEstimate) -> Points:
     """Return the triangles of the band within 2.33 standard deviations of the estimated thread, shape (6 n, 2) [m]."""
+    # Only here: a scene server packs markers too, and needs no estimator.
+    from magnetosuture_thread.estimator.estimate import ONE_SIDED_99
+
     nodes = estimate.positions
     along = np.gradient(nodes, axis=0)
     across = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-12)[:, None]
@@ -184,25 +186,15 @@ def packed_forecast_markers(stamp: Stamp, forecast: Forecast) -> bytes:
     needle's tail at the end. All disappear by themselves half a second after the last forecast.
     """
     markers = []
-    for number, instant in enumerate(forecast_instants(forecast, GHOSTS + 1)[1:]):
-        line, opacity, size = forecast.vertices[instant], 0.8 - 0.2 * number, (1.5e-4, 0.0, 0.0)
-        ghost = Marker(
-            "forecast",
-            number,
-            MarkerType.LINE_STRIP,
-            size,
-            COLOURS["forecast"],
-            opacity,
-            points=line,
-            lifetime=LIFETIME,
-        )
-        markers.append(ghost)
+    for number, instant in enumerate(forecast_instants(forecast, 4)[1:]):
+        ghost = _line("forecast", number, 1.5e-4, COLOURS["forecast"], forecast.vertices[instant], 0.8 - 0.2 * number)
+        markers.append(ghost._replace(lifetime=LIFETIME))
     contact, caption = forecast.first_contact, forecast_text(forecast)
     if caption:
         place = forecast.tails[-1]
         if contact is not None:
             place = forecast.vertices[int(np.searchsorted(forecast.times, contact.time)), contact.node]
-        markers.append(_text("forecast", GHOSTS, COLOURS["alarm"], place, caption))
+        markers.append(_text("forecast", 3, "alarm", place, caption))
     return packed_markers(stamp, markers)
 
 
@@ -242,19 +234,14 @@ def packed_scene_markers(stamp: Stamp, scene: Scene) -> bytes:
     angles = np.linspace(0.0, 2.0 * math.pi, 181)
     rim = scene.dish.radius * np.column_stack([np.cos(angles), np.sin(angles)])
     delete_all = Marker("", 0, 0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, action=3)
-    markers = [delete_all, Marker("dish", 0, LINE_STRIP, (0.005 * diameter, 0.0, 0.0), COLOURS["rim"], 0.8, points=rim)]
+    markers = [delete_all, _line("dish", 0, 0.005 * diameter, COLOURS["rim"], rim, 0.8)]
     for index, shape in enumerate(scene.shapes):
         geometry, colour = shape.geometry, COLOURS[shape.kind]
         if isinstance(geometry, Disc):
             scale = (2.0 * geometry.radius, 2.0 * geometry.radius, thickness)
-            markers.append(Marker("shapes", index, MarkerType.CYLINDER, scale, colour, 0.8, place=geometry.centre))
+            markers.append(Marker("shapes", index, MarkerType.CYLINDER, scale, colour, 0.8, geometry.centre))
         else:
-            corners = triangulate(geometry).reshape(-1, 2)
-            markers.append(
-                Marker("shapes", index, MarkerType.TRIANGLE_LIST, (1.0, 1.0, 1.0), colour, 0.8, points=corners)
-            )
-        place, size = (*shape.label_point, thickness), (0.0, 0.0, 0.025 * diameter)
-        markers.append(
-            Marker("names", index, MarkerType.TEXT_VIEW_FACING, size, COLOURS["ink"], place=place, caption=shape.name)
-        )
+            markers.append(_triangles("shapes", index, colour, triangulate(geometry).reshape(-1, 2), 0.8))
+        name = _text("names", index, "ink", (*shape.label_point, thickness), shape.name, 0.025 * diameter)
+        markers.append(name._replace(lifetime=0))
     return packed_markers(stamp, markers)

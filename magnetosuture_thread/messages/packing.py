@@ -12,26 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.orientation import heading_angle, yaw_quaternion
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import (
-    CAMERA_FRAME,
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    ESTIMATED_THREAD,
-    GROUND_TRUTH_NEEDLE,
-    GROUND_TRUTH_PULL,
-    GROUND_TRUTH_THREAD,
-    MARGINS,
-    MEASURED_THREAD,
-    NEEDLE_POSE,
-    PREDICTED_THREAD,
-    THREAD_OBSERVATION,
-    Channel,
-)
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, Stamp, aligned, pack
-from magnetosuture_thread.thread.margins import FrictionState, Margins
+from magnetosuture_thread.thread.margins import UNKNOWN, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.thread_observation import ThreadObservation
 
@@ -46,7 +32,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.vision.tracker import Track
 
 Vector = NDArray[np.float64]
-Outputs = Iterator[tuple[Channel, bytes]]
+Outputs = Iterator[tuple[interface.Channel, bytes]]
 
 IN_PLANE = (0, 1, 5)  # x, y and the turn about z among ROS's six coordinates of a pose
 
@@ -114,14 +100,14 @@ def packed_wrench(stamp: Stamp, force: Vector, moment: float) -> bytes:
 
 def packed_compressed_image(stamp: Stamp, data: NDArray[np.uint8]) -> bytes:
     """Return a JPEG file's bytes, shape (bytes,), as a CompressedImage."""
-    return pack("time text text uint8[]", stamp, CAMERA_FRAME, "bgr8; jpeg compressed bgr8", data)
+    return pack("time text text uint8[]", stamp, interface.CAMERA_FRAME, "bgr8; jpeg compressed bgr8", data)
 
 
 def packed_image(stamp: Stamp, pixels: NDArray[np.uint8]) -> bytes:
     """Return a BGR image of shape (height, width, 3) as an Image."""
     height, width = pixels.shape[:2]
     layout = "time text uint32 uint32 text uint8 uint32 uint8[]"
-    return pack(layout, stamp, CAMERA_FRAME, height, width, "bgr8", 0, 3 * width, pixels.ravel())
+    return pack(layout, stamp, interface.CAMERA_FRAME, height, width, "bgr8", 0, 3 * width, pixels.ravel())
 
 
 def packed_camera_info(stamp: Stamp, size: tuple[int, int], view: DishView, distance: float) -> bytes:
@@ -130,7 +116,7 @@ def packed_camera_info(stamp: Stamp, size: tuple[int, int], view: DishView, dist
     # Distortion, intrinsic, rectification, projection matrix; then binning and region of interest, which are not set.
     layout = "time text uint32 uint32 text float64[] float64[9] float64[9] float64[12] uint32[6] bool"
     projection = np.column_stack([matrix, np.zeros(3)])
-    head = (stamp, CAMERA_FRAME, size[1], size[0], "plumb_bob")
+    head = (stamp, interface.CAMERA_FRAME, size[1], size[0], "plumb_bob")
     return pack(layout, *head, np.zeros(5), matrix, np.eye(3), projection, np.zeros(6), False)
 
 
@@ -227,24 +213,22 @@ def packed_margins(
         scene_version: of the scene in force where there are none.
         of_estimate: whether they are of the estimated thread; else of the predicted one.
     """
-    rows_layout = "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
-    contact_layout = "uint8 uint32[] uint8 uint32[] float64"
-    # The numbers of contact states and sources are those of SafetyMargins.msg.
-    if margins is None:
-        nothing = (0, (), FrictionState.UNKNOWN, (), 1.0)
-        return pack(rows_layout + contact_layout, stamp, scene_version, False, reason, 0, (), *[()] * 6, 0, *nothing)
-    barriers, minima, friction = margins.barriers, margins.minima, margins.friction
+    known = Margins((), (), UNKNOWN, scene_version) if margins is None else margins
+    barriers, friction = known.barriers, known.friction
     columns: list[ArrayLike] = [np.repeat(np.arange(len(barriers)), [len(barrier) for barrier in barriers])]
     for name in ("node", "obstacle", "value", "clearance", "bound"):
         columns.append(np.concatenate([getattr(barrier, name) for barrier in barriers]) if barriers else ())
     rows: list[Any] = []
-    for row in minima:
+    for row in known.minima:
         rows += [row.barrier, row.node[0], row.obstacle[0], row.value[0], row.clearance[0], row.bound[0]]
+    # As in SafetyMargins.msg.
+    source, contact = (0, 0) if margins is None else (1 + of_estimate, 2 if margins.in_contact else 1)
     return pack(
-        rows_layout + "text uint32 int32 float64 float64 float64 " * len(minima) + contact_layout,
-        *(stamp, margins.scene_version, True, "", 1 + of_estimate, [barrier.barrier for barrier in barriers]),
-        *(*columns, len(minima), *rows),
-        *(2 if margins.in_contact else 1, margins.in_contact),
+        "header text bool text uint8 texts uint8[] uint32[] int32[] float64[] float64[] float64[] uint32 "
+        + "text uint32 int32 float64 float64 float64 " * len(known.minima)
+        + "uint8 uint32[] uint8 uint32[] float64",
+        *(stamp, known.scene_version, margins is not None, "" if margins is not None else reason, source),
+        *([barrier.barrier for barrier in barriers], *columns, len(known.minima), *rows, contact, known.in_contact),
         *(friction.state, friction.nodes, friction.slowdown),
     )
 
@@ -344,49 +328,45 @@ def camera_outputs(
     stamp: Stamp, jpeg: NDArray[np.uint8], size: tuple[int, int], view: DishView, height: float
 ) -> Outputs:
     """Give a frame and the intrinsics of a camera at a height above the dish [m]; size is width and height."""
-    yield COMPRESSED_IMAGE, packed_compressed_image(stamp, jpeg)
-    yield CAMERA_INFO, packed_camera_info(stamp, size, view, height)
+    yield interface.COMPRESSED_IMAGE, packed_compressed_image(stamp, jpeg)
+    yield interface.CAMERA_INFO, packed_camera_info(stamp, size, view, height)
 
 
 def ground_truth_outputs(stamp: Stamp, frame: RigFrame) -> Outputs:
     """Give where needle and thread of a simulation are, and how the thread pulls."""
-    yield GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
-    yield GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
-    yield GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)
+    yield interface.GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
+    yield interface.GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
+    yield interface.GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)
 
 
 def thread_outputs(stamp: Stamp, observation: ThreadObservation, centreline: Points | None) -> Outputs:
     """Give what a frame shows of the thread; the centreline from the tail on has the shape (m, 2) [m]."""
-    yield THREAD_OBSERVATION, packed_observation(stamp, observation)
+    yield interface.THREAD_OBSERVATION, packed_observation(stamp, observation)
     if centreline is not None and len(centreline):
-        yield MEASURED_THREAD, packed_path(stamp, centreline)
+        yield interface.MEASURED_THREAD, packed_path(stamp, centreline)
 
 
 def pose_outputs(
     stamp: Stamp, tail: NDArray[np.float64], heading: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> Outputs:
     """Give the needle's pose; see `packed_pose`."""
-    yield NEEDLE_POSE, packed_pose(stamp, tail, heading, covariance)
+    yield interface.NEEDLE_POSE, packed_pose(stamp, tail, heading, covariance)
 
 
 def prediction_outputs(result: PredictionResult, material: str, step_time: float = 0.0) -> Outputs:
     """Give the prediction of a pose, if there is one, with the time that it took [s]."""
     if result.prediction is not None:
-        yield PREDICTED_THREAD, packed_prediction(result.stamp, result.prediction, material, step_time=step_time)
+        yield (
+            interface.PREDICTED_THREAD,
+            packed_prediction(result.stamp, result.prediction, material, step_time=step_time),
+        )
 
 
 def estimate_outputs(result: PredictionResult) -> Outputs:
     """Give the estimate of a pose, if there is one, and the margins or why there are none."""
     if result.estimate is not None:
-        yield ESTIMATED_THREAD, packed_estimate(result.stamp, result.estimate)
+        yield interface.ESTIMATED_THREAD, packed_estimate(result.stamp, result.estimate)
     if result.estimate is not None or not result.late:
-        yield (
-            MARGINS,
-            packed_margins(
-                result.stamp,
-                result.margins,
-                "" if result.margins else result.reason,
-                result.scene_version,
-                of_estimate=result.estimate is not None,
-            ),
-        )
+        reason, of_estimate = "" if result.margins else result.reason, result.estimate is not None
+        packed = packed_margins(result.stamp, result.margins, reason, result.scene_version, of_estimate=of_estimate)
+        yield interface.MARGINS, packed

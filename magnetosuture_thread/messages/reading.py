@@ -10,18 +10,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from magnetosuture_thread import interface
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import (
-    CLOCK,
-    DISH_FRAME,
-    FILTER_STATE,
-    MARGINS,
-    MEASURED_THREAD,
-    NEEDLE_POSE,
-    THREAD_OBSERVATION,
-)
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, header_stamp, is_in_dish_frame
 from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
@@ -30,8 +22,8 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation,
 
 MAX_PIECES, MAX_PIECE_POINTS, MAX_OUTLINES = 64, 4096, 256  # of an observation of the thread
 RecordedMessage: TypeAlias = Any  # with `topic`, `time` [ns], `data` (CDR bytes), and `decode()`, or a `BagError`
-_STAMP = f"{NEEDLE_POSE.name}.header.stamp"
-_ORIENTATION = f"{NEEDLE_POSE.name}.pose.orientation"
+_STAMP = f"{interface.NEEDLE_POSE.name}.header.stamp"
+_ORIENTATION = f"{interface.NEEDLE_POSE.name}.pose.orientation"
 
 
 def nanoseconds(stamp: Any) -> int:
@@ -49,8 +41,8 @@ def checked_nanoseconds(stamp: Any, field: str) -> int:
 def clock_nanoseconds(message: Any) -> int:
     """Return the time of a Clock in nanoseconds, or refuse one that rclpy cannot represent."""
     if message.clock.sec < 0:
-        raise InvalidInputError(f"/{CLOCK.name}.clock.sec", message.clock.sec, "a time since 1970")
-    return checked_nanoseconds(message.clock, f"/{CLOCK.name}.clock")
+        raise InvalidInputError(f"/{interface.CLOCK.name}.clock.sec", message.clock.sec, "a time since 1970")
+    return checked_nanoseconds(message.clock, f"/{interface.CLOCK.name}.clock")
 
 
 def seconds(stamp: Any) -> float:
@@ -58,10 +50,23 @@ def seconds(stamp: Any) -> float:
     return nanoseconds(stamp) * 1e-9
 
 
+def constant_name(message: Any, value: int, prefix: str, other: str = "unknown") -> str:
+    """Return the name of a constant of a message or its class in lower case, without its prefix.
+
+    Args:
+        message: a message of rclpy, or its class.
+        value: of the constant.
+        prefix: of the constant's name, as `STATE_`.
+        other: returned where no constant has the value.
+    """
+    names = (name for name in dir(message) if name.startswith(prefix) and getattr(message, name) == value)
+    return next((name.removeprefix(prefix).lower() for name in names), other)
+
+
 def require_dish_frame(frame: str, field: str) -> None:
     """Refuse a message in another frame than the dish's."""
-    if frame != DISH_FRAME:
-        raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(DISH_FRAME))
+    if frame != interface.DISH_FRAME:
+        raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(interface.DISH_FRAME))
 
 
 def needle_pose(message: Any) -> NeedlePose:
@@ -70,14 +75,15 @@ def needle_pose(message: Any) -> NeedlePose:
     Raises:
         InvalidInputError: wrong frame, no stamp, no unit quaternion, or a heading that is unknown by its covariance.
     """
-    tail, heading, deviation = _plane_pose(message, NEEDLE_POSE.name)
-    stamp = message.header.stamp
-    checked_nanoseconds(stamp, _STAMP)  # the prediction could not be stamped by another
+    tail, heading, deviation = _plane_pose(message, interface.NEEDLE_POSE.name)
+    checked_nanoseconds(message.header.stamp, _STAMP)  # the prediction could not be stamped by another
     variance = float(message.pose.covariance[-1])
     if variance > 1.0:  # rad^2; beyond, it is unknown which end of the needle is the tail
         expected = "a standard deviation of at most 1 rad: the heading is unknown"
-        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected)
-    return NeedlePose(seconds(stamp), tail, heading, deviation)
+        raise InvalidInputError(
+            f"{interface.NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected
+        )
+    return NeedlePose(seconds(message.header.stamp), tail, heading, deviation)
 
 
 def _plane_pose(message: Any, field: str) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:
@@ -146,7 +152,9 @@ def pose_covariance(message: Any) -> NDArray[np.float64] | None:
     covariance = whole[np.ix_(IN_PLANE, IN_PLANE)]
     if not np.isfinite(covariance).all() or (np.diag(covariance) < 0.0).any():
         diagonal = np.diag(covariance).tolist()
-        raise InvalidInputError(f"{NEEDLE_POSE.name}.pose.covariance", diagonal, "finite variances of at least 0")
+        raise InvalidInputError(
+            f"{interface.NEEDLE_POSE.name}.pose.covariance", diagonal, "finite variances of at least 0"
+        )
     return np.asarray(covariance)
 
 
@@ -156,10 +164,10 @@ def filtered_command(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np
     Raises:
         InvalidInputError: a velocity is not finite, or the stamp no time.
     """
-    stamp = checked_nanoseconds(message.header.stamp, f"{FILTER_STATE.name}.header.stamp")
+    stamp = checked_nanoseconds(message.header.stamp, f"{interface.FILTER_STATE.name}.header.stamp")
     commanded, filtered = np.array([[v.x, v.y] for v in (message.commanded, message.filtered)])
     if not (np.isfinite(commanded).all() and np.isfinite(filtered).all()):
-        raise InvalidInputError(FILTER_STATE.name, [*commanded, *filtered], "finite velocities [m/s]")
+        raise InvalidInputError(interface.FILTER_STATE.name, [*commanded, *filtered], "finite velocities [m/s]")
     return stamp, commanded, filtered, message.source
 
 
@@ -170,22 +178,21 @@ def margins_of(message: Any) -> Margins:
         InvalidInputError: its parallel arrays differ in length, or a row is of no barrier.
     """
     row, names = np.asarray(message.barrier, dtype=np.intp), list(message.barrier_names)
+    bound = getattr(message, "clearance_bound", ())  # older bags have none
     columns = [
-        np.asarray(values, dtype)
-        for values, dtype in (
-            (message.node, np.uint32),
-            (message.obstacle, np.int32),
-            (message.value, np.float64),
-            (message.clearance, np.float64),
-        )
+        np.asarray(message.node, np.uint32),
+        np.asarray(message.obstacle, np.int32),
+        np.asarray(message.value, np.float64),
+        np.asarray(message.clearance, np.float64),
+        np.asarray(bound, np.float64) if len(bound) else np.full(len(row), -np.inf),
     ]
-    bound = np.asarray(getattr(message, "clearance_bound", ()), np.float64)  # older bags have none
-    columns.append(bound if len(bound) else np.full(len(row), -np.inf))
     if any(len(column) != len(row) for column in columns) or (len(row) and row.max() >= len(names)):
         found = f"{[len(row), *map(len, columns)]} rows of {len(names)} barriers"
-        raise InvalidInputError(MARGINS.name, found, "parallel arrays, each row of a barrier that is named")
+        raise InvalidInputError(interface.MARGINS.name, found, "parallel arrays, each row of a barrier that is named")
     if message.friction_state not in set(FrictionState):
-        raise InvalidInputError(f"{MARGINS.name}.friction_state", message.friction_state, "a state of SafetyMargins")
+        raise InvalidInputError(
+            f"{interface.MARGINS.name}.friction_state", message.friction_state, "a state of SafetyMargins"
+        )
     margins = [BarrierMargins(name, *(column[row == k] for column in columns)) for k, name in enumerate(names)]
     squeezed = tuple(int(node) for node in message.friction_nodes)
     friction = Friction(FrictionState(message.friction_state), squeezed, message.slowdown)
@@ -198,7 +205,7 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, 2.0 * float(np.arctan2(turn.z, turn.w))
 
 
-def path_points(message: Any, field: str = MEASURED_THREAD.name) -> Points:
+def path_points(message: Any, field: str = interface.MEASURED_THREAD.name) -> Points:
     """Return a Path as an array of shape (m, 2) [m].
 
     Raises:
@@ -208,7 +215,7 @@ def path_points(message: Any, field: str = MEASURED_THREAD.name) -> Points:
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
 
 
-def thread_observation(message: Any, field: str = THREAD_OBSERVATION.name) -> ThreadObservation:
+def thread_observation(message: Any, field: str = interface.THREAD_OBSERVATION.name) -> ThreadObservation:
     """Return a ThreadObservation that is valid.
 
     Raises:

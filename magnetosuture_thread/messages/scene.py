@@ -72,10 +72,9 @@ def parse_scene_message(message: Any) -> Scene:
 
 
 def _self_contact(value: int) -> bool | None:
-    for setting, number in SELF_CONTACT.items():
-        if number == value:
-            return setting
-    raise ConfigurationError("self_contact", value, "0, 1 or 2, see the message's constants")
+    if value not in SELF_CONTACT.values():
+        raise ConfigurationError("self_contact", value, "0, 1 or 2, see the message's constants")
+    return next(setting for setting, number in SELF_CONTACT.items() if number == value)
 
 
 def _require_bounds(message: Any) -> None:

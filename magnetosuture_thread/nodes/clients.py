@@ -21,6 +21,7 @@ from lifecycle_msgs.srv import ChangeState
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, ProcedureState
 from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -33,18 +34,15 @@ from typing_extensions import Self
 
 from magnetosuture_thread import InvalidInputError
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import ALL_NODES, ARM, DIAGNOSTICS, EMERGENCY_STOP, EXECUTE_PROCEDURE, RESET
-from magnetosuture_thread.messages.reading import clock_nanoseconds
+from magnetosuture_thread.interface import ALL_NODES, DIAGNOSTICS, EXECUTE_PROCEDURE, Service
+from magnetosuture_thread.messages.reading import clock_nanoseconds, constant_name
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import JITTER_KEYS, MAX_REASON_CHARS, SCHEDULING, GuardedNode, read_status
 from magnetosuture_thread.texts import shortened
 
 TIMEOUT = 10.0  # s for a service to be found and to answer
-RETRY_PERIOD = 0.5  # s without an answer, after which a service is called again
 POLL_PERIOD = 0.005  # s between two looks at what has come
 DISCOVERY_TIME = 1.0  # s after a node is found, for it to have discovered this client
-GOAL_PERIOD = 2.0  # s after which a procedure that could not begin is sent again
-RECORDED_DEPTH = 1000  # messages of a recorded topic that may wait before any is lost
 
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
@@ -142,7 +140,7 @@ class Latest:
         topic: to subscribe.
         read: converts a message; where it fails, the previous value stays.
         period: minimum between two messages that are read [s].
-        max_bytes: of a message that is read; the topic's own bound if None.
+        max_bytes: of a message that is read, besides the topic's own bound.
 
     Attributes:
         value: content of the latest message that was read; None before the first.
@@ -154,30 +152,29 @@ class Latest:
         topic: topics.Topic,
         read: Callable[[Any], Any] = lambda message: message,
         period: float = 0.0,
-        *,
-        max_bytes: int | None = None,
+        max_bytes: float = math.inf,
     ) -> None:
         self._inbox = Inbox(node, topic, 1)
-        self._max_bytes = topic.max_bytes if max_bytes is None else max_bytes
-        self._read = read
-        self._period = period
-        self._next_read = 0.0
-        self._arrived = 0
+        self._read, self._period, self._max_bytes = read, period, max_bytes
+        self._next_read, self._arrived = 0.0, 0
         self.value: Any = None
+        self.close = self._inbox.close
 
     def poll(self) -> bool:
         """Read the latest message, if there is one; return whether there is a new value."""
         now = time.monotonic()
-        waiting = list(self._inbox.take()) if now >= self._next_read else []
-        if not waiting or len(waiting[-1][0]) > self._max_bytes:
+        if now < self._next_read:
             return False
-        data, arrived = waiting[-1]
-        try:
-            self.value = self._read(self._inbox.topic.decode(data))
-        except Exception:  # whatever is wrong with a message, who asks goes on with the one before
-            return False
-        self._arrived, self._next_read = arrived, now + self._period
-        return True
+        for data, arrived in self._inbox.take():
+            if len(data) > self._max_bytes:
+                return False
+            try:
+                self.value = self._read(self._inbox.topic.decode(data))
+            except Exception:  # whatever is wrong with a message, who asks goes on with the one before
+                return False
+            self._arrived, self._next_read = arrived, now + self._period
+            return True
+        return False
 
     @property
     def age(self) -> float:
@@ -187,10 +184,6 @@ class Latest:
     def aged(self) -> dict[str, Any] | None:
         """Return a copy of the latest content, with its age."""
         return None if self.value is None else {**self.value, "age": self.age}
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._inbox.close()
 
 
 def _never(data: bytes) -> None:
@@ -207,7 +200,6 @@ class Services:
 
     def __init__(self, node: Node, kinds: Mapping[str, Any]) -> None:
         self._clients = {name: node.create_client(kind, name) for name, kind in kinds.items()}
-        self._answers: dict[str, dict[int, Any]] = {name: {} for name in kinds}
 
     def ready(self, name: str) -> bool:
         """Return whether a service is available."""
@@ -219,7 +211,7 @@ class Services:
         request: Any,
         *,
         timeout: float = TIMEOUT,
-        retry_period: float = RETRY_PERIOD,
+        retry_period: float = 0.5,
         is_wanted: Callable[[], bool] = lambda: True,
     ) -> Any:
         """Return the answer of a service; None where it is not wanted any more.
@@ -236,25 +228,31 @@ class Services:
         Raises:
             GraphError: it was not found, or did not answer in time.
         """
-        client, answers = self._clients[name], self._answers[name]
-        calls: list[int] = []
+        client = self._clients[name]
+        calls: list[Future] = []
         deadline, retry_at = time.monotonic() + timeout, 0.0
         while (now := time.monotonic()) < deadline:
             if not is_wanted():
                 return None
-            with client.handle:
-                if now >= retry_at and client.service_is_ready():
-                    calls.append(client.handle.send_request(request))
-                    retry_at = now + retry_period
+            if now >= retry_at and client.service_is_ready():
+                calls.append(client.call_async(request))
+                retry_at = now + retry_period
             await asyncio.sleep(POLL_PERIOD)
-            with client.handle:  # take the answers to all calls
-                while (found := client.handle.take_response(client.srv_type.Response))[0] is not None:
-                    answers[found[0].request_id.sequence_number] = found[1]
-            for answer in [answers.pop(number) for number in calls if number in answers]:
-                return answer
+            _take_answers(client)
+            for call in calls:
+                if call.done():
+                    return call.result()
         raise GraphError(
             f"{name} did not answer within {timeout:g} s" if calls else f"no service {name} within {timeout:g} s"
         )
+
+
+def _take_answers(client: Client) -> None:
+    """Take the answers to all calls of a client, as an executor does."""
+    with client.handle:
+        while (found := client.handle.take_response(client.srv_type.Response))[0] is not None:
+            with suppress(KeyError):  # somebody else has answered already
+                client.get_pending_request(found[0].request_id.sequence_number).set_result(found[1])
 
 
 def answer_requests(node: Node) -> None:
@@ -266,7 +264,31 @@ def answer_requests(node: Node) -> None:
                 service.send_response(service.callback(request, service.srv_type.Response()), header)
 
 
-class CoilClient:
+class _Client:
+    """A client that is in the graph while it is entered.
+
+    Args:
+        name: of its node.
+        namespace: of the graph, where it is in one.
+    """
+
+    def __init__(self, name: str, namespace: str = "") -> None:
+        self._name, self._namespace, self._stack = name, namespace, ExitStack()
+
+    def __enter__(self) -> Self:
+        """Join the graph."""
+        self._open(self._stack.enter_context(joined(name=self._name, namespace=self._namespace)))
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the graph."""
+        self._stack.close()
+
+    def _open(self, node: Node) -> None:
+        raise NotImplementedError
+
+
+class CoilClient(_Client):
     """Client of the coil bridge on the ROS domain of the environment.
 
     Args:
@@ -274,21 +296,14 @@ class CoilClient:
     """
 
     def __init__(self, namespace: str = "") -> None:
-        self._namespace, self._stack = namespace, ExitStack()
+        super().__init__("coil_client", namespace)
 
-    def __enter__(self) -> Self:
-        """Join the graph."""
-        node = self._stack.enter_context(joined(name="coil_client", namespace=self._namespace))
-        switches = {ARM: SetBool, EMERGENCY_STOP: Trigger, RESET: Trigger}
+    def _open(self, node: Node) -> None:
+        switches = {Service.ARM: SetBool, Service.EMERGENCY_STOP: Trigger, Service.RESET: Trigger}
         self._services = Services(node, {**switches, "coil_bridge/change_state": ChangeState})
         self._state = Latest(node, topics.BRIDGE_STATE)
         self._reports = Inbox(node, topics.DIAGNOSTICS, 10)
         self._bridge = f"{node.get_namespace()}/coil_bridge".lstrip("/")
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Leave the graph."""
-        self._stack.close()
 
     def execute(self, action: str) -> str:
         """Execute a command: a lifecycle transition, arm, disarm, stop, or reset.
@@ -299,6 +314,7 @@ class CoilClient:
         Raises:
             GraphError: no bridge was found, or it rejects the command.
         """
+        message = ""
         if action in TRANSITIONS:
             # Called once, so the bridge must have discovered this client too, or its answer is lost.
             self._wait_for_state()
@@ -306,11 +322,11 @@ class CoilClient:
             request = ChangeState.Request(transition=Transition(id=TRANSITIONS[action]))
             if not self._call("coil_bridge/change_state", request, retry_period=math.inf).success:
                 raise GraphError(f"the bridge rejected {action}: not possible in its state, or see its log")
-            message = ""
         else:
-            name = {"stop": EMERGENCY_STOP, "reset": RESET}.get(action, ARM)
-            request = SetBool.Request(data=action == "arm") if name == ARM else Trigger.Request()
-            answer = self._call(name, request)
+            name = {"stop": Service.EMERGENCY_STOP, "reset": Service.RESET}.get(action, Service.ARM)
+            answer = self._call(
+                name, SetBool.Request(data=action == "arm") if name == Service.ARM else Trigger.Request()
+            )
             message = shortened(answer.message, MAX_REASON_CHARS)
             if not answer.success:
                 raise GraphError(message)
@@ -324,14 +340,8 @@ class CoilClient:
             GraphError: no state was received.
         """
         state = self._wait_for_state()
-        texts = {
-            CoilBridgeState.STATE_UNCONFIGURED: "unconfigured",
-            CoilBridgeState.STATE_INACTIVE: "inactive",
-            CoilBridgeState.STATE_ACTIVE: "active",
-            CoilBridgeState.STATE_FAULT: "fault",
-        }
         return {
-            "state": texts[state.state] + (", armed" if state.armed else ""),
+            "state": constant_name(state, state.state, "STATE_", "unknown") + (", armed" if state.armed else ""),
             "currents are zero because": _listed(state.reasons) or "they are not: a command is followed",
             "velocity commanded [mm/s]": _millimetres(state.commanded),
             "velocity filtered [mm/s]": _millimetres(state.filtered),
@@ -353,24 +363,24 @@ class CoilClient:
         Raises:
             GraphError: no diagnostics were received.
         """
-        deadline = time.monotonic() + TIMEOUT
-        while time.monotonic() < deadline:
-            for report, _ in self._reports.read():
-                for status in report.status:
-                    values = read_status(status)[1] if status.name.startswith(f"{self._bridge}:") else {}
-                    if SCHEDULING in values:
-                        median, p99, maximum = (float(values[name]) for name in JITTER_KEYS)
-                        return (median, p99, maximum), values[SCHEDULING]
-            time.sleep(POLL_PERIOD)
-        raise GraphError(f"no coil_bridge diagnostics received within {TIMEOUT:g} s")
+        values = _wait_for(self._timing_values, "no coil_bridge diagnostics received")
+        median, p99, maximum = (float(values[name]) for name in JITTER_KEYS)
+        return (median, p99, maximum), values[SCHEDULING]
+
+    def _timing_values(self) -> dict[str, str] | None:
+        for report, _ in self._reports.read():
+            for status in report.status:
+                values = read_status(status)[1] if status.name.startswith(f"{self._bridge}:") else {}
+                if SCHEDULING in values:
+                    return values
+        return None
 
     def _wait_for_state(self) -> CoilBridgeState:
-        deadline = time.monotonic() + TIMEOUT
-        while not self._state.poll() and self._state.value is None:
-            if time.monotonic() > deadline:
-                raise GraphError(f"no coil_bridge state received within {TIMEOUT:g} s on this ROS domain")
-            time.sleep(POLL_PERIOD)
-        return self._state.value
+        def latest() -> Any:
+            self._state.poll()
+            return self._state.value
+
+        return _wait_for(latest, "no coil_bridge state received on this ROS domain")
 
     def _call(self, name: str, request: Any, **options: Any) -> Any:
         try:
@@ -379,6 +389,16 @@ class CoilClient:
             if not str(error).startswith("no service"):  # a bridge that does not answer may hold currents
                 raise
             raise GraphError(f"no coil_bridge on this ROS domain: {error}") from None
+
+
+def _wait_for(read: Callable[[], Any], problem: str) -> Any:
+    """Return what a function returns, once that is not None; raise `GraphError` if that takes too long."""
+    deadline = time.monotonic() + TIMEOUT
+    while (found := read()) is None:
+        if time.monotonic() > deadline:
+            raise GraphError(f"{problem} within {TIMEOUT:g} s")
+        time.sleep(POLL_PERIOD)
+    return found
 
 
 def _millimetres(vector: Any) -> str:
@@ -398,7 +418,7 @@ class ProcedureReport:
     """What the planner reports of a procedure.
 
     Attributes:
-        state: planned, running, paused, done or failed.
+        state: ready, running, paused, done or failed.
         reason: why it is paused or has failed; empty else.
         goals_met: how many goals are met.
         progress: completed share of the present goal's path, 0 to 1.
@@ -412,7 +432,7 @@ class ProcedureReport:
     clearance: float = math.nan
 
 
-class ProcedureClient:
+class ProcedureClient(_Client):
     """Client of the needle planner on the ROS domain of the environment; nothing happens but in `poll`.
 
     Args:
@@ -425,28 +445,19 @@ class ProcedureClient:
     """
 
     def __init__(self, procedure: str) -> None:
-        self._stack = ExitStack()
+        super().__init__("procedure_client")
         self._request = ExecuteProcedure.Goal(procedure=procedure)
-        self._send_at: float | None = None  # None until the planner is found
-        self._sent: Future | None = None
-        self._ended: Future | None = None
+        self._send_at: float | None = None  # None until the planner is found, infinite while it executes the goal
         self.status: ProcedureReport | None = None
         self.result: ProcedureReport | None = None
         self.refusal = ""
 
-    def __enter__(self) -> Self:
-        """Join the graph."""
-        node = self._stack.enter_context(joined(name="procedure_client"))
+    def _open(self, node: Node) -> None:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._client = ActionClient(node, ExecuteProcedure, EXECUTE_PROCEDURE)
         self._stack.callback(self._client.destroy)
         self._stack.callback(self._executor.shutdown)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Leave the graph."""
-        self._stack.close()
 
     def poll(self) -> None:
         """Send the goal once the planner is there, and take what has come."""
@@ -456,36 +467,23 @@ class ProcedureClient:
         if self._send_at is None:
             if self._client.server_is_ready():
                 self._send_at = now + DISCOVERY_TIME
-        elif self._sent is None:
-            if now >= self._send_at:
-                self._sent = self._client.send_goal_async(self._request, self._on_feedback)
-        elif self._ended is None:
-            if self._sent.done():
-                self._ended = self._sent.result().get_result_async()
-        elif self._ended.done() and self.result is None:
-            self._end(self._ended.result().result, now)
+        elif now >= self._send_at:
+            self._send_at = math.inf
+            sent = self._client.send_goal_async(self._request, self._on_feedback)
+            sent.add_done_callback(lambda sent: sent.result().get_result_async().add_done_callback(self._on_result))
 
     def _on_feedback(self, message: Any) -> None:
         status = message.feedback.status
         figures = status.goals_met, status.progress, status.clearance
-        self.status = ProcedureReport(_procedure_state(status.state), status.reason, *figures)
+        self.status = ProcedureReport(constant_name(status, status.state, "STATE_"), status.reason, *figures)
 
-    def _end(self, result: ExecuteProcedure.Result, now: float) -> None:
+    def _on_result(self, ended: Future) -> None:
+        result = ended.result().result
         if self.status is not None or result.state == ProcedureState.STATE_DONE:
-            self.result = ProcedureReport(_procedure_state(result.state), result.reason, result.goals_met)
-            return
-        self.refusal, self._sent, self._ended, self._send_at = result.reason, None, None, now + GOAL_PERIOD
-
-
-def _procedure_state(state: int) -> str:
-    names = {
-        ProcedureState.STATE_READY: "planned",
-        ProcedureState.STATE_RUNNING: "running",
-        ProcedureState.STATE_PAUSED: "paused",
-        ProcedureState.STATE_DONE: DONE,
-        ProcedureState.STATE_FAILED: "failed",
-    }
-    return names.get(state, "unknown")
+            state = constant_name(ProcedureState, result.state, "STATE_")
+            self.result = ProcedureReport(state, result.reason, result.goals_met)
+        else:
+            self.refusal, self._send_at = result.reason, time.monotonic() + 2.0  # s; then it is sent again
 
 
 class Recorder:
@@ -517,7 +515,7 @@ class Recorder:
         self._stack = ExitStack()
         node = self._stack.enter_context(joined(name="recorder", domain=domain))
         followed = (topics.CLOCK, *taken) if simulated_clock else taken
-        self._inboxes = [Inbox(node, topic, RECORDED_DEPTH) for topic in followed]
+        self._inboxes = [Inbox(node, topic, 1000) for topic in followed]
 
     def close(self) -> None:
         """Leave the graph."""

@@ -16,8 +16,6 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.timer import Timer
-from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
@@ -25,26 +23,13 @@ from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, Coil
 from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.interface import ARM, EMERGENCY_STOP, RESET
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import (
-    packed_bridge_state,
-    packed_currents,
-    packed_filter_state,
-    packed_rig_currents,
-    packed_twist,
-)
+from magnetosuture_thread.interface import Service
+from magnetosuture_thread.messages import packing, reading
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import ManagedNode
-from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING
+from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import raise_priority
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
-# Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
-AGE_KEY = "minimum age of {topic} [ms]"
-AGED_TOPICS = (*INPUTS.values(), topics.NEEDLE_POSE.name)
-STATE_PERIOD = 0.1  # s between two messages of an unchanged state
 
 
 class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
@@ -53,6 +38,8 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     Every command passes the needle's safety filter: those of an operator on `operator/servo_cv`, which have priority,
     and those of a planner or path follower on `needle/servo_cv`.
     """
+
+    stands_by = False  # it reports what it does, in any state
 
     def __init__(self, **options: Any) -> None:
         super().__init__("coil_bridge", CoilBridgeSettings, **options)
@@ -63,7 +50,6 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._reactivate = False  # whether a reset activates the node again
         # The watchdog has its own clock: simulated time may stand still, and the coils must not stay on.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watchdog: Timer | None = None
         self._refused = 0
         self._last_state: object = None
         self._last_log = ""
@@ -72,7 +58,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         self._states = topics.BRIDGE_STATE.publisher(self)
         self._filter = topics.FILTER_STATE.publisher(self)
         self._rig = topics.RIG_CURRENTS.publisher(self)
-        self.create_timer(STATE_PERIOD, lambda: self._publish_state(force=True), clock=self._steady)
+        self.create_timer(0.1, lambda: self._publish_state(force=True), clock=self._steady)
         # Once before the loop runs: for its first line rclpy looks for its caller in all modules, which takes 0.1 s.
         self._log(self.system.closed, self.system.driver_state)
         topics.NEEDLE_POSE.subscribe_numbered(self, self.on_pose)
@@ -80,9 +66,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         topics.MARGINS.subscribe(self, self.on_margins)
         for topic, source in ((topics.OPERATOR_COMMAND, OPERATOR), (topics.NEEDLE_COMMAND, NEEDLE)):
             topic.subscribe_numbered(self, partial(self.on_command, source))
-        self.create_service(SetBool, ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
-        self.create_service(Trigger, EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
-        self.create_service(Trigger, RESET, lambda _, answer: _done(answer, self.reset()))
+        self.serve(Service.ARM, lambda asked, answer: _done(answer, self.arm(asked.data)))
+        self.serve(Service.EMERGENCY_STOP, lambda _, answer: _done(answer, self.stop()))
+        self.serve(Service.RESET, lambda _, answer: _done(answer, self.reset()))
         self.system.import_barriers(self.get_parameter_or("barriers").value or ())
         self.start()
         self.system.arm_when_ready(self.settings is not None and self.settings.autostart == "armed")
@@ -95,7 +81,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         bridge = CoilBridge(settings, self.system.latch, self._scene.load(settings.scene))
         driver = make_driver(settings, len(bridge.coils), self._send_to_rig, self._count_rigs)
         self.system.open(settings, bridge, driver)
-        self._watchdog = self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady)
+        self.held(self.create_timer(1.0 / settings.rate, self.on_watchdog, clock=self._steady))
 
     def activate(self) -> None:
         """Activate, so that the bridge can be armed."""
@@ -107,9 +93,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def release(self) -> None:
         """Set the coils to zero, close the driver, and publish that."""
-        if self._watchdog is not None:
-            self.destroy_timer(self._watchdog)
-        self._watchdog, self._reactivate = None, False
+        self._reactivate = False
         self._stamps.clear()
         ends = self.is_shutting_down or self.has_ended
         final = self.system.close(FINALIZED if ends else UNCONFIGURED)
@@ -238,7 +222,7 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
 
     def _send_to_rig(self, currents: np.ndarray) -> None:
         """Send currents to the simulated rig."""
-        self._rig.publish(packed_rig_currents(self.get_clock().now().to_msg(), currents))
+        self._rig.publish(packing.packed_rig_currents(self.get_clock().now().to_msg(), currents))
 
     def _count_rigs(self) -> int:
         """Return the number of simulated rigs that subscribe; none after ROS has shut down."""
@@ -247,9 +231,9 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
     def _publish_output(self, command: Time | None, output: BridgeOutput) -> None:
         """Publish the output of a step; `command` is the stamp of the command that it follows, if any."""
         stamp = self.get_clock().now().to_msg()
-        self._currents.publish(packed_currents(stamp, command, output))
-        self._setpoints.publish(packed_twist(stamp, output.applied))
-        self._filter.publish(packed_filter_state(command or stamp, output))
+        self._currents.publish(packing.packed_currents(stamp, command, output))
+        self._setpoints.publish(packing.packed_twist(stamp, output.applied))
+        self._filter.publish(packing.packed_filter_state(command or stamp, output))
 
     def _publish_state(self, *, force: bool) -> None:
         """Publish the state if it has changed, or if forced."""
@@ -262,34 +246,31 @@ class CoilBridgeNode(ManagedNode[CoilBridgeSettings]):
         if now == self._last_state and not force:
             return
         stamp = self.get_clock().now().to_msg()
-        self._states.publish(packed_bridge_state(stamp, system, driver, self._refused))
+        self._states.publish(packing.packed_bridge_state(stamp, system, driver, self._refused))
         self._last_state = now
         if output is not None and not output.publish:
-            self._filter.publish(packed_filter_state(stamp, output))
-        jitter = zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)
+            self._filter.publish(packing.packed_filter_state(stamp, output))
+        aged = (*INPUTS.values(), topics.NEEDLE_POSE.name)
+        # Over the last seconds, NaN without a message; negative where the sender's clock is ahead.
         ages = {} if system.bridge is None else system.bridge.stamp_ages.minimum(time.monotonic())
         self.health.note(
-            **{key: round(value, 3) for key, value in jitter},
-            **{AGE_KEY.format(topic=topic): round(1e3 * ages.get(topic, math.nan), 1) for topic in AGED_TOPICS},
+            **{key: round(value, 3) for key, value in zip(JITTER_KEYS, system.timing.jitter_ms, strict=True)},
+            **{f"minimum age of {topic} [ms]": round(1e3 * ages.get(topic, math.nan), 1) for topic in aged},
             driver=system.driver_name,
             scene=scene or "none",
             **{"driver problem": driver.problem or "none"},
         )
         self._log(closed or latch.state.value, driver)
+        level, text = self.health.ok, closed or latch.stop_reason or "following commands"
         if latch.latched_reason:
-            self.health.error(f"fault: {latch.latched_reason}")
-        elif closed:
-            self.health.ok(closed)
-        elif not driver.ready:
-            self.health.warn(f"{latch.stop_reason or 'armed'}; driver: {driver.problem}")
-        elif latch.stop_reason:
-            self.health.ok(latch.stop_reason)
-        elif reasons:
-            self.health.warn(f"stopped: {'; '.join(reasons)}")
-        elif driver.warnings:
-            self.health.warn(f"following commands; driver: {'; '.join(driver.warnings)}")
-        else:
-            self.health.ok("following commands")
+            level, text = self.health.error, f"fault: {latch.latched_reason}"
+        elif not closed and not driver.ready:
+            level, text = self.health.warn, f"{latch.stop_reason or 'armed'}; driver: {driver.problem}"
+        elif not closed and not latch.stop_reason and (reasons or driver.warnings):
+            stopped = f"stopped: {'; '.join(reasons)}"
+            level = self.health.warn
+            text = stopped if reasons else f"following commands; driver: {'; '.join(driver.warnings)}"
+        level(text)
 
     def _log(self, state: str, driver: DriverState) -> None:
         """Log changes of state and driver, as a record of incidents."""

@@ -7,7 +7,6 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -22,28 +21,17 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, read_scene
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, interface, read_scene
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import (
-    ABORT_PROCEDURE,
-    ALL_NODES,
-    ARM,
-    EMERGENCY_STOP,
-    PAUSE_PROCEDURE,
-    PAUSE_REPLAY,
-    PAUSE_RIG,
-    PLAN_PROCEDURE,
-    RESET,
-    RESUME_PROCEDURE,
-)
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_header, packed_twist
 from magnetosuture_thread.nodes import console_state as page
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Latest, Services, answer_requests
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PERIOD, GuardedNode, Health
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PERIOD, GuardedNode
 from magnetosuture_thread.nodes.parameters import declare, given_parameters, init
 from magnetosuture_thread.nodes.run import end_signals
 from magnetosuture_thread.planning.procedure import read_procedure
@@ -54,21 +42,19 @@ from magnetosuture_thread.vision.images import unpack_image
 
 NAME = "console"
 RIG = "rig_simulator"
-NODE_TIMEOUT = 3.0  # s without diagnostics, after which a node is silent
 DROP_TIMEOUT = 60.0  # s without diagnostics, after which a node that is none of ours is no longer shown
 MAX_NODES = 32  # shown
-MAX_SHOWN_BYTES = 1 << 18  # of a message that becomes a part of the state
 
-SERVICES: dict[str, Any] = {
-    **dict.fromkeys((ARM, PAUSE_REPLAY, PAUSE_RIG), SetBool),
-    **dict.fromkeys((EMERGENCY_STOP, RESET, RESUME_PROCEDURE, PAUSE_PROCEDURE, ABORT_PROCEDURE), Trigger),
-    PLAN_PROCEDURE: PlanProcedure,
-}
 ACTIONS: dict[str, tuple[str, Any]] = {
-    "arm": (ARM, SetBool.Request(data=True)),
-    "disarm": (ARM, SetBool.Request(data=False)),
-    "stop": (EMERGENCY_STOP, Trigger.Request()),
-    "reset": (RESET, Trigger.Request()),
+    "arm": (Service.ARM, SetBool.Request(data=True)),
+    "disarm": (Service.ARM, SetBool.Request(data=False)),
+    "stop": (Service.EMERGENCY_STOP, Trigger.Request()),
+    "reset": (Service.RESET, Trigger.Request()),
+}
+PROCEDURE_ACTIONS = {
+    "resume": Service.RESUME_PROCEDURE,
+    "pause": Service.PAUSE_PROCEDURE,
+    "abort": Service.ABORT_PROCEDURE,
 }
 # Parts of the state: the topic, what reads its messages, how seldom [s], and whether the part has its age. Paths and
 # forecasts take a millisecond to read, a large scene more.
@@ -113,7 +99,9 @@ class ConsoleGraph:
     def __init__(self, node: Node, settings: ConsoleSettings) -> None:
         self.node = node
         self.blocked = ""
-        self.services = Services(node, SERVICES)
+        offered_by = ("coil_bridge", interface.PLANNER, "replay", RIG)
+        called = [each for each in Service if each.node in offered_by]
+        self.services = Services(node, {each: topics.ros_class(each.type_name) for each in called})
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
@@ -148,12 +136,11 @@ class ConsoleGraph:
         """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
         if self.blocked:
             return self.blocked
-        if action == "plan":
-            request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
-            # A long way takes some seconds, and is planned once.
-            return await self.call(PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
-        names = {"resume": RESUME_PROCEDURE, "pause": PAUSE_PROCEDURE, "abort": ABORT_PROCEDURE}
-        return await self.call(names[action], Trigger.Request())
+        if action != "plan":
+            return await self.call(PROCEDURE_ACTIONS[action], Trigger.Request())
+        request = PlanProcedure.Request(procedure=procedure, hold_to_run=hold_to_run)
+        # A long way takes some seconds, and is planned once.
+        return await self.call(Service.PLAN_PROCEDURE, request, timeout=60.0, retry_period=math.inf)
 
     async def execute_action(self, action: str) -> str:
         """Arm, disarm, stop or reset; return an empty text, or the reason of a refusal.
@@ -177,9 +164,9 @@ class ConsoleGraph:
         if answer is None:
             return "cancelled by a later action"
         text = shortened(str(answer.message), MAX_REASON_CHARS)
-        if answer.success:  # where time is paused, that is all the message says
-            return "" if name in (PAUSE_REPLAY, PAUSE_RIG) else text
-        return text or "refused"
+        if not answer.success:
+            return text or "refused"
+        return "" if name in (Service.PAUSE_REPLAY, Service.PAUSE_RIG) else text  # that time is paused is no remark
 
     def state(self) -> dict[str, Any]:
         """Return the present state; see `console.client.Graph`."""
@@ -212,19 +199,24 @@ class ConsoleGraph:
         The nodes of this package stay, but for those of other rigs, which are left out; of all others the latest are
         kept, for a while.
         """
-        space = self.node.get_namespace().strip("/")
+        space, now = self.node.get_namespace().strip("/"), time.time_ns()
         for report, arrived in self._reports.read():
             for status in report.status[:MAX_NODES]:
                 name = _name_within(space, shortened(status.name.split(":")[0]))
                 if name:
                     self._diagnostics[name] = (page.node_state(status), arrived)
-        others = sorted(self._diagnostics.keys() - set(ALL_NODES), key=lambda name: self._diagnostics[name][1])
-        oldest = time.time_ns() - round(DROP_TIMEOUT * 1e9)
-        too_many = len(others) + len(ALL_NODES) - MAX_NODES
+        others = sorted(
+            self._diagnostics.keys() - set(interface.ALL_NODES), key=lambda name: self._diagnostics[name][1]
+        )
         for number, name in enumerate(others):
-            if number < too_many or self._diagnostics[name][1] < oldest:
+            too_many = number < len(others) + len(interface.ALL_NODES) - MAX_NODES
+            if too_many or now - self._diagnostics[name][1] > DROP_TIMEOUT * 1e9:
                 del self._diagnostics[name]
-        return dict(self._aged_nodes())
+        found: dict[str, dict[str, Any]] = {}
+        for name, (status, arrived) in sorted(self._diagnostics.items()):
+            age = max(0.0, (now - arrived) * 1e-9)
+            found[name] = {**status, "level": "silent" if age > 3.0 else status["level"], "age": age}
+        return found
 
     def is_active(self, name: str) -> bool:
         """Return whether a node publishes diagnostics now."""
@@ -248,7 +240,7 @@ class ConsoleGraph:
     def _open(self, settings: ConsoleSettings, scene: dict[str, Any] | None) -> None:
         self.settings, self._scene = settings, scene
         self._latest = {
-            name: Latest(self.node, topic, read, period, max_bytes=MAX_SHOWN_BYTES)
+            name: Latest(self.node, topic, read, period, max_bytes=1 << 18)
             for name, (topic, read, period, _) in READERS.items()
         }
         self._reports = Inbox(self.node, topics.DIAGNOSTICS, 50)
@@ -257,11 +249,6 @@ class ConsoleGraph:
         image, read = (topics.IMAGE, _encoded) if raw else (topics.COMPRESSED_IMAGE, _compressed)
         self._camera = Latest(self.node, image, read)
 
-    def _aged_nodes(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        for name, (status, arrived) in sorted(self._diagnostics.items()):
-            age = max(0.0, time.time() - arrived * 1e-9)
-            yield name, {**status, "level": "silent" if age > NODE_TIMEOUT else status["level"], "age": age}
-
 
 def _name_within(space: str, name: str) -> str:
     """Return a node's name without the namespace of the graph, empty for a node of a rig in another namespace.
@@ -269,7 +256,7 @@ def _name_within(space: str, name: str) -> str:
     /diagnostics is one topic for all rigs of a ROS domain.
     """
     inside = name.removeprefix(f"{space}/") if space else name
-    is_ours = inside.rpartition("/")[2] in (*ALL_NODES, NAME)
+    is_ours = inside.rpartition("/")[2] in (*interface.ALL_NODES, NAME)
     is_elsewhere = "/" in inside or (bool(space) and inside == name)
     return "" if is_ours and is_elsewhere else inside
 
@@ -337,13 +324,16 @@ class GraphHost:
 
     def _pause_service(self) -> str:
         """Return the service that pauses time; empty if there is none."""
-        return next((name for name in (PAUSE_REPLAY, PAUSE_RIG) if self.graph.services.ready(name)), "")
+        return next(
+            (name for name in (Service.PAUSE_REPLAY, Service.PAUSE_RIG) if self.graph.services.ready(name)),
+            "",
+        )
 
 
-async def _serve(node: Node, settings: ConsoleSettings) -> None:
+async def _serve(node: GuardedNode, settings: ConsoleSettings) -> None:
     """Serve the page until the process is asked to end; answer the node's services and publish its health."""
-    graph, health = ConsoleGraph(node, settings), Health(node)
-    health.ok(f"serving on {settings.address}")
+    graph = ConsoleGraph(node, settings)
+    node.health.ok(f"serving on {settings.address}")
     due = time.monotonic()
 
     async def watch() -> None:
@@ -352,7 +342,7 @@ async def _serve(node: Node, settings: ConsoleSettings) -> None:
         if time.monotonic() >= due:
             due = time.monotonic() + PERIOD
             graph.now()  # sets the clock for the stamp
-            health.publish()
+            node.health.publish()
 
     def report(url: str) -> None:
         print(f"the operator's page: {url}", flush=True)

@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3
-from magnetosuture_msgs.msg import (
-    CoilBridgeState,
-    EstimatedThread,
-    FilterState,
-    PredictedThread,
-    ProcedureState,
-    SafetyMargins,
-    ThreadDisturbance,
-    ThreadForecast,
-    TrackerState,
-)
-from magnetosuture_msgs.msg import Scene as SceneMessage
+from magnetosuture_msgs import msg
 from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.markers import forecast_events
-from magnetosuture_thread.messages.reading import margins_of, needle_pose
+from magnetosuture_thread.messages.reading import constant_name, margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.thread.margins import node_clearance
@@ -45,14 +33,13 @@ def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
     return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading)}
 
 
-def tracker(message: TrackerState) -> dict[str, Any]:
+def tracker(message: msg.TrackerState) -> dict[str, Any]:
     """Return the tracker's state, and the dish's place in the image if known."""
-    view = None
-    if len(message.dish_centre) == 2 and message.metres_per_pixel > 0.0:
-        scale, rotation = message.metres_per_pixel, message.camera_rotation
-        view = {"centre": list(message.dish_centre), "scale": scale, "rotation": rotation}
+    view, scale = None, message.metres_per_pixel
+    if len(message.dish_centre) == 2 and scale > 0.0:
+        view = {"centre": list(message.dish_centre), "scale": scale, "rotation": message.camera_rotation}
     return {
-        "state": _constant(message, message.state, "STATE_"),
+        "state": constant_name(message, message.state, "STATE_", "searching"),
         **_plain(message, "reason", "confidence"),
         "view": view,
     }
@@ -63,7 +50,7 @@ def measured_thread(message: Path) -> list[list[float]]:
     return _points(placed.pose.position for placed in message.poses)
 
 
-def predicted(message: PredictedThread) -> dict[str, Any]:
+def predicted(message: msg.PredictedThread) -> dict[str, Any]:
     """Return the predicted vertices [m], how they were found, and the forces [N]: tensions, pull on the needle.
 
     Raises:
@@ -75,14 +62,14 @@ def predicted(message: PredictedThread) -> dict[str, Any]:
         raise InvalidInputError("thread/predicted", found, "a tension for each segment, or none")
     return {
         "tension": tension,
-        "needle_force": _plain(message, "needle_force")["needle_force"] if tension else None,
+        "needle_force": [message.needle_force.x, message.needle_force.y] if tension else None,
         "vertices": _points(message.positions),
         **_plain(message, "residual", "step_time"),
         "status": shortened(message.solver_status),
     }
 
 
-def estimated(message: EstimatedThread) -> dict[str, Any]:
+def estimated(message: msg.EstimatedThread) -> dict[str, Any]:
     """Return the estimated vertices with their deviations [m], how they were found, and the forces that were found.
 
     Raises:
@@ -99,13 +86,14 @@ def estimated(message: EstimatedThread) -> dict[str, Any]:
     }
 
 
-def _disturbance(message: ThreadDisturbance) -> dict[str, Any]:
-    place, way = message.position, message.direction
+def _disturbance(message: msg.ThreadDisturbance) -> dict[str, Any]:
+    way = message.direction
     text = disturbance_text(message.arc_length, message.force, (way.x, way.y))
-    return {"position": [place.x, place.y], "direction": [way.x, way.y], "force": message.force, "text": text}
+    position = [message.position.x, message.position.y]
+    return {"position": position, "direction": [way.x, way.y], "force": message.force, "text": text}
 
 
-def forecast(message: ThreadForecast) -> dict[str, Any]:
+def forecast(message: msg.ThreadForecast) -> dict[str, Any]:
     """Return where the thread will be at some instants, the last that of the horizon, and what happens when.
 
     Raises:
@@ -126,26 +114,26 @@ def forecast(message: ThreadForecast) -> dict[str, Any]:
     return {"horizon": message.horizon, "ghosts": ghosts, "events": events, "problem": shortened(message.problem)}
 
 
-def margins(message: SafetyMargins) -> dict[str, Any]:
+def margins(message: msg.SafetyMargins) -> dict[str, Any]:
     """Return the margins by node and by kind, as distances [m]; no number of a message that is not valid."""
     bounds = [each.clearance_bound for each in message.minimum if np.isfinite(each.clearance_bound)]
     return {
         "valid": message.valid,
-        "of": _constant(message, message.source, "OF_", "nothing"),
+        "of": constant_name(message, message.source, "OF_", "nothing"),
         "reason": shortened(message.reason),
         "clearance": clearances(message) if message.valid else [],
         "least": {shortened(each.barrier): each.clearance for each in message.minimum[:MAX_LISTED]},
         "bound": min(bounds, default=None),
         "contact": list(message.contact_nodes),
         "friction": {
-            "state": _constant(message, message.friction_state, "FRICTION_"),
+            "state": constant_name(message, message.friction_state, "FRICTION_"),
             "nodes": list(message.friction_nodes),
             "slowdown": message.slowdown,
         },
     }
 
 
-def clearances(message: SafetyMargins) -> list[float | None]:
+def clearances(message: msg.SafetyMargins) -> list[float | None]:
     """Return each node's minimum clearance of the wall and any shape [m]; None where none is near.
 
     Raises:
@@ -157,7 +145,7 @@ def clearances(message: SafetyMargins) -> list[float | None]:
     return [value if value < np.inf else None for value in node_clearance(margins_of(message), count).tolist()]
 
 
-def scene(message: SceneMessage) -> dict[str, Any]:
+def scene(message: msg.Scene) -> dict[str, Any]:
     """Return the scene of a message as the page draws it.
 
     Raises:
@@ -181,32 +169,30 @@ def _shown_shape(shape: SceneShape, tolerance: float) -> dict[str, Any]:
     shown: dict[str, Any] = {"name": shape.name, "kind": shape.kind, "label": list(shape.label_point)}
     if isinstance(shape.geometry, Disc):
         return {**shown, "disc": [*shape.geometry.centre, shape.geometry.radius]}
-    outline, *holes = [
-        [[round(x, 7), round(y, 7)] for x, y in ring]  # 30 times a second, for every page: no digit too many
-        for ring in shape.outlines(tolerance)
-    ]
+    # 30 times a second, for every page: no digit too many.
+    outline, *holes = [np.round(ring, 7).tolist() for ring in shape.outlines(tolerance)]
     return {**shown, "outline": outline, "holes": holes}
 
 
-def filter_state(message: FilterState) -> dict[str, Any]:
+def filter_state(message: msg.FilterState) -> dict[str, Any]:
     """Return what the bridge made of the last velocity command [m/s]."""
     velocities = ("commanded", "filtered", "applied")
     return _plain(message, "source", *velocities, "slowdown", "active", "overridden", "reason")
 
 
-def bridge(message: CoilBridgeState) -> dict[str, Any]:
+def bridge(message: msg.CoilBridgeState) -> dict[str, Any]:
     """Return what the coil bridge does and why: velocities [m/s], currents [A]."""
     shown = (
         *("armed", "emergency_stopped", "reasons", "commanded", "filtered", "applied", "saturated", "driver"),
         *("driver_ready", "driver_warnings", "current", "measured_current", "refused"),
     )
-    return {"state": _constant(message, message.state, "STATE_", "fault"), **_plain(message, *shown)}
+    return {"state": constant_name(message, message.state, "STATE_", "fault"), **_plain(message, *shown)}
 
 
-def procedure(message: ProcedureState) -> dict[str, Any]:
+def procedure(message: msg.ProcedureState) -> dict[str, Any]:
     """Return what the needle planner does."""
     return {
-        "state": _constant(message, message.state, "STATE_", "failed"),
+        "state": constant_name(message, message.state, "STATE_", "failed"),
         "name": shortened(message.procedure),
         **_plain(message, "goals", "goal", "goals_met", "progress", "resumes", "hold_to_run"),
         "reason": shortened(message.reason, 400),
@@ -228,18 +214,6 @@ def node_state(status: DiagnosticStatus) -> dict[str, Any]:
         "message": shortened(status.message),
         "values": {shortened(value.key): shortened(value.value) for value in status.values[:MAX_LISTED]},
     }
-
-
-def _constant(message: Any, value: int, prefix: str, other: str = "") -> str:
-    """Return the name of a message's constant in lower case; of an unknown value `other`, or that of 0."""
-    kind: Any = type(message)
-    names = _names(kind, prefix)
-    return names.get(value, other or names[0])
-
-
-@cache
-def _names(kind: Any, prefix: str) -> dict[int, str]:
-    return {getattr(kind, name): name.removeprefix(prefix).lower() for name in dir(kind) if name.startswith(prefix)}
 
 
 def _plain(message: Any, *names: str) -> dict[str, Any]:

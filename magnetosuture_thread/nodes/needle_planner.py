@@ -15,30 +15,18 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from magnetosuture_msgs.action import ExecuteProcedure
 from magnetosuture_msgs.msg import CoilBridgeState, EstimatedThread, PredictedThread, SafetyMargins, TrackerState
 from magnetosuture_msgs.msg import ProcedureState as StateMessage
-from magnetosuture_msgs.srv import PlanProcedure
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import Header
-from std_srvs.srv import Trigger
 
-from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import (
-    ABORT_PROCEDURE,
-    DISH_FRAME,
-    EXECUTE_PROCEDURE,
-    PAUSE_PROCEDURE,
-    PLAN_PROCEDURE,
-    PLANNER,
-    RESUME_PROCEDURE,
-)
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PackageNode, reason_of
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
@@ -51,10 +39,9 @@ from magnetosuture_thread.planning.session import (
 from magnetosuture_thread.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
-IDLE_PERIOD = 0.2  # s between two messages of a thread that are read while nothing is executed: to read them costs most
 
 
-class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
+class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
     """Commands the needle along planned paths, at every pose; without poses the coil bridge times out.
 
     A thread of its own plans, for up to some seconds, while the needle is kept in place. The operator is above it:
@@ -63,9 +50,8 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(PLANNER, NeedlePlannerSettings, **options)
+        super().__init__(interface.PLANNER, NeedlePlannerSettings, **options)
         self._planning = ThreadPoolExecutor(1)
-        self._offers = False  # whether the action is there
         self._moving = False  # whether the last command was not zero
         self._scene = SceneFollower(self, self.on_scene)
         self.start()
@@ -82,20 +68,22 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         self._published: tuple[Any, ...] = ()
         self._published_at = -math.inf
         self._read_due: dict[str, float] = {}  # when the next message of a thread is read while nothing is executed [s]
-        self.held(topics.TRACKER_STATE.subscribe(self, self.while_active(self.on_tracker)))
+        self.held(topics.BRIDGE_STATE.subscribe(self, self.on_bridge))
+        for topic, handle in (
+            (topics.TRACKER_STATE, self.on_tracker),
+            (topics.PROCEDURE_HOLD, self.on_hold),
+            (topics.NEEDLE_POSE, self.on_pose),
+            (topics.OPERATOR_COMMAND, self.on_operator),
+        ):
+            self.held(topic.subscribe(self, self.while_active(handle)))
         self._read_sparingly(topics.PREDICTED_THREAD, self.on_prediction)
         self._read_sparingly(topics.ESTIMATED_THREAD, self.on_estimate)
         self._read_sparingly(topics.MARGINS, self.on_margins)
-        self.held(topics.PROCEDURE_HOLD.subscribe(self, self.while_active(self.on_hold)))
-        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
-        self.held(topics.BRIDGE_STATE.subscribe(self, self.on_bridge))
-        self.held(topics.OPERATOR_COMMAND.subscribe(self, self.while_active(self.on_operator)))
-        self.held(self.create_service(PlanProcedure, PLAN_PROCEDURE, self.on_plan))
-        self._offer(PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person"))
-        self._offer(RESUME_PROCEDURE, self.resume_procedure)
-        self._offer(ABORT_PROCEDURE, lambda: self._session.abort("given up by a person"))
-        self._action = ProcedureAction(self, self.execute, self.abort)
-        self._offers = True
+        self.held(self.serve(Service.PLAN_PROCEDURE, self.on_plan))
+        self._offer(Service.PAUSE_PROCEDURE, lambda: self._session.pause("paused by a person"))
+        self._offer(Service.RESUME_PROCEDURE, self.resume_procedure)
+        self._offer(Service.ABORT_PROCEDURE, lambda: self._session.abort("given up by a person"))
+        self._action = self.held(ProcedureAction(self, self.execute, self.abort))
         # Where simulated time stands still, a goal can be cancelled all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.held(self.create_timer(PERIOD, self.while_active(self.on_timer), clock=steady))
@@ -109,13 +97,6 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         """Give the procedure up, the needle at rest."""
         if self.is_active:
             self.abort(f"the needle planner {'has ended' if self.is_shutting_down else 'was deactivated'}")
-
-    def release(self) -> None:
-        """Offer nothing any more."""
-        if self._offers:
-            self._action.destroy()
-        self._offers = False
-        super().release()
 
     def execute(self, request: Any) -> None:
         """Plan and begin a procedure; raise a `MagnetosutureError` where that cannot be."""
@@ -232,18 +213,18 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         super().destroy_node()
 
     def _read_sparingly(self, topic: topics.Topic, handle: Callable[[Any], None]) -> None:
-        """Read every message of a topic while a procedure is executed, and few while none is."""
+        """Read every message of a topic while a procedure is executed, and few while none is, as that costs most."""
 
         def take(data: bytes) -> None:
             now = time.monotonic()
             if now >= self._read_due.get(topic.name, 0.0) or self._session.is_active:
-                self._read_due[topic.name] = now + IDLE_PERIOD
+                self._read_due[topic.name] = now + 0.2
                 topic.decoded(self, data, handle)
 
         self.held(topic.subscribe(self, self.while_active(take), raw=True))
 
-    def _offer(self, name: str, execute: Callable[[], bool]) -> None:
-        self.held(self.create_service(Trigger, name, partial(self._serve, execute)))
+    def _offer(self, service: Service, execute: Callable[[], bool]) -> None:
+        self.held(self.serve(service, partial(self._serve, execute)))
 
     def _serve(self, execute: Callable[[], bool], request: Any, answer: Any) -> Any:
         self.require_active()
@@ -289,16 +270,14 @@ class NeedlePlannerNode(StandbyNode[NeedlePlannerSettings]):
         self._action.finish()
 
     def _report(self, status: ProcedureStatus) -> None:
-        health, name = self.health, shortened(status.procedure)
-        values = {"procedure": name, "goals met": f"{status.goals_met} of {len(status.goals)}"}
-        if status.state is None:
-            health.ok("no procedure", **values)
-        elif status.state is ProcedureState.RUNNING:
-            health.ok(f"{name}: {status.goals[status.goal]}, goal {status.goal + 1} of {len(status.goals)}", **values)
-        elif status.state in (ProcedureState.PAUSED, ProcedureState.FAILED):
-            health.warn(f"{name}: {status.state.value}: {status.reason}", **values)
-        else:
-            health.ok(f"{name}: {status.state.value}", **values)
+        name, state, text, level = shortened(status.procedure), status.state, "no procedure", self.health.ok
+        if state is ProcedureState.RUNNING:
+            text = f"{name}: {status.goals[status.goal]}, goal {status.goal + 1} of {len(status.goals)}"
+        elif state in (ProcedureState.PAUSED, ProcedureState.FAILED):
+            level, text = self.health.warn, f"{name}: {state.value}: {status.reason}"
+        elif state is not None:
+            text = f"{name}: {state.value}"
+        level(text, procedure=name, **{"goals met": f"{status.goals_met} of {len(status.goals)}"})
 
     def _rest(self) -> None:
         """Stop the needle now, and not when its last command times out."""
@@ -330,7 +309,7 @@ def _vertices(message: Any) -> Points | None:
 def state_message(stamp: Any, status: ProcedureStatus) -> StateMessage:
     """Return the state of a procedure as a message."""
     return StateMessage(
-        header=Header(stamp=stamp, frame_id=DISH_FRAME),
+        header=Header(stamp=stamp, frame_id=interface.DISH_FRAME),
         state=getattr(StateMessage, f"STATE_{'IDLE' if status.state is None else status.state.name}"),
         procedure=shortened(status.procedure),
         goals=list(status.goals),
@@ -365,7 +344,7 @@ class ProcedureAction:
         abort: gives the procedure up, for a reason.
     """
 
-    def __init__(self, node: PackageNode, begin: Callable[[Any], None], abort: Callable[[str], object]) -> None:
+    def __init__(self, node: GuardedNode, begin: Callable[[Any], None], abort: Callable[[str], object]) -> None:
         self._node, self._begin, self._abort = node, begin, abort
         self._goal: Any = None
         self._cancelled = False
@@ -373,7 +352,7 @@ class ProcedureAction:
         self._server = _DeferredServer(
             node,
             ExecuteProcedure,
-            EXECUTE_PROCEDURE,
+            interface.EXECUTE_PROCEDURE,
             lambda goal: ExecuteProcedure.Result(),
             goal_callback=lambda request: GoalResponse.ACCEPT,
             handle_accepted_callback=self.on_goal,

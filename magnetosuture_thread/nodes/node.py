@@ -1,29 +1,46 @@
-"""The base of every node of this package: its status, and that no request, message or time from outside ends it."""
+"""The base of every node of this package: its status, its lifecycle, the scene that it goes by.
+
+No request, message or time from outside ends a node. A lifecycle node checks its parameters when it is configured, and
+they stay until it is cleaned up. Those that it can change while it runs are checked together with all that stay, by the
+configuration class, and are in force once all of the node's callbacks have agreed.
+"""
 
 from __future__ import annotations
 
+import gc
 import threading
-from collections.abc import Callable, Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import Any, ClassVar
-from weakref import WeakMethod
+from typing import Any, ClassVar, Generic, TypeVar
+from weakref import ref
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.clock import Clock, ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.service import Service
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
 from magnetosuture_thread.compiled import compilations
+from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, to_mapping
+from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.messages import reading
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.nodes.parameters import as_declared, declare, given_parameters, plain_value
 from magnetosuture_thread.texts import shortened
+
+C = TypeVar("C", bound=Configuration)
+E = TypeVar("E")  # a publisher, subscription, service or timer, or another part of a node with a method `destroy`
 
 PERIOD = 1.0  # s between two reports of a node
 # Keys of the coil bridge's report, which its clients read.
@@ -32,6 +49,8 @@ JITTER_KEYS = tuple(f"loop jitter, {name} [ms]" for name in ("median", "99th per
 COMPILING = "compiling"  # how the state of a node begins that does
 MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
+SUCCESS = TransitionCallbackReturn.SUCCESS
+INACTIVE = "inactive: messages are not used until the node is activated"
 
 
 class Health:
@@ -61,7 +80,7 @@ class Health:
         self._values: dict[str, object] = {}
         self._sent = -1.0
         node.create_timer(PERIOD, self.publish, clock=self._clock)
-        self._late = node.create_timer(self.quiet, self._publish_late, clock=self._clock)
+        self._late = node.create_timer(self.quiet, self.publish, clock=self._clock)
         self._late.cancel()
 
     def ok(self, text: str, **values: object) -> None:
@@ -91,9 +110,9 @@ class Health:
         self._refused += 1
         self._last_refusal = shortened(str(problem), MAX_REASON_CHARS)
         if self._level == DiagnosticStatus.ERROR:
-            self._values.update(values)
+            self.note(**values)
         else:
-            self._set(DiagnosticStatus.WARN, f"refused: {self._last_refusal}", values)
+            self.warn(f"refused: {self._last_refusal}", **values)
 
     @contextmanager
     def load(self, what: str) -> Iterator[None]:
@@ -121,6 +140,7 @@ class Health:
 
     def publish(self) -> None:
         """Publish the state now."""
+        self._late.cancel()
         values = {**self._values, "refused": self._refused, "last refusal": self._last_refusal or "none"}
         status = DiagnosticStatus(
             level=DiagnosticStatus.WARN if self._standby else self._level,
@@ -148,10 +168,6 @@ class Health:
         elif self._late.is_canceled():
             self._late.reset()
 
-    def _publish_late(self) -> None:
-        self._late.cancel()
-        self.publish()
-
 
 def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
     """Return message and values of a status, of anybody, with texts of bounded length."""
@@ -160,7 +176,7 @@ def read_status(status: DiagnosticStatus) -> tuple[str, dict[str, str]]:
 
 
 class GuardedNode(Node):
-    """A node of rclpy that answers a failed request by an error, and ignores an impossible time.
+    """A node that reports on /diagnostics, answers a failed request by an error, and ignores an impossible time.
 
     What a service callback raises, those of rclpy for parameters, lifecycle and types included, would come out of
     `spin` and end the node; so would a time on /clock that rclpy cannot represent.
@@ -170,8 +186,13 @@ class GuardedNode(Node):
         super().__init__(name, **options)
         for service in self.services:  # rclpy makes some by another way
             self._guard(service)
-        # Where a constructor fails, nothing may keep the node: it would stay in the graph.
-        self.add_on_set_parameters_callback(_weakly(self._check_parameters))
+        node = ref(self)  # where a constructor fails, nothing may keep the node: it would stay in the graph
+        self.add_on_set_parameters_callback(lambda parameters: _check_parameters(node(), parameters))
+
+    @cached_property
+    def health(self) -> Health:
+        """Status of the node, published from its first use on."""
+        return Health(self)
 
     @property
     def clock_is_fixed(self) -> bool:
@@ -188,10 +209,14 @@ class GuardedNode(Node):
 
     def refuse(self, problem: Exception) -> None:
         """Report a message that was refused."""
-        self.get_logger().warning(f"refused: {problem}", throttle_duration_sec=PERIOD)
+        self.health.refuse(problem)
 
     def finish(self) -> None:
         """Publish what others must know before the node ends in order; the graph is still there."""
+
+    def serve(self, service: interface.Service, callback: Callable[[Any, Any], Any]) -> Service:
+        """Offer a service."""
+        return self.create_service(topics.ros_class(service.type_name), service, callback)
 
     def create_service(self, *arguments: Any, **options: Any) -> Service:
         """Create a service whose callback may raise."""
@@ -202,14 +227,15 @@ class GuardedNode(Node):
     ) -> Subscription:
         """Subscribe; of /clock, to which rclpy subscribes by itself, only a possible time is passed on."""
         if msg_type is ClockMessage and not options.get("raw"):
-            options["raw"], received, refuse = True, callback, _weakly(self.refuse)
+            found: Callable[[], Any] = ref(self)
+            options["raw"], received = True, callback
 
             def callback(data: bytes) -> None:
                 try:
                     message = topics.CLOCK.decode(data)
                     reading.clock_nanoseconds(message)
                 except InvalidInputError as error:
-                    refuse(error)
+                    found().refuse(error)
                 else:
                     received(message)
 
@@ -220,41 +246,16 @@ class GuardedNode(Node):
             service.callback = _GuardedCallback(service, self.get_logger())
         return service
 
-    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if not parameter.name:  # which rclpy would declare
-                return SetParametersResult(successful=False, reason="a parameter without a name")
-            if parameter.name == "use_sim_time" and self.clock_is_fixed:
-                now = self.get_parameter("use_sim_time").value
-                if parameter.value is not now:
-                    error = ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now")
-                    return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
 
-
-class PackageNode(GuardedNode):
-    """A guarded node that reports on /diagnostics."""
-
-    @cached_property
-    def health(self) -> Health:
-        """Status of the node, published from its first use on."""
-        return Health(self)
-
-    def refuse(self, problem: Exception) -> None:
-        """Report a message that was refused."""
-        self.health.refuse(problem)
-
-
-def _weakly(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a function that calls a method but does not keep its object."""
-    found = WeakMethod(method)
-
-    def call(argument: Any) -> Any:
-        bound = found()
-        assert bound is not None  # who calls is part of the object
-        return bound(argument)
-
-    return call
+def _check_parameters(node: Any, parameters: list[Parameter]) -> SetParametersResult:
+    """Refuse a parameter without a name, which rclpy would declare, and another clock for a node that keeps its own."""
+    reason, now = "", node.get_parameter("use_sim_time").value
+    for parameter in parameters:
+        if not parameter.name:
+            reason = "a parameter without a name"
+        elif parameter.name == "use_sim_time" and node.clock_is_fixed and parameter.value is not now:
+            reason = str(ConfigurationError("use_sim_time", parameter.value, f"{now}, as the node has now"))
+    return SetParametersResult(successful=not reason, reason=reason)
 
 
 class _GuardedCallback:
@@ -318,3 +319,368 @@ def _refused(response: Any, reason: str, request: Any) -> Any:
         if name in fields and (name not in ("result", "results") or "SetParametersResult" in kind):
             setattr(response, name, fields[name])
     return response
+
+
+class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
+    """A lifecycle node with the states of ROS 2: unconfigured, inactive, active, finalized.
+
+    It uses messages, answers requests and commands only while it is active: see `while_active` and `require_active`.
+    What others wait for, as its publishers, enters the graph when it is configured, with everything loaded, and leaves
+    when it is cleaned up: see `held`.
+
+    Args:
+        name: of the node.
+        settings: its configuration class.
+        fixed: parameters that stay while the node is configured, and why; all if None.
+        options: for rclpy's node.
+
+    Attributes:
+        stands_by: whether its state on /diagnostics is that of its lifecycle while it is not active.
+        is_active: whether it is active.
+        settings: as the node was configured with them; None while unconfigured.
+        problem: why the last transition failed.
+
+    Raises:
+        ConfigurationError: a parameter is invalid, or a parameter file cannot be used.
+    """
+
+    stands_by: ClassVar[bool] = True
+
+    def __init__(self, name: str, settings: type[C], *, fixed: Mapping[str, str] | None = None, **options: Any) -> None:
+        self.settings: C | None = None
+        self.is_active = False
+        self.problem: Exception | None = None
+        self._held: list[Any] = []
+        self._agreed: tuple[C, Callable[[], None]] | None = None
+        self._starts = False
+        super().__init__(name, **options)
+        self._class = settings
+        every = dict.fromkeys((each.name for each in configuration_fields(settings)), "")
+        self._fixed = every if fixed is None else fixed
+        try:
+            declare(self, settings, given_parameters(self, name, options), read_only=False, fixed=self._fixed)
+        except ConfigurationError:
+            self._leave()
+            raise
+        self.add_pre_set_parameters_callback(lambda parameters: as_declared(settings, parameters))
+        self.add_on_set_parameters_callback(self._check_change)
+        self.add_post_set_parameters_callback(self._put_in_force)
+
+    @abstractmethod
+    def allocate(self, settings: C) -> None:
+        """Allocate what the settings require; raise `MagnetosutureError` if that is impossible."""
+
+    def activate(self) -> None:
+        """Become active; raise `MagnetosutureError` where that cannot be."""
+
+    def deactivate(self) -> None:
+        """Become inactive; must not fail."""
+
+    def release(self) -> None:
+        """Give back what `allocate` took and is not held, also if that did not get to its end; must not fail."""
+
+    def prepare(self, settings: C) -> Callable[[], None]:
+        """Return what puts other settings in force, which must not fail; raise `MagnetosutureError` if they cannot be.
+
+        Only called where some parameters are not fixed.
+        """
+        raise NotImplementedError
+
+    @property
+    def configured_settings(self) -> C:
+        """The settings of a node that is configured."""
+        assert self.settings is not None
+        return self.settings
+
+    @property
+    def stage(self) -> str:
+        """The state's name in ROS."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_shutting_down(self) -> bool:
+        """Whether the node is being finalized, and not only made inactive."""
+        return self.stage == "shuttingdown"
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the node is finalized."""
+        return self.stage == "finalized"
+
+    @property
+    def clock_is_fixed(self) -> bool:
+        """Whether the node keeps the clock that it has: while it is configured."""
+        return self.settings is not None
+
+    def may_start(self) -> bool:
+        """Return whether the node may become active by itself at its start."""
+        return True
+
+    def held(self, entity: E) -> E:
+        """Return an entity of this node, after noting that it leaves the graph when the node is cleaned up."""
+        self._held.append(entity)
+        return entity
+
+    def give_back(self, entity: Any) -> None:
+        """Take an entity that is held out of the graph."""
+        self._held.remove(entity)
+        kinds = (
+            (Publisher, self.destroy_publisher),
+            (Subscription, self.destroy_subscription),
+            (Service, self.destroy_service),
+            (Timer, self.destroy_timer),
+        )
+        destroy = next((destroy for kind, destroy in kinds if isinstance(entity, kind)), type(entity).destroy)
+        destroy(entity)
+
+    def while_active(self, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback of a subscription or timer that is called only while the node is active."""
+
+        def call(*arguments: Any) -> None:
+            if self.is_active:
+                callback(*arguments)
+
+        return call
+
+    def require_active(self) -> None:
+        """Refuse a request that only an active node can answer.
+
+        Raises:
+            GraphError: the node is not active.
+        """
+        if not self.is_active:
+            raise GraphError(f"{self.get_name()} is {self.stage}; activate it first")
+
+    def require(self, go: Callable[[], TransitionCallbackReturn]) -> None:
+        """Make a transition.
+
+        Raises:
+            MagnetosutureError: it failed; the node stays before it.
+        """
+        self.problem = None
+        if go() is not SUCCESS:
+            raise self.problem or GraphError(f"{self.get_name()}: the transition from {self.stage} failed")
+
+    def start(self) -> None:
+        """Go as far as the parameter `autostart` says: unconfigured, inactive, or else active.
+
+        Raises:
+            MagnetosutureError: a transition failed; the node is destroyed.
+        """
+        until = self.get_parameter("autostart").value
+        self._starts = True
+        try:
+            if until != "unconfigured":
+                self.require(self.trigger_configure)
+                if until != "inactive" and self.may_start():
+                    self.require(self.trigger_activate)
+        except BaseException:  # an interruption too: the driver may be open
+            self.destroy_node()
+            raise
+        finally:
+            self._starts = False
+        if not self.is_active:
+            self._stand_by("unconfigured" if self.settings is None else INACTIVE)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters and allocate what they require."""
+        try:
+            settings = from_mapping(self._class, self._declared())
+            self.allocate(settings)
+            if not self._starts:  # as `run` does when the node has started
+                gc.collect()
+                gc.freeze()
+        except Exception as error:  # rclpy would swallow it, and what was taken would stay
+            self._release_all()
+            self._stand_by(f"unconfigured: {error}")
+            return self._failed(error)
+        self.settings = settings
+        self._stand_by(INACTIVE)
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become active."""
+        self._stand_by("")
+        try:
+            self.activate()
+        except Exception as error:
+            self._stand_by(INACTIVE)
+            return self._failed(error)
+        self.is_active = True
+        return SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Become inactive; where even that fails, give all back."""
+        try:
+            self.deactivate()
+        except Exception as error:
+            self.on_cleanup(state)
+            self._failed(error)
+            return TransitionCallbackReturn.ERROR
+        self.is_active = False
+        self._stand_by(INACTIVE)
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give all back; the parameters can be set again."""
+        self.is_active = False
+        self._release_all()
+        self.settings = None
+        self._stand_by("finalized" if self.is_shutting_down else "unconfigured")
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give all back for good."""
+        try:
+            self.deactivate()
+        except Exception as error:
+            self._failed(error)
+        return self.on_cleanup(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After an unexpected error, release everything; the node can be configured again."""
+        return self.on_shutdown(state)
+
+    def finish(self) -> None:
+        """Shut down by the lifecycle, so that everything is given back while the graph is still there."""
+        if not self.has_ended:
+            self.trigger_shutdown()
+
+    def destroy_node(self) -> None:
+        """Give all back, and leave the graph at once."""
+        try:
+            self._release_all()
+        finally:
+            self._leave()
+
+    def change(self, values: Mapping[str, Any]) -> None:
+        """Set parameters together, as the service does.
+
+        Raises:
+            MagnetosutureError: they are refused; nothing has changed.
+        """
+        if values:
+            if self.settings is None:  # then `_check_change` leaves it to `on_configure`
+                from_mapping(self._class, {**self._declared(), **values})
+            result = self.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+            if not result.successful:
+                raise MagnetosutureError(result.reason)
+
+    def _release_all(self) -> None:
+        self.release()
+        for entity in tuple(self._held):
+            self.give_back(entity)
+
+    def _leave(self) -> None:
+        super().destroy_node()
+        # rclpy forgets it, and it keeps the node in the graph until garbage is collected.
+        self._state_machine.destroy_when_not_in_use()
+
+    def _stand_by(self, text: str) -> None:
+        """Report the state of the lifecycle on /diagnostics; at the start, once the node has got as far as it goes."""
+        if self.stands_by and self.context.ok() and (not self._starts or not text):
+            self.health.stand_by(text)
+
+    def _declared(self) -> dict[str, Any]:
+        """Return the values of the parameters."""
+        names = [each.name for each in configuration_fields(self._class)]
+        return {name: plain_value(self.get_parameter(name)) for name in names}
+
+    def _failed(self, error: Exception) -> TransitionCallbackReturn:
+        self.problem = error
+        if not self._starts:  # at its start the node ends by this error
+            self.get_logger().error(reason_of(error))
+        return TransitionCallbackReturn.FAILURE
+
+    def _check_change(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Refuse to change fixed settings of a configured node, and prepare others; the value in force is no change."""
+        self._agreed = None
+        if self.settings is None:
+            return SetParametersResult(successful=True)
+        in_force = to_mapping(self.settings)
+        asked = {each.name: plain_value(each) for each in parameters if each.name in in_force}
+        asked = {name: value for name, value in asked.items() if value != in_force[name]}
+        try:
+            for name, value in asked.items():
+                where, long = f"{self._class.GROUP}.{name}", isinstance(value, list) and len(value)
+                if name in self._fixed:
+                    shown = value[:10] if long else value  # a million entries take long to write
+                    raise ConfigurationError(where, shown, "its value in force, until the node is cleaned up")
+                if long > MAX_REQUEST_ENTRIES:
+                    expected = f"at most {MAX_REQUEST_ENTRIES} while the node runs"
+                    raise ConfigurationError(where, f"{long} entries", expected)
+            if asked:
+                settings = from_mapping(self._class, {**in_force, **asked})
+                self._agreed = settings, self.prepare(settings)
+        except MagnetosutureError as error:
+            return SetParametersResult(successful=False, reason=_reason(error, asked))
+        return SetParametersResult(successful=True)
+
+    def _put_in_force(self, parameters: Sequence[Parameter]) -> None:
+        if self._agreed is not None:
+            (self.settings, put_in_force), self._agreed = self._agreed, None
+            put_in_force()
+
+
+def _reason(error: MagnetosutureError, asked: Mapping[str, Any]) -> str:
+    """Return why a change was refused, in one line."""
+    named = error.name.partition(".")[2] if isinstance(error, ConfigurationError) else ""
+    together = "" if named in ("", *asked) else "; what belongs together is set at once, by set_parameters_atomically"
+    return shortened(" ".join(str(error).split()), MAX_REASON_CHARS) + together
+
+
+class SceneFollower:
+    """The scene that a node goes by.
+
+    Of a message that is damaged, or whose scene the node cannot use, the reason is reported to the node's health and
+    kept in `problem` until a good one comes; the scene before stays in force.
+
+    Args:
+        node: that subscribes.
+        changed: called with a scene of the topic that is another than the one in force, before it is; raises a
+            `MagnetosutureError`, for example a `ConfigurationError`, where the node cannot use it.
+        scene: in force at first; None if it is not known yet.
+
+    Attributes:
+        scene: in force; None until one is known.
+        problem: why the scene that came last is not in force; empty where it is, or none came.
+    """
+
+    def __init__(self, node: GuardedNode, changed: Callable[[Scene], None], scene: Scene | None = None) -> None:
+        self.scene, self.problem = scene, ""
+        self._heard: Scene | None = None  # the last of the topic, also where it was refused; None if it was damaged
+        self._node, self._changed = node, changed
+        topics.SCENE.subscribe(node, self.on_scene, raw=True)
+
+    @property
+    def version(self) -> str:
+        """Version of the scene in force; empty for none."""
+        return "" if self.scene is None else self.scene.version
+
+    def load(self, name: str) -> Scene | None:
+        """Return the scene for a node that is configured now: the topic's if one has come, else that of a parameter.
+
+        Raises:
+            ConfigurationError: there is no such file, or it holds anything invalid.
+        """
+        if self._heard is None:
+            self.scene = read_scene(name) if name else None
+        else:
+            self.scene, self.problem = self._heard, ""
+            if name:
+                self._node.get_logger().info(f"scene {self.version} of the topic, and not that of the parameter")
+        return self.scene
+
+    def on_scene(self, data: bytes) -> None:
+        """Handle the bytes of a published scene."""
+        self._heard = None
+        try:
+            self._heard = scene = parse_scene_message(topics.SCENE.decode(data))
+            if scene.version != self.version:
+                self._changed(scene)
+        except MagnetosutureError as error:
+            self.problem = f"scene refused: {shortened(str(error))}"
+            self._node.health.refuse(error, **{"scene problem": self.problem})
+        else:
+            self.scene, self.problem = scene, ""
+            self._node.health.note(**{"scene problem": "none"})

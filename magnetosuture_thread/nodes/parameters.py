@@ -83,7 +83,10 @@ def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[
     """
     arguments = list(_flags(options.get("cli_args") or []))  # the node's own override the process's
     if options.get("use_global_arguments", True):
-        arguments = [*_flags(_global_arguments(options.get("context"))), *arguments]
+        context, default = options.get("context"), get_default_context()
+        # Those that the context was initialised with: as `init` saw them, else the process's own.
+        whole = _ARGUMENTS.get(context or default, sys.argv if context in (None, default) else [])
+        arguments = [*_flags(whole), *arguments]
     given: dict[str, Any] = {}
     for flag, value in arguments:
         if flag == "--params-file":
@@ -110,13 +113,6 @@ def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
             is_ros = flag == "--ros-args"
         elif is_ros:
             yield flag, value
-
-
-def _global_arguments(context: Context | None) -> list[str]:
-    """Return the arguments that a context was initialised with: as `init` saw them, else the process's own."""
-    if context is None or context is get_default_context():
-        return _ARGUMENTS.get(get_default_context(), sys.argv)
-    return _ARGUMENTS.get(context, [])
 
 
 def _sections_for(path: Path, kind: str, node: str) -> list[tuple[str, dict[str, Any]]]:
@@ -146,7 +142,7 @@ def declare(
     Shared parameters that the class does not know are meant for others, and left aside.
 
     Args:
-        node: that gets the parameters; those that it has already are declared anew.
+        node: that gets the parameters.
         cls: the configuration class.
         given: values by name.
         read_only: whether they stay as they are for good.
@@ -159,43 +155,36 @@ def declare(
     fields = configuration_fields(cls)
     others = set(SHARED_PARAMETERS) - {about.name for about in fields}
     settings = from_mapping(cls, {name: value for name, value in given.items() if name not in others})
-    values = to_mapping(settings)
-    for about in fields:
-        _declare(node, about, values[about.name], _descriptor(about, read_only, fixed.get(about.name)))
+    for name, value in to_mapping(settings).items():
+        about = next(field for field in fields if field.name == name)
+        descriptor = _descriptor(about, read_only, fixed.get(name))
+        if not isinstance(value, (list, tuple)) or len(value):
+            node.declare_parameter(name, value, descriptor, ignore_override=True)
+        else:  # by its value alone rclpy would take an empty list for one of bytes, for good
+            node.declare_parameter(name, _type(about), ParameterDescriptor(), ignore_override=True)
+            node.set_parameters([Parameter(name, _type(about), [])])
+            node.set_descriptor(name, descriptor)
     return settings
-
-
-def _declare(node: Node, about: ConfigurationField, value: Any, descriptor: ParameterDescriptor) -> None:
-    if node.has_parameter(about.name):
-        node.undeclare_parameter(about.name)
-    if not isinstance(value, (list, tuple)) or len(value):
-        node.declare_parameter(about.name, value, descriptor, ignore_override=True)
-        return
-    # By its value alone rclpy would take an empty list for one of bytes, for good.
-    node.declare_parameter(about.name, _type(about), ParameterDescriptor(), ignore_override=True)
-    node.set_parameters([Parameter(about.name, _type(about), [])])
-    node.set_descriptor(about.name, descriptor)
 
 
 def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
     quantity, constraints = about.quantity, about.quantity.expectation(about.kind)
     if fixed is not None:
         constraints += "; stays while the node is configured" + (f": {fixed}" if fixed else "")
-    descriptor = ParameterDescriptor(
+    low, high = quantity.minimum, quantity.maximum
+    ranges: dict[str, Any] = {}
+    if low is not None and high is not None and about.kind is float:
+        ranges["floating_point_range"] = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    elif low is not None and high is not None and about.kind is int:
+        ranges["integer_range"] = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+    return ParameterDescriptor(
         name=about.name,
         type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=constraints,
         read_only=read_only,
+        **ranges,
     )
-    if quantity.minimum is not None and quantity.maximum is not None:
-        if about.kind is float:
-            bounds = FloatingPointRange(from_value=float(quantity.minimum), to_value=float(quantity.maximum))
-            descriptor.floating_point_range = [bounds]
-        elif about.kind is int:
-            whole = IntegerRange(from_value=int(quantity.minimum), to_value=int(quantity.maximum), step=1)
-            descriptor.integer_range = [whole]
-    return descriptor
 
 
 def _type(about: ConfigurationField) -> Parameter.Type:

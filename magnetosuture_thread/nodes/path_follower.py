@@ -12,13 +12,12 @@ from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import StandbyNode
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
+from magnetosuture_thread.planning.follower import PathFollowerSettings, prepare_paths
 
 
-class PathFollowerNode(StandbyNode[PathFollowerSettings]):
+class PathFollowerNode(ManagedNode[PathFollowerSettings]):
     """Publishes a velocity command for every needle pose; without poses the coil bridge times out.
 
     The path begins when the node has been configured and is first active; activated again, it is continued.
@@ -26,7 +25,6 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("path_follower", PathFollowerSettings, **options)
-        self._follower: PathFollower | None = None
         self._blocked = ""  # reason why the path cannot be followed
         self._scene = SceneFollower(self, self.on_scene)
         self.start()
@@ -51,48 +49,42 @@ class PathFollowerNode(StandbyNode[PathFollowerSettings]):
     def deactivate(self) -> None:
         """Bring the needle to rest at once, and not when the last command times out."""
         if self.is_active:
-            self._commands.publish(packed_twist(self.get_clock().now().to_msg(), np.zeros(2)))
+            self._command(np.zeros(2))
             self._commands.wait_for_all_acked(Duration(seconds=DELIVERY_TIMEOUT))
-            self.destroy_publisher(self._commands)
-            self._held.remove(self._commands)
-
-    def release(self) -> None:
-        """Give the path up."""
-        self._follower = None
-        super().release()
+            self.give_back(self._commands)
 
     def on_scene(self, scene: Scene) -> None:
         """Check the path against a new scene; a blocked path is not followed further."""
         if self.settings is None:
             return
+        self._blocked = ""
         try:
             self.settings.check_path(scene)
         except ConfigurationError as error:
             self._blocked = str(error)
-        else:
-            self._blocked = ""
 
     def on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Publish the velocity command that moves the tip along its path."""
-        assert self._follower is not None  # the node is active
+        settings, subscribers = self.configured_settings, self._commands.get_subscription_count()
         if self._blocked:
             self.health.error(self._blocked)
             return
-        subscribers = self._commands.get_subscription_count()
-        if subscribers < self.configured_settings.audience:
-            some = f"{subscribers} of {self.configured_settings.audience} subscribers to velocity commands"
+        if subscribers < settings.audience:
+            some = f"{subscribers} of {settings.audience} subscribers to velocity commands"
             self.health.warn(some if subscribers else "no subscriber to velocity commands")
             return
         try:
             pose = reading.needle_pose(message)
-            now = self.get_clock().now().nanoseconds * 1e-9
-            reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
+            reading.check_pose_age(pose.stamp, self.get_clock().now().nanoseconds * 1e-9, settings.pose_timeout)
             command = self._follower.compute_command(pose.stamp, pose.tail, pose.heading)
         except InvalidInputError as error:
-            self.health.refuse(error)
+            self.refuse(error)
             return
-        self._commands.publish(packed_twist(self.get_clock().now().to_msg(), command.velocity))
+        self._command(command.velocity)
         if 0.0 < command.progress < 1.0:
             self._setpoints.publish(packed_pose_stamped(message.header.stamp, command.tip, 0.0))
         text = "done" if command.progress >= 1.0 else "following" if command.progress else "settling"
         self.health.ok(text, progress=round(command.progress, 4))
+
+    def _command(self, velocity: np.ndarray) -> None:
+        self._commands.publish(packed_twist(self.get_clock().now().to_msg(), velocity))

@@ -11,21 +11,9 @@ from typing import Any, TypeAlias
 import rclpy.time
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool
 
-from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread import InvalidInputError, interface
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import (
-    CAMERA,
-    CAMERA_INFO,
-    CURRENTS,
-    DIAGNOSTICS,
-    MARGINS,
-    NEEDLE_POSE,
-    PAUSE_REPLAY,
-    PREDICTED_THREAD,
-    SCENE,
-)
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes import topics
@@ -39,9 +27,7 @@ START_TIMEOUT = 180.0  # s for all nodes to be there
 SETTLE = 3.2
 QUIET = 0.5  # s without any answer, once all has been taken and answered: the graph is done
 STUCK = 3.0  # s without any answer where poses are left: the model refuses them, or they got lost
-DRAIN_TIMEOUT = 30.0  # s after the last input at the most
 DEPTH = 300  # messages that may wait for a slow node before any is lost
-ANSWERS = (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS)
 Recorded: TypeAlias = Any  # a recorded message: `topic`, `time` [ns] and `data` (CDR bytes)
 
 
@@ -65,7 +51,7 @@ class Losses:
     @property
     def frames_played(self) -> int:
         """Return the camera frames published."""
-        return sum(self.played[channel.name] for channel in CAMERA.values())
+        return sum(self.played[channel.name] for channel in interface.CAMERA.values())
 
     @property
     def frames_waiting(self) -> bool:
@@ -88,9 +74,9 @@ class Losses:
         if number is not None and number != topics.UNNUMBERED:
             self._numbers[topic] = max(self._numbers.get(topic, 0), number)
             self._taken[topic] += 1
-        if stamp is not None and topic == NEEDLE_POSE.name:
+        if stamp is not None and topic == interface.NEEDLE_POSE.name:
             self._poses.add(stamp)
-        if stamp is not None and topic in (PREDICTED_THREAD.name, MARGINS.name):
+        if stamp is not None and topic in (interface.PREDICTED_THREAD.name, interface.MARGINS.name):
             self._answered.add(stamp)
 
     def count_diagnostics(self, data: bytes) -> None:
@@ -156,7 +142,7 @@ class LiveReplay:
         self.arrived: dict[str, dict[int, float]] = defaultdict(dict)
         self._stack = ExitStack()
         self._node = self._stack.enter_context(joined(name="replay", domain=domain))
-        self._node.create_service(SetBool, PAUSE_REPLAY, self._on_pause)
+        self._node.serve(interface.Service.PAUSE_REPLAY, self._on_pause)
         self._clock = self._node.create_publisher(Clock, "/clock", qos_profile_system_default)
         # A quality of service that waits for slow readers: only the replay has time to.
         reliable: dict[str, Any] = {"depth": DEPTH, "reliability": ReliabilityPolicy.RELIABLE}
@@ -194,7 +180,8 @@ class LiveReplay:
             missing = [
                 name
                 for name, publisher in self._inputs.items()
-                if name not in (CAMERA_INFO.recorded, SCENE.recorded) and not publisher.get_subscription_count()
+                if name not in (interface.CAMERA_INFO.recorded, interface.SCENE.recorded)
+                and not publisher.get_subscription_count()
             ]
             silent = (inbox.topic for inbox in self._outputs if not inbox.has_publisher)
             missing += [topic.name for topic in silent if topic not in topics.ON_REQUEST]
@@ -242,7 +229,7 @@ class LiveReplay:
         self.losses.played[name] += 1
         if stamp is not None:
             self.published[name][stamp] = now
-        if record.topic == SCENE.recorded:
+        if record.topic == interface.SCENE.recorded:
             self._receive(record.topic, record.time, bytes(record.data))
         if record.topic in self._echoed:
             if stamp is not None:
@@ -252,7 +239,7 @@ class LiveReplay:
 
     def _drain(self, clock: int) -> None:
         """Let time go on until the graph has taken and answered all, and no more answers come."""
-        deadline = self._time.running() + DRAIN_TIMEOUT
+        deadline = self._time.running() + 30.0
         self._last_answer = time.perf_counter()
         while self._time.running() < deadline:
             enough = STUCK if self.losses.poses_waiting else QUIET
@@ -289,23 +276,19 @@ class LiveReplay:
                     self._receive(inbox.topic.channel.recorded, self._time.now(), data)
 
     def _count(self, topic: topics.Topic, data: bytes, info: dict[str, Any]) -> None:
-        is_currents = topic.channel is CURRENTS  # which count by the command that they follow, if any
+        is_currents = topic.channel is interface.CURRENTS  # which count by the command that they follow, if any
         stamp = nanoseconds(topic.decode(data).command) or None if is_currents else header_stamp(data)
         if stamp is not None:
             # When it reached this process: how long it waited here for its turn is not the graph's delay.
             self.arrived[topic.channel.name].setdefault(stamp, info["received_timestamp"] * 1e-9)
-        if topic in ANSWERS:
+        if topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD, topics.PREDICTED_THREAD, topics.MARGINS):
             self._last_answer = time.perf_counter()
             self.losses.heard(topic.channel.name, stamp, info["publication_sequence_number"])
-        if topic.channel is DIAGNOSTICS:
+        if topic.channel is interface.DIAGNOSTICS:
             self.losses.count_diagnostics(data)
 
     def _on_pause(self, asked: Any, answer: Any) -> Any:
-        """Let time stand still, or go on."""
-        self._time.pause(asked.data)
-        answer.success = True
-        at = (self._time.now() - self._time.start) * 1e-9
-        answer.message = f"{'paused' if asked.data else 'goes on'} at {at:.2f} s"
+        answer = self._time.on_pause(asked, answer)
         self._log(answer.message)
         return answer
 

@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes.run import raise_priority
@@ -83,15 +82,12 @@ def reserved_domain() -> Iterator[int]:
 
 def is_empty(domain: int) -> bool:
     """Return whether no process on this machine uses a discovery port of a ROS domain."""
-    return all(_is_free(7400 + 250 * domain + 10 + 2 * k) for k in range(120))  # a domain has no more
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
+    for port in range(7400 + 250 * domain + 10, 7400 + 250 * domain + 250, 2):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                return False
     return True
 
 
@@ -117,9 +113,7 @@ class NodeProcesses:
         *,
         prefix: Sequence[str] = (),
     ) -> None:
-        self._names = names
-        self._prefix = prefix
-        self._arguments = arguments
+        self._names, self._prefix, self._arguments = names, prefix, arguments
         # What a node keeps over a restart is of this run: an emergency stop of another one does not hold here.
         self._state = tempfile.TemporaryDirectory(prefix="magnetosuture_state_")
         self._environment = {**environment, "XDG_STATE_HOME": self._state.name}
@@ -137,9 +131,7 @@ class NodeProcesses:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End the nodes, politely first."""
         self.end()
 
@@ -200,9 +192,6 @@ class NodeProcesses:
         self._state.cleanup()
 
 
-_LIBC = ctypes.CDLL(None)
-
-
 def _end_with_parent() -> None:
     """Ask Linux to interrupt this process when its parent dies."""
-    _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
+    ctypes.CDLL(None).prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG

@@ -11,14 +11,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -53,9 +52,7 @@ class Interruption:
                 signal.signal(which, self._keep)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Keep no more; raise for one that came, unless something was raised already.
 
         Raises:
@@ -63,7 +60,7 @@ class Interruption:
         """
         for which, handler in self._before:
             signal.signal(which, handler)
-        if kind is None:
+        if error[0] is None:
             self.check()
 
     def check(self) -> None:
@@ -191,14 +188,9 @@ def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | 
         gc.freeze()
         ending.spin(executor, nodes)
         _finish(nodes)
-    except ExternalShutdownException:
-        _finish(nodes)
     except Exception as error:
-        is_shut_down = not rclpy.ok()
-        if nodes and is_shut_down and isinstance(error, rclpy_implementation.RCLError):
-            return 0  # a callback was still at work when the context was shut down
         # rclpy raises several kinds, some private, for a broken file or parameter.
-        cannot_start = not nodes and (isinstance(error, ValueError) or is_shut_down)
+        cannot_start = not nodes and (isinstance(error, ValueError) or not rclpy.ok())
         if not (cannot_start or isinstance(error, (MagnetosutureError, ParameterException))):
             raise
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -214,8 +206,6 @@ def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | 
 
 def _finish(nodes: tuple[Node, ...]) -> None:
     """Let nodes publish their final messages, and give the middleware the time to deliver them."""
-    if not rclpy.ok():
-        return
     for node in nodes:
         if isinstance(node, GuardedNode):
             node.finish()

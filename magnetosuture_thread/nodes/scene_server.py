@@ -3,65 +3,55 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
-
-from magnetosuture_thread import MagnetosutureError, Scene
-from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE, SCENE_SERVER
+from magnetosuture_thread import MagnetosutureError, Scene, read_scene
+from magnetosuture_thread.interface import SCENE_SERVER, Service
 from magnetosuture_thread.messages.markers import packed_scene_markers
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.scene_follower import initial_scene
+from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.scene.files import SceneEditor, SceneServerSettings
 
 
-class SceneServerNode(StandbyNode[SceneServerSettings]):
+class SceneServerNode(ManagedNode[SceneServerSettings]):
     """Publishes the scene whenever it changes; an invalid change is refused with its reason and changes nothing.
 
-    Configured, it reads the scene of its parameter; activated again, it publishes the scene that is in force.
+    Configured, it reads the scene of its parameter; activated again, it publishes the scene that is in force, with the
+    shapes that were added.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(SCENE_SERVER, SceneServerSettings, **options)
-        self._editor = SceneEditor(None)
         self.start()
 
     def allocate(self, settings: SceneServerSettings) -> None:
         """Read the scene."""
-        self._editor = SceneEditor(initial_scene(settings.scene))
+        self._editor = editor = SceneEditor(read_scene(settings.scene) if settings.scene else None)
         self._scenes = self.held(topics.SCENE.publisher(self))
         self._markers = self.held(topics.SCENE_MARKERS.publisher(self))
-        self._offer(LoadScene, LOAD_SCENE, lambda asked: self._editor.load(asked.file))
-        self._offer(EditShape, ADD_SHAPE, lambda asked: self._editor.add(asked.name, asked.shape))
-        self._offer(EditShape, REPLACE_SHAPE, lambda asked: self._editor.replace(asked.name, asked.shape))
-        self._offer(RemoveShape, REMOVE_SHAPE, lambda asked: self._editor.remove(asked.name))
+        for service, change in (
+            (Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
+            (Service.ADD_SHAPE, lambda asked: editor.add(asked.name, asked.shape)),
+            (Service.REPLACE_SHAPE, lambda asked: editor.replace(asked.name, asked.shape)),
+            (Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
+        ):
+            self.held(self.serve(service, partial(self._change, change)))
 
     def activate(self) -> None:
-        """Publish the scene."""
+        """Publish the scene; inactive, others go on by what they have."""
         if self._editor.scene is None:
-            self.health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {LOAD_SCENE}")
+            self.health.warn(f"no scene yet: the parameter scene is empty, and nobody has called {Service.LOAD_SCENE}")
         else:
             self._publish(self._editor.scene)
 
-    def deactivate(self) -> None:
-        """Publish no more; others go on by what they have."""
-
-    def release(self) -> None:
-        """Forget the scene, and the shapes that were added."""
-        self._editor = SceneEditor(None)
-        super().release()
-
-    def _offer(self, service: Any, name: str, change: Callable[[Any], None]) -> None:
-        self.held(self.create_service(service, name, lambda asked, answer: self._change(answer, lambda: change(asked))))
-
-    def _change(self, answer: Any, change: Callable[[], None]) -> Any:
+    def _change(self, change: Callable[[Any], object], asked: Any, answer: Any) -> Any:
         """Change the scene, and say what became of it."""
         self.require_active()
         before = self._editor.scene
         try:
-            change()
+            change(asked)
         except MagnetosutureError as error:
             answer.success, answer.message = False, str(error)
             self.health.refuse(error)
@@ -70,7 +60,7 @@ class SceneServerNode(StandbyNode[SceneServerSettings]):
         after = self._editor.scene
         if after is not None:
             answer.version = after.version
-            if answer.success and (before is None or before.version != after.version):
+            if before is None or before.version != after.version:
                 self._publish(after)
         return answer
 

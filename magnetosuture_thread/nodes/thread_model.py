@@ -1,27 +1,40 @@
-"""The node `thread_model`: predicts the thread from needle poses, and estimates it by what the camera sees of it."""
+"""The node `thread_model`: predicts the thread from needle poses, estimates it by the camera, and forecasts it."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from queue import SimpleQueue
+from threading import Thread as Worker
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from magnetosuture_msgs.msg import ThreadMaterial
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, NeedlePose, Scene, ThreadEstimate, interface
+from magnetosuture_thread import (
+    Forecast,
+    ForecastStart,
+    InvalidInputError,
+    MagnetosutureError,
+    NeedlePose,
+    Scene,
+    ThreadEstimate,
+    ThreadForecaster,
+    interface,
+)
 from magnetosuture_thread.configuration import to_mapping
+from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
-from magnetosuture_thread.messages.markers import packed_thread_markers
-from magnetosuture_thread.messages.packing import estimate_outputs, prediction_outputs
+from magnetosuture_thread.messages.markers import packed_forecast_markers, packed_thread_markers
+from magnetosuture_thread.messages.packing import estimate_outputs, packed_forecast, prediction_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.node import Health
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
-from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
+from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
+from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 from magnetosuture_thread.thread.prediction import STARTED
 from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
@@ -31,7 +44,7 @@ if TYPE_CHECKING:
     from magnetosuture_thread.vision.tracker import Track
 
 
-class ThreadModelNode(StandbyNode[ThreadModelSettings]):
+class ThreadModelNode(ManagedNode[ThreadModelSettings]):
     """Predicts and estimates the thread at every needle pose.
 
     Activated again, it starts from the next measured thread. Parameters that are not `FIXED` can be changed in any
@@ -67,7 +80,10 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         self._markers = self.held(topics.THREAD_MARKERS.publisher(self))
         self._last_margins = 0  # stamp of those that were published [ns]
         if self._listens:
-            self._subscribe()
+            observation, measured = self.on_observation_message, self.on_measured_thread_message
+            self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
+            self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
+            self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
         where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         thread = f"{settings.segments} segments of {settings.material}"
         self.get_logger().info(f"ready: {thread}, {where}, {settings.formulation} by {settings.solver}")
@@ -88,20 +104,13 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
         if self._forecasts is not None:
             self._forecasts.close()
         self._forecasts = None
-        super().release()
-
-    def listen(self) -> None:
-        """Take needle poses, and what is seen of the thread, by topics from now on."""
-        self._listens = True
-        if self.settings is not None:
-            self._subscribe()
 
     def on_material(self, message: ThreadMaterial) -> None:
         """Set the parameters that a message names."""
         try:
             self.change(parse_material(message))
         except MagnetosutureError as error:
-            self.health.refuse(error)
+            self.refuse(error)
 
     def on_scene(self, scene: Scene) -> None:
         """Change the scene; one that the thread's segments do not resolve raises `ConfigurationError`."""
@@ -119,18 +128,12 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
             self._report_all(self._session.on_observation(reading.nanoseconds(stamp), track.observation))
             self._step(stamp, lambda: reading.tracked_pose(stamp, track.tail, track.heading, track.covariance))
 
-    def _subscribe(self) -> None:
-        observation, measured = self.on_observation_message, self.on_measured_thread_message
-        self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
-        self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
-        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
-
     def _step(self, stamp: Time, pose: Callable[[], NeedlePose]) -> None:
         began = time.perf_counter()
         try:
             read = pose()
         except InvalidInputError as error:
-            self.health.refuse(error)
+            self.refuse(error)
             return
         result = self._session.predict(reading.nanoseconds(stamp), read)
         step_time = time.perf_counter() - began
@@ -141,28 +144,25 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
             self._forecasts.request(result, read)
 
     def on_measured_thread_message(self, data: bytes) -> None:
-        """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags.
-
-        Where the thread is not estimated most are not needed, and to read a path of a hundred poses takes as long as
-        some predictions: so only the stamp is read of those.
-        """
+        """Take a centreline, where no tracker tells whether it is all of the thread, as in older bags."""
         name = self.resolve_topic_name(topics.THREAD_OBSERVATION.name)
         self._observed = self._observed or self.count_publishers(name) > 0
         if not self._observed:
             self._take(data, topics.MEASURED_THREAD, reading.path_points, self._session.on_measured_thread)
 
     def on_observation_message(self, data: bytes) -> None:
-        """Take what the camera sees of the thread; as above, it may not be needed."""
+        """Take what the camera sees of the thread."""
         self._observed = True
         self._take(data, topics.THREAD_OBSERVATION, reading.thread_observation, self._session.on_observation)
 
     def _take(self, data: bytes, topic: topics.Topic, read: Callable[[Any], Any], take: Callable[..., Any]) -> None:
+        """Take a message about the thread; without an estimate most are not needed, and only their stamp is read."""
         stamp = header_stamp(data) or 0
         if self._session.estimates or self._session.needs_measured_thread(stamp):
             try:
                 self._report_all(take(stamp, read(topic.decode(data))))
             except InvalidInputError as error:
-                self.health.refuse(error)
+                self.refuse(error)
 
     def _report_all(self, results: Iterator[PredictionResult]) -> None:
         began = time.perf_counter()
@@ -181,7 +181,7 @@ class ThreadModelNode(StandbyNode[ThreadModelSettings]):
     def _report(self, result: PredictionResult, step_time: float) -> None:
         """Publish estimate and margins of a pose or of a late observation, or why there are none."""
         if result.refused is not None:
-            self.health.refuse(result.refused)
+            self.refuse(result.refused)
             return
         is_newest = result.stamp >= self._last_margins or not result.late
         for channel, data in estimate_outputs(result):
@@ -273,3 +273,160 @@ class ThreadHealth:
         if estimate.problems:
             figures["last_refused_piece"] = estimate.problems[0]
         return figures | {f"learned {each.name}": each for each in estimate.slow_parameters}
+
+
+class ThreadForecasts:
+    """Publishes a forecast of every estimate, where the parameter `forecast_horizon` asks for it.
+
+    It is made in a thread of its own, so that the node does not wait for it. While a forecast is made, only the newest
+    estimate is kept for the next one. A service answers what would happen along a path instead.
+    What is held is the command that the coil bridge follows, of `needle/filter_state`; without one the needle rests.
+
+    Args:
+        node: of the thread model; it reports what cannot be forecast.
+        session: whose settings and scene are used.
+    """
+
+    def __init__(self, node: ManagedNode[ThreadModelSettings], session: ThreadSession) -> None:
+        self._node, self._session = node, session
+        self._last: tuple[PredictionResult, NeedlePose] | None = None
+        self._started = -math.inf  # stamp of the last estimate that is forecast [ns]
+        self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
+        self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
+        self._forecaster()
+        self._generation = 0  # of the forecasts that are still wanted
+        self._published = node.held(topics.FORECAST.publisher(node))
+        self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
+        node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
+        node.held(node.serve(interface.Service.FORECAST_PATH, self.on_path))
+        # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
+        self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
+        self._error: Exception | None = None
+        self._worker = Worker(target=self._work, name="forecasts", daemon=True)
+        self._worker.start()
+
+    def close(self) -> None:
+        """Publish no more; to be called before the publishers are destroyed."""
+        self._waiting.put(None)
+        self._worker.join()
+
+    def reset(self) -> None:
+        """Publish nothing until there is another estimate, nor what is being made."""
+        self._last, self._command = None, None
+        self._generation += 1
+
+    def on_filter_state(self, message: object) -> None:
+        """Remember the command that the bridge follows."""
+        try:
+            self._command = reading.filtered_command(message)
+        except InvalidInputError as error:
+            self._node.refuse(error)
+
+    def request(self, result: PredictionResult, pose: NeedlePose) -> None:
+        """Queue the forecast from an estimate; the worker thread makes and publishes it.
+
+        Args:
+            result: of the pose.
+            pose: of the needle's tail, as tracked.
+
+        Raises:
+            Exception: an unexpected one that ended an earlier forecast, as in any callback.
+        """
+        if self._error is not None:
+            raise self._error
+        if result.estimate is None or not result.estimate.converged:
+            return
+        forecaster, settings = self._forecaster(), self._session.settings
+        self._last = result, pose
+        elapsed = 1e-9 * abs(result.stamp - self._started)  # time may be set back
+        if forecaster is None or elapsed < settings.forecast_period:
+            return
+        self._started = result.stamp
+        commanded, filtered, source = np.zeros(2), None, ""
+        # A command is held for no longer than half a second when none follows.
+        if self._command is not None and abs(result.stamp - self._command[0]) <= 500_000_000:
+            _, commanded, filtered, source = self._command
+        start = ForecastStart.of_estimate(result.estimate, pose, filtered)
+        slowed = source == "operator" or settings.friction_feedback == "all"
+        make = partial(forecaster.forecast, start, commanded, settings.forecast_horizon, slowed=slowed)
+        self._waiting.put((result.stamp, self._generation, make))
+
+    def _work(self) -> None:
+        while self._error is None and (task := self._waiting.get()) is not None:
+            try:
+                if self._waiting.empty():
+                    self._publish(*task)
+            except MagnetosutureError as error:
+                self._node.get_logger().warning(f"no forecast: {error}", throttle_duration_sec=5.0)
+            except Exception as error:
+                self._error = error
+
+    def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
+        forecast = make()
+        if generation == self._generation:
+            self._published.publish(packed_forecast(stamp, forecast))
+            if self._markers.get_subscription_count():
+                self._markers.publish(packed_forecast_markers(stamp, forecast))
+
+    def on_path(self, request: Any, answer: Any) -> Any:
+        """Answer what happens while the needle's tip follows a path, from the last estimate; nothing moves.
+
+        Raises:
+            MagnetosutureError: path, speed or horizon are out of bounds, nothing is estimated yet, or the node is not
+                active.
+        """
+        self._node.require_active()
+        settings = self._session.settings
+        follower = make_path_follower(request, settings)
+        forecaster = self._forecaster()
+        if self._last is None or forecaster is None:
+            raise InvalidInputError("forecast", "no estimate yet", "a thread that is estimated, in a scene")
+        result, pose = self._last
+        assert result.estimate is not None
+
+        def command(time: float, tail: np.ndarray, heading: np.ndarray) -> np.ndarray:
+            return follower.compute_command(time, tail, heading).velocity
+
+        start, slowed = ForecastStart.of_estimate(result.estimate, pose), settings.friction_feedback == "all"
+        forecast = forecaster.forecast(start, command, request.horizon, slowed=slowed)
+        answer.success = True
+        answer.forecast = topics.FORECAST.decode(packed_forecast(result.stamp, forecast))
+        return answer
+
+    def _forecaster(self) -> ThreadForecaster | None:
+        """Return the forecaster of the settings and the scene in force; None without a scene."""
+        settings, scene = self._session.settings, self._session.scene
+        if self._made is None or self._made[0] is not settings or self._made[1] is not scene:
+            self._made, self._last, forecaster = None, None, None
+            if scene is not None:
+                forecaster = make_forecaster(settings, scene)
+                forecaster.warm_up()
+                prepare_paths()
+            self._made = settings, scene, forecaster
+        return self._made[2]
+
+
+def make_path_follower(request: Any, settings: ThreadModelSettings) -> PathFollower:
+    """Return the controller that takes the tip along the path of a request, as the node `path_follower` does.
+
+    Raises:
+        InvalidInputError: path, speed or horizon are out of bounds.
+    """
+    points = np.array([(point.x, point.y) for point in request.path]).reshape(-1, 2)
+    if not 0 < len(points) <= 1000:
+        raise InvalidInputError("path", f"{len(points)} points", "1 to 1000")
+    if not (np.abs(points) <= 0.5).all():
+        raise InvalidInputError("path", "a point that is not finite or far away", "within 0.5 m")
+    if not 1e-5 <= request.speed <= 0.1:
+        raise InvalidInputError("speed", request.speed, "1e-05 to 0.1 m/s")
+    if not 0.0 < request.horizon <= 10.0:  # s; the node does nothing else while it is computed
+        raise InvalidInputError("horizon", request.horizon, "above 0 and at most 10 s")
+    chosen = PathFollowerSettings(
+        waypoints=tuple(points.ravel().tolist()),
+        speed=request.speed,
+        settle=0.0,
+        integral_gain=0.0,  # the forecast knows all drag that there is
+        needle_length=settings.needle_length,
+        needle_curvature=settings.needle_curvature,
+    )
+    return chosen.follower()

@@ -1,6 +1,7 @@
 """The graph's topics in ROS: publishers and subscriptions of the channels in `interface`.
 
-`topics.NEEDLE_POSE` is the topic of `interface.NEEDLE_POSE`, and so for every channel there.
+`topics.NEEDLE_POSE` is the topic of `interface.NEEDLE_POSE`, `topics.INPUTS` those of `interface.INPUTS`, and so for
+every channel and tuple of channels there.
 """
 
 from __future__ import annotations
@@ -40,17 +41,16 @@ MAX_BYTES = {
     "sensor_msgs/msg/CameraInfo": 1 << 16,
     "magnetosuture_msgs/msg/Scene": 1 << 17,  # the largest has 120 kB
     "magnetosuture_msgs/msg/ThreadMaterial": 1 << 18,
-    **{f"magnetosuture_msgs/msg/{name}": 1 << 16 for name in ("TrackerState", "FilterState", "CoilBridgeState")},
-    **{f"magnetosuture_msgs/msg/{name}": 1 << 16 for name in ("ProcedureState", "CoilCurrents")},
+    **{
+        f"magnetosuture_msgs/msg/{name}": 1 << 16
+        for name in ("TrackerState", "FilterState", "CoilBridgeState", "ProcedureState", "CoilCurrents")
+    },
     "diagnostic_msgs": 1 << 16,
     "sensor_msgs": MAX_BLOCK_BYTES,
     "visualization_msgs": 1 << 22,
-    "geometry_msgs": 1 << 12,
-    "std_msgs": 1 << 12,
-    "rosgraph_msgs": 1 << 12,
+    **dict.fromkeys(("geometry_msgs", "std_msgs", "rosgraph_msgs"), 1 << 12),
 }
 UNNUMBERED = 2**64 - 1  # ROS's own word for a message without a number
-MAX_SEQUENCE_GAP = 10_000  # numbers so far apart are of different publishers
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,7 @@ class Topic:
     @property
     def message(self) -> Any:
         """Return the message class."""
-        package, _, name = self.channel.type_name.split("/")
-        return getattr(import_module(f"{package}.msg"), name)
+        return ros_class(self.channel.type_name)
 
     def publisher(self, node: Node) -> Publisher:
         """Return a publisher whose reliability and depth can be overridden by parameters, as usual in ROS."""
@@ -101,15 +100,21 @@ class Topic:
             expected = f"a {self.channel.type_name} of our definition"
             raise InvalidInputError(self.channel.name, f"{len(data)} bytes", expected) from None
 
-    def subscribe(self, node: GuardedNode, callback: Callable[[Any], None], *, raw: bool = False) -> Subscription:
+    def subscribe(self, node: GuardedNode, callback: Callable[..., None], *, raw: bool = False) -> Subscription:
         """Subscribe; reliability and depth can be overridden by parameters.
+
+        What comes is bytes: what is too large is not made into a message first.
 
         Args:
             node: that subscribes; it reports messages that are refused.
             callback: called with each message that can be decoded, or with the CDR bytes of each.
             raw: whether with its bytes.
         """
-        return self._subscribe(node, callback if raw else lambda data: self.decoded(node, data, callback))
+        take = callback if raw else lambda data: self.decoded(node, data, callback)
+        options = QoSOverridingOptions.with_default_policies()
+        return node.create_subscription(
+            self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
+        )
 
     def subscribe_numbered(self, node: GuardedNode, callback: Callable[[Any, int], None]) -> Subscription:
         """Subscribe, and get with each message the number that its publisher gave it.
@@ -124,10 +129,11 @@ class Topic:
             taken += 1
             number = info["publication_sequence_number"]
             if number is None or number == UNNUMBERED:
-                number = taken if subscription.get_publisher_count() <= 1 else taken * MAX_SEQUENCE_GAP
+                gap = 1 if subscription.get_publisher_count() <= 1 else 10_000  # so far apart are those of several
+                number = taken * gap
             self.decoded(node, data, lambda message: callback(message, number))
 
-        subscription = self._subscribe(node, take)
+        subscription = self.subscribe(node, take, raw=True)
         return subscription
 
     def decoded(self, node: GuardedNode, data: bytes, callback: Callable[[Any], None]) -> None:
@@ -139,12 +145,11 @@ class Topic:
         else:
             callback(message)
 
-    def _subscribe(self, node: GuardedNode, take: Callable[..., None]) -> Subscription:
-        """Subscribe to the bytes of the messages: what is too large is not made into a message first."""
-        options = QoSOverridingOptions.with_default_policies()
-        return node.create_subscription(
-            self.message, self.name, take, copy(self.qos), qos_overriding_options=options, raw=True
-        )
+
+def ros_class(type_name: str) -> Any:
+    """Return the class of a type, for example of `std_srvs/srv/SetBool`."""
+    package, kind, name = type_name.split("/")
+    return getattr(import_module(f"{package}.{kind}"), name)
 
 
 @cache
@@ -153,21 +158,14 @@ def topic_of(channel: Channel) -> Topic:
     return Topic(channel)
 
 
-def __getattr__(name: str) -> Topic:
-    """Return the topic of the channel of this name."""
-    channel = getattr(interface, name, None)
-    if not isinstance(channel, Channel):
-        raise AttributeError(f"{interface.__name__} has no channel {name}")
-    return topic_of(channel)
-
-
-INPUTS = tuple(map(topic_of, interface.INPUTS))
-OUTPUTS = tuple(map(topic_of, interface.OUTPUTS))
-ON_REQUEST = (topic_of(interface.FORECAST),)  # outputs that nobody publishes unless a parameter asks for them
-SETTINGS = tuple(map(topic_of, interface.SETTINGS))
-GROUND_TRUTH = tuple(map(topic_of, interface.GROUND_TRUTH))
-SIMULATED = (*GROUND_TRUTH, topic_of(interface.TIP_SETPOINT), topic_of(interface.FAULT_REQUEST))
-PROCEDURES = tuple(map(topic_of, interface.PROCEDURES))
+def __getattr__(name: str) -> Any:
+    """Return the topic of the channel of this name, or those of a tuple of channels."""
+    found = getattr(interface, name, None)
+    if isinstance(found, Channel):
+        return topic_of(found)
+    if isinstance(found, tuple) and isinstance(found[0], Channel):
+        return tuple(map(topic_of, found))
+    raise AttributeError(f"{interface.__name__} has no channel {name}")
 
 
 def lossless(depth: int) -> dict[str, Any]:

@@ -15,8 +15,7 @@ from magnetosuture_thread import InvalidInputError, Scene, interface
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import StandbyNode
-from magnetosuture_thread.nodes.scene_follower import SceneFollower
+from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.vision.images import decode_image, unpack_image
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
@@ -26,10 +25,13 @@ NO_SCENE = "no scene yet: neither the parameter nor the topic says how large the
 SILENCE = 0.5  # s without a frame, after which the tracker says that it sees nothing
 
 
-class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
+class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
     """Tracks the needle in every camera frame; when it is lost, no pose is published.
 
     Activated again, it finds needle and thread anew.
+
+    Attributes:
+        follower: called with each frame in which the needle is tracked, once that is published.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -39,10 +41,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
         self._text = ""  # what was seen last
         self._lens: Lens | None = None
         self._lens_problem = ""  # why frames are not corrected for the lens, until valid parameters come
-        # Simulated time may stand still; that the camera is silent must be noticed all the same.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._last_frame = self._arrival()
-        # In the same process: called with each frame in which the needle is tracked, once that is published.
+        self._last_frame = time.monotonic()
         self.follower: Callable[[Time, Track], None] | None = None
         topics.CAMERA_INFO.subscribe(self, self.on_camera_info)
         self.start()
@@ -51,8 +50,7 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
         """Load the kernels, and subscribe to the camera."""
         with self.health.load("the tracker's kernels"):
             warm_up()
-        self._session = self._new_session(settings, self._scene.load(settings.scene))
-        self._camera = interface.CAMERA[settings.image_transport].name
+        self._start_session(settings, self._scene.load(settings.scene))
         self._states = self.held(topics.TRACKER_STATE.publisher(self))
         self._outputs = {
             interface.NEEDLE_POSE: self.held(topics.NEEDLE_POSE.publisher(self)),
@@ -60,11 +58,14 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             interface.MEASURED_THREAD: self.held(topics.MEASURED_THREAD.publisher(self)),
         }
         if settings.image_transport == "compressed":
-            self.held(topics.COMPRESSED_IMAGE.subscribe(self, self.while_active(self.on_compressed)))
+            camera = topics.COMPRESSED_IMAGE.subscribe(self, self.while_active(self.on_compressed))
         else:
-            self.held(topics.IMAGE.subscribe(self, self.while_active(self.on_image)))
-        self.held(self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=self._steady))
-        self.get_logger().info(f"ready: frames from {self.resolve_topic_name(self._camera)}")
+            camera = topics.IMAGE.subscribe(self, self.while_active(self.on_image))
+        self._camera = self.held(camera).topic_name
+        # Simulated time may stand still; that the camera is silent must be noticed all the same.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.held(self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=steady))
+        self.get_logger().info(f"ready: frames from {self._camera}")
 
     def activate(self) -> None:
         """Look for needle and thread in the next frame."""
@@ -74,19 +75,18 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
     def deactivate(self) -> None:
         """Forget needle and thread, which move meanwhile."""
         if not self.is_shutting_down:
-            self._session = self._new_session(self.configured_settings, self._scene.scene)
+            self._start_session(self.configured_settings, self._scene.scene)
 
     def release(self) -> None:
         """Leave the camera."""
         self._session = None
-        super().release()
 
     def on_scene(self, scene: Scene) -> None:
         """Look for the needle in another scene."""
         if self._session is not None:
             self._session.set_scene(scene)
         elif self.settings is not None:
-            self._session = self._new_session(self.settings, scene)
+            self._start_session(self.settings, scene)
 
     def on_compressed(self, message: CompressedImage) -> None:
         """Track the needle in a JPEG or PNG frame."""
@@ -103,39 +103,35 @@ class VisionTrackerNode(StandbyNode[VisionTrackerSettings]):
             self._lens, self._lens_problem = lens_of(message), ""
         except InvalidInputError as error:
             self._lens, self._lens_problem = None, str(error)
-            self.health.refuse(error)
+            self.refuse(error)
         if self._session is not None:
             self._session.set_lens(self._lens)
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""
-        waited = self._arrival() - self._last_frame
+        waited = time.monotonic() - self._last_frame
         if self._session is not None and self._session.frames and waited > SILENCE:
             reason = f"no camera frame for {waited:.1f} s"
             stamp = self.get_clock().now().to_msg()
-            self._states.publish(packed_tracker_state(stamp, no_pose(self._session.missing, reason, None), 0.0))
+            self._states.publish(packed_tracker_state(stamp, no_pose(self._session.missing, reason, None)))
             self.health.warn("; ".join(filter(None, (reason, f"before that {self._text}", self._lens_problem))))
 
-    def _new_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> TrackerSession | None:
-        if scene is None:
-            return None
-        session = TrackerSession(settings, scene)
-        session.set_lens(self._lens)
-        return session
-
-    def _arrival(self) -> float:
-        return float(self._steady.now().nanoseconds * 1e-9)
+    def _start_session(self, settings: VisionTrackerSettings, scene: Scene | None) -> None:
+        self._session = None
+        if scene is not None:
+            self._session = TrackerSession(settings, scene)
+            self._session.set_lens(self._lens)
 
     def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
-        self._last_frame = self._arrival()
+        self._last_frame = time.monotonic()
         stamp, taken = message.header.stamp, 0.0
         try:
             reading.checked_nanoseconds(stamp, f"{self._camera}.header.stamp")
         except InvalidInputError as error:  # nothing that is published could be stamped by it
-            self.health.refuse(error)
+            self.refuse(error)
             return
         if self._session is None:
-            self._states.publish(packed_tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None), 0.0))
+            self._states.publish(packed_tracker_state(stamp, no_pose(State.SEARCHING, NO_SCENE, None)))
             self.health.warn(NO_SCENE)
             return
         try:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from magnetosuture_msgs.srv import EditShape
 
-from magnetosuture_thread.interface import ADD_SHAPE, ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER
+from magnetosuture_thread.interface import ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER, Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
@@ -132,7 +132,7 @@ def test_commands_of_one_page_reach_its_own_rig_alone_also_on_a_remapped_topic(r
 
 def test_an_emergency_stop_a_reset_and_a_new_shape_reach_one_rig_alone(rigs: Rigs):
     graph = rigs.graph
-    client = graph.probe.create_client(EditShape, f"/{RIGHT}/{ADD_SHAPE}")
+    client = graph.probe.create_client(EditShape, f"/{RIGHT}/{Service.ADD_SHAPE}")
     graph.wait(client.service_is_ready, "the scene server")
 
     async def use() -> None:

@@ -10,7 +10,7 @@ from geometry_msgs.msg import TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread.interface import ARM
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.scene import read_scene
@@ -69,7 +69,7 @@ def press(graph, name: str) -> Any:
 
 def arm(graph, on: bool = True) -> Any:
     """Arm or disarm."""
-    return graph.call(SetBool, ARM, data=on)
+    return graph.call(SetBool, Service.ARM, data=on)
 
 
 def change(graph, transition: int) -> bool:

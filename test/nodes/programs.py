@@ -11,11 +11,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
 from magnetosuture_thread.nodes import program
+from magnetosuture_thread.nodes.processes import NodeProcesses
 
 TIMEOUT = 90.0  # s for a process on a busy machine
 
@@ -25,11 +27,12 @@ class Program:
 
     Args:
         pid: of the process.
-        log: file that gets what it prints; its exit code is beside it.
+        log: file that gets what it prints.
+        code: file that gets its exit code.
     """
 
-    def __init__(self, pid: int, log: Path) -> None:
-        self.pid, self._log, self._code = pid, log, log.with_suffix(".code")
+    def __init__(self, pid: int, log: Path, code: Path) -> None:
+        self.pid, self._log, self._code = pid, log, code
 
     @property
     def output(self) -> str:
@@ -42,18 +45,25 @@ class Program:
         return [line for line in self.output.splitlines() if line.startswith("error: ")]
 
     def send_signal(self, which: signal.Signals) -> None:
-        """Send a signal."""
-        os.kill(self.pid, which)
+        """Send a signal, if it has not ended."""
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, which)
 
     def poll(self) -> int | None:
         """Return the exit code, None while it runs."""
         return int(self._code.read_text()) if self._code.exists() else None
 
+    @property
+    def returncode(self) -> int | None:
+        """Return the exit code, as a `Popen` has it."""
+        return self.poll()
+
     def wait(self, timeout: float = TIMEOUT) -> int:
-        """Return the exit code once it has ended."""
+        """Return the exit code once it has ended, or raise `TimeoutExpired` with what it has printed."""
         deadline = time.monotonic() + timeout
         while (code := self.poll()) is None:
-            assert time.monotonic() < deadline, f"waited {timeout:g} s for the end: {self.output}"
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired(self.output, timeout)
             time.sleep(0.005)
         return code
 
@@ -68,7 +78,7 @@ class Program:
     def kill(self) -> None:
         """Kill it, as a crash would, if it has not ended."""
         if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+            self.send_signal(signal.SIGKILL)
             self.wait()
 
 
@@ -85,16 +95,18 @@ class Programs:
         command = [sys.executable, __file__]
         self._server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    def start(self, name: str, *arguments: str, environment: Mapping[str, str]) -> Program:
-        """Start the program of a name with ROS arguments."""
+    def start(self, name: str, *arguments: str, environment: Mapping[str, str], log: Path | None = None) -> Program:
+        """Start the program of a name with ROS arguments; what it prints goes to a file of ours unless one is given."""
         assert self._server.stdin is not None
         assert self._server.stdout is not None
-        log = self._folder / f"{next(self._numbers)}.log"
-        log.touch()
+        number = next(self._numbers)
+        log, code = log or self._folder / f"{number}.log", self._folder / f"{number}.code"
+        log.write_bytes(b"")
         argv = [name, "--ros-args", *arguments]
-        self._server.stdin.write(json.dumps({"argv": argv, "environment": dict(environment), "log": str(log)}) + "\n")
+        given = {"argv": argv, "environment": dict(environment), "log": str(log), "code": str(code)}
+        self._server.stdin.write(json.dumps(given) + "\n")
         self._server.stdin.flush()
-        started = Program(int(self._server.stdout.readline()), log)
+        started = Program(int(self._server.stdout.readline()), log, code)
         self._programs.append(started)
         return started
 
@@ -110,6 +122,19 @@ class Programs:
             pass
 
 
+def start_forked(programs: Callable[[], Programs]) -> Callable[..., None]:
+    """Return what stands in for `NodeProcesses.start`: a node of this package is forked, and not started anew."""
+    start = NodeProcesses.start
+
+    def fork(nodes: Any, name: str, *, module: str = "", arguments: Sequence[str] = ()) -> None:
+        if module:
+            return start(nodes, name, module=module, arguments=arguments)
+        given, log = (*nodes._arguments, *arguments), nodes._logs / f"{name}.log"
+        nodes._processes[name] = programs().start(name, *given, environment=nodes._environment, log=log)
+
+    return fork
+
+
 def serve() -> None:
     """Fork a program for each line on standard input, and note exit codes."""
     for name in (*program.MAKERS, "console", "run"):
@@ -121,12 +146,14 @@ def serve() -> None:
         if not ends and select.select([sys.stdin], [], [], 0.0 if codes else 0.2)[0]:
             line = sys.stdin.readline()
             ends = not line
+            for pid in codes if ends else ():  # whoever started them is gone
+                os.kill(pid, signal.SIGINT)
             if line:
                 given = json.loads(line)
                 pid = os.fork()
                 if not pid:
                     run(given)
-                codes[pid] = Path(given["log"]).with_suffix(".code")
+                codes[pid] = Path(given["code"])
                 print(pid, flush=True)
         for pid in list(codes):
             done, status = os.waitpid(pid, os.WNOHANG)

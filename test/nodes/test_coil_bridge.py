@@ -71,14 +71,11 @@ def test_a_pose_that_grows_old_stops_the_coils_while_commands_go_on(graph):
     graph.wait(is_stopped, "the stop")
 
 
-@pytest.mark.parametrize(
-    "spoil", [lambda m: setattr(m.header, "stamp", Time(sec=5)), lambda m: setattr(m.header, "frame_id", "map")]
-)
-def test_a_bad_pose_is_not_used(graph, spoil):
+def test_a_bad_pose_is_not_used(graph):
     node = armed(graph, **LONG)
     states, diagnostics = graph.listen(topics.BRIDGE_STATE), graph.listen(topics.DIAGNOSTICS)
     pose = wire.pose_message(graph.now(), np.zeros(2), EAST)
-    spoil(pose)
+    pose.header.frame_id = "map"
     graph.publish(topics.NEEDLE_POSE, pose)
     graph.wait(lambda: any("needle/measured_cp" in str(d.status[0].values) for d in diagnostics), "a refusal")
     graph.publish(topics.NEEDLE_COMMAND, command(graph))
@@ -123,7 +120,6 @@ def test_the_watchdog_does_not_depend_on_simulated_time(graph):
     ("spoil", "words"),
     [
         (lambda m: setattr(m.twist.linear, "x", math.nan), "finite numbers"),
-        (lambda m: setattr(m.twist.angular, "z", math.nan), "x and y alone count"),
         (lambda m: setattr(m.header, "frame_id", "base_link"), "'dish'"),
         (lambda m: setattr(m.header, "stamp", Time(sec=5)), "at most 0.1 s"),
         (lambda m: setattr(m.header.stamp, "sec", m.header.stamp.sec + 60), "at most 0.05 s"),

@@ -16,9 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 
-from magnetosuture_thread.cli import main
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import joined
@@ -29,7 +27,6 @@ from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.scene import read_scene
 from test.nodes import wire
-from test.nodes.margins import no_margins
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -86,21 +83,6 @@ def test_the_switches_of_the_real_bridge_are_pressed(graph, console):
     assert "expected one of arm, disarm, stop, reset" in act(console, "dance")
 
 
-def test_a_stop_that_is_not_kept_over_a_restart_says_so_on_page_and_terminal(graph, console, monkeypatch, capfd):
-    node = graph.add(CoilBridgeNode, autostart="active", scene="dish_35mm")
-    graph.wait(lambda: bridge(console).get("state") == "active", "the bridge")
-
-    def full(**_: bool) -> None:
-        raise InvalidInputError("stop_file", "No space left on device", "a file that can be written")
-
-    monkeypatch.setattr(node.system, "remember", full)
-    assert "No space left" in act(console, "stop")
-    graph.wait(lambda: bridge(console)["emergency_stopped"], "the emergency stop")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(graph.domain))
-    assert main(["coils", "stop"]) == 0
-    assert "warning: stop_file: got No space left" in "".join(capfd.readouterr())
-
-
 def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console):
     stamp = graph.now()
     assert console.state()["needle"] is None
@@ -108,7 +90,7 @@ def test_real_messages_are_told_and_forgotten_at_a_new_beginning(graph, console)
     scene = wire.scene_message(stamp, read_scene("dish_35mm_post"))
     pose = wire.pose_message(stamp, np.array([0.003, -0.004]), np.array([0.0, 1.0]))
     path = wire.path_message(stamp, np.array([[0.0, 0.0], [0.001, 0.0]]))
-    margins = no_margins(stamp, "no pose")
+    margins = wire.no_margins(stamp, "no pose")
     tell(graph, topics.SCENE, scene, lambda: console.state()["scene"], "the scene")
     tell(graph, topics.NEEDLE_POSE, pose, lambda: console.state()["needle"], "the pose")
     tell(graph, topics.MEASURED_THREAD, path, lambda: console.state()["measured"], "the seen thread")

@@ -75,8 +75,16 @@ def test_requests_that_rclpy_cannot_answer_are_refused(graph, node):
     graph.call(
         GetTypeDescription, f"{node.get_name()}/get_type_description", type_name="no/msg/Such", type_hash="RIHS01_0"
     )
-    answer = graph.call(GetParameters, f"{node.get_name()}/get_parameters", names=["use_sim_time"])
-    assert answer.values[0].type == ParameterType.PARAMETER_BOOL
+    # Its clock stays the one that it was started with.
+    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
+    asked = [Parameter(name="use_sim_time", value=value)]
+    for result in (
+        graph.call(SetParameters, f"{node.get_name()}/set_parameters", parameters=asked).results[0],
+        graph.call(SetParametersAtomically, f"{node.get_name()}/set_parameters_atomically", parameters=asked).result,
+    ):
+        assert not result.successful
+        assert "use_sim_time" in result.reason
+    assert not graph.probe.get_subscriptions_info_by_topic("/clock")
 
 
 def test_an_armed_bridge_drives_on(graph):
@@ -90,18 +98,6 @@ def test_an_armed_bridge_drives_on(graph):
     assert node.system.latch.armed
     told = len(node.system.driver.applied)
     graph.wait(lambda: len(node.system.driver.applied) > told, "more steps")
-
-
-def test_the_clock_of_a_node_stays_the_one_that_it_was_started_with(graph, node):
-    value = ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=True)
-    asked = [Parameter(name="use_sim_time", value=value)]
-    for result in (
-        graph.call(SetParameters, f"{node.get_name()}/set_parameters", parameters=asked).results[0],
-        graph.call(SetParametersAtomically, f"{node.get_name()}/set_parameters_atomically", parameters=asked).result,
-    ):
-        assert not result.successful
-        assert "use_sim_time" in result.reason
-    assert not graph.probe.get_subscriptions_info_by_topic("/clock")
 
 
 @pytest.mark.parametrize("kind", [kind for kind in EVERY if kind is not RigSimulatorNode], ids=lambda k: k.__name__)
@@ -119,7 +115,7 @@ def test_an_impossible_time_is_reported_and_ignored(graph, kind):
         graph.wait(lambda s=seconds: node.get_clock().now().nanoseconds == s * 10**9, "the time")
 
 
-@pytest.mark.parametrize("stamp", [Time(sec=-1, nanosec=5), Time(sec=1, nanosec=10**9), Time(sec=1, nanosec=2**32 - 1)])
+@pytest.mark.parametrize("stamp", [Time(sec=-1, nanosec=5), Time(sec=1, nanosec=2**32 - 1)])
 def test_a_command_of_an_impossible_time_is_refused(graph, stamp):
     node = armed(graph, **LONG)
     states = graph.listen(topics.BRIDGE_STATE)
@@ -151,7 +147,7 @@ def long_scene(graph) -> Any:
 
 @pytest.mark.parametrize(
     ("topic", "make"),
-    [(topics.OPERATOR_COMMAND, long_twist), (topics.NEEDLE_COMMAND, long_twist), (topics.MARGINS, long_scene)],
+    [(topics.OPERATOR_COMMAND, long_twist), (topics.MARGINS, long_scene)],
 )
 def test_a_message_that_is_too_large_is_refused_unread(graph, topic: topics.Topic, make: Callable[[Any], Any]):
     graph.add(CoilBridgeNode, scene="dish_35mm")

@@ -43,17 +43,13 @@ def kept(which: signal.Signals, done: list[str], *, asks: bool = False, error: E
             done.append("went on again")
 
 
-@pytest.mark.parametrize("asks", [True, False])
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_is_kept_until_it_is_asked_for_or_the_end(heeded, which: signal.Signals, asks: bool):
-    done: list[str] = []
-    with pytest.raises(KeyboardInterrupt):
-        kept(which, done, asks=asks)
-    assert done == ["went on"]
-    assert {number: signal.getsignal(number) for number in heeded} == heeded
-
-
-def test_what_is_raised_already_stays(heeded):
-    with pytest.raises(ValueError, match="mine"):
-        kept(signal.SIGINT, [], error=ValueError("mine"))
+def test_a_signal_is_kept_until_it_is_asked_for_or_the_end(heeded, which: signal.Signals):
+    for asks in (True, False):
+        done: list[str] = []
+        with pytest.raises(KeyboardInterrupt):
+            kept(which, done, asks=asks)
+        assert done == ["went on"]
+    with pytest.raises(ValueError, match="mine"):  # what is raised already stays
+        kept(which, [], error=ValueError("mine"))
     assert {number: signal.getsignal(number) for number in heeded} == heeded

@@ -20,33 +20,22 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from magnetosuture_thread.interface import (
-    LOAD_SCENE,
-    PAUSE_PROCEDURE,
-    PLAN_PROCEDURE,
-    SCENE_SERVER,
-)
+from magnetosuture_thread.interface import SCENE_SERVER, STANDBY_NODES, Service
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.lifecycle import INACTIVE
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
+from magnetosuture_thread.nodes.node import INACTIVE
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
-from magnetosuture_thread.nodes.thread_forecast import ThreadForecasts
-from magnetosuture_thread.nodes.thread_model import ThreadModelNode
+from magnetosuture_thread.nodes.thread_model import ThreadForecasts, ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from test.nodes import wire
 from test.nodes.conftest import Graph
+from test.nodes.makers import EVERY_NODE
 from test.nodes.test_needle_planner import FAR, Bench
 
 CONFIGURE, CLEANUP = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
 ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
-NODES: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
-    "vision_tracker": (VisionTrackerNode, {"scene": "dish_35mm"}),
-    "thread_model": (ThreadModelNode, {"scene": "dish_35mm", "forecast_horizon": 1.0}),
-    "needle_planner": (NeedlePlannerNode, {"scene": "dish_35mm"}),
-    "path_follower": (PathFollowerNode, {"scene": "dish_35mm", "waypoints": [0.01, 0.0]}),
-    "scene_server": (SceneServerNode, {"scene": "dish_35mm"}),
-}
+NODES = {name: EVERY_NODE[name] for name in STANDBY_NODES}
 ACTIVE = {  # how the first report of each begins while it is active
     "vision_tracker": "no camera frame yet",
     "thread_model": "no needle pose yet",
@@ -75,7 +64,7 @@ def values_of(reports: list[Any]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_it_goes_as_far_as_autostart_says_and_through_its_states_twice(graph: Graph, name: str):
+def test_it_goes_as_far_as_autostart_says_through_its_states_twice_and_ends(graph: Graph, name: str):
     make, parameters = NODES[name]
     reports = graph.listen_later(topics.DIAGNOSTICS)
     node = graph.add(make, autostart="unconfigured", **parameters)
@@ -96,27 +85,20 @@ def test_it_goes_as_far_as_autostart_says_and_through_its_states_twice(graph: Gr
         assert entities(node) == before
     graph.add(make, autostart="inactive", namespace="second", **parameters)
     assert graph.stage(f"second/{name}") == "inactive"
-    graph.add(make, namespace="third", **parameters)
+    third = graph.add(make, namespace="third", **parameters)
     assert graph.stage(f"third/{name}") == "active"
+    assert not third.has_ended
+    assert graph.change(f"third/{name}", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert third.has_ended
+    graph.wait(lambda: state_of(reports) == "finalized", "the report")
+    with graph.between_callbacks():
+        third.finish()  # as its process does then
 
 
 def entities(node: Any) -> list[str]:
     """Return the names of all that a node has in the graph."""
     topic_names = [each.topic_name for each in (*node.publishers, *node.subscriptions)]
     return sorted([*topic_names, *(each.srv_name for each in node.services), *["timer" for _ in node.timers]])
-
-
-@pytest.mark.parametrize("name", NODES)
-def test_a_node_that_is_shut_down_ends(graph: Graph, name: str):
-    make, parameters = NODES[name]
-    node = graph.add(make, **parameters)
-    reports = graph.listen_later(topics.DIAGNOSTICS)
-    assert not node.has_ended
-    assert graph.change(name, Transition.TRANSITION_ACTIVE_SHUTDOWN)
-    assert node.has_ended
-    graph.wait(lambda: state_of(reports) == "finalized", "the report")
-    with graph.between_callbacks():
-        node.finish()  # as its process does then
 
 
 @pytest.mark.parametrize(
@@ -164,7 +146,7 @@ def test_an_activation_that_fails_leaves_the_node_inactive(graph: Graph, monkeyp
     monkeypatch.setattr(node, "activate", broken)
     assert not graph.change(SCENE_SERVER, ACTIVATE)
     assert graph.stage(SCENE_SERVER) == "inactive"
-    refused = graph.call(LoadScene, LOAD_SCENE, file="dish_50mm")
+    refused = graph.call(LoadScene, Service.LOAD_SCENE, file="dish_50mm")
     assert refused.message == "scene_server is inactive; activate it first"
     with graph.between_callbacks():
         node.health.note(asked="now")
@@ -211,7 +193,10 @@ def test_a_procedure_is_given_up_when_its_planner_is_deactivated(graph: Graph, b
     ended = running.get_result_async()
     graph.wait(ended.done, "the result")
     assert ended.result().result.reason == "the needle planner was deactivated"
-    for refused in (graph.call(PlanProcedure, PLAN_PROCEDURE, procedure=FAR), graph.call(Trigger, PAUSE_PROCEDURE)):
+    for refused in (
+        graph.call(PlanProcedure, Service.PLAN_PROCEDURE, procedure=FAR),
+        graph.call(Trigger, Service.PAUSE_PROCEDURE),
+    ):
         assert not refused.success
         assert refused.message == "needle_planner is inactive; activate it first"
     count = len(bench.commands)

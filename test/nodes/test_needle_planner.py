@@ -27,19 +27,12 @@ from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.interface import (
-    ABORT_PROCEDURE,
-    EXECUTE_PROCEDURE,
-    PAUSE_PROCEDURE,
-    PLAN_PROCEDURE,
-    RESUME_PROCEDURE,
-)
+from magnetosuture_thread.interface import EXECUTE_PROCEDURE, Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Scene, SceneShape, read_scene
 from test.nodes import wire
-from test.nodes.scenes import scene_told
 
 NEEDLE = NeedleKinematics(0.0025)
 RATE = 20.0  # Hz; of the poses, by their stamps: they come as fast as the test runs
@@ -68,7 +61,7 @@ class Bench:
         self.begin = int(time.time()) + 3600  # s; late poses are refused, however slowly the test runs
         self.real_time = False  # whether the stamps of poses are those of a clock, for a coil bridge
         self.margins = SafetyMargins(valid=True, slowdown=1.0)
-        graph.publish(topics.SCENE, scene_told(scene))
+        graph.publish(topics.SCENE, wire.scene_message(0, scene))
         graph.wait(lambda: self.node._scene.version == scene.version, "the scene")
 
     def show(self) -> None:
@@ -200,12 +193,8 @@ def test_a_procedure_is_executed_with_feedback_and_a_result(graph, make_bench):
     [
         ("no_such_procedure", "expected a YAML file, or one of"),
         ("goals: [{fly_to: {position: [0.0, 0.0]}}]", "goals[0]: got ['fly_to']"),
-        ("{goals: [{go_to: {position: [0.0, 0.0]}}], limits: {speed: -0.001}}", "speed: got -0.001"),
         ("goals: [{go_to: {position: [0.05, 0.0]}}]", "goals[0].go_to.position"),
-        ("goals: [{wrap: {around: ring, angle: 6.0}}]", "goals[0].wrap.around"),
         ("goals: [{wrap: {around: [}}]", "valid YAML"),
-        ("goals: " + "x" * 200, "a list of 1 to 100 goals"),
-        ("", "expected a YAML file, or one of"),
     ],
 )
 def test_what_cannot_be_executed_is_aborted_at_once_with_the_reason(graph, make_bench, procedure: str, reason: str):
@@ -238,46 +227,39 @@ def test_any_command_of_the_operator_pauses_until_it_is_resumed(graph, make_benc
     bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "an operator commands"), "the pause")
     assert not bench.state().resumes
     assert bench.rests()
-    assert bench.call(RESUME_PROCEDURE).success
+    assert bench.call(Service.RESUME_PROCEDURE).success
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
 def test_a_person_plans_begins_pauses_and_gives_up_by_services(graph, make_bench):
     bench = make_bench()
-    assert not bench.call(PAUSE_PROCEDURE).success
-    assert "no procedure" in bench.call(RESUME_PROCEDURE).message
+    assert not bench.call(Service.PAUSE_PROCEDURE).success
+    assert "no procedure" in bench.call(Service.RESUME_PROCEDURE).message
     bench.until(lambda: bench.node._session.known.has_pose(time.monotonic()), "the needle to be known")
-    answer = bench.call(PLAN_PROCEDURE, PlanProcedure, procedure=FAR)
+    answer = bench.call(Service.PLAN_PROCEDURE, PlanProcedure, procedure=FAR)
     assert (answer.success, answer.message) == (True, "")
     assert answer.duration == pytest.approx(answer.length / 0.002)
     assert bench.is_in(ProcedureState.STATE_READY)
     graph.wait(lambda: len(bench.plans) == 1, "the plan")
     assert bench.rests()
-    assert bench.call(RESUME_PROCEDURE).success
+    assert bench.call(Service.RESUME_PROCEDURE).success
     bench.until(lambda: bool(bench.commands) and bench.is_commanded(), "motion")
-    assert bench.call(PAUSE_PROCEDURE).success
+    assert bench.call(Service.PAUSE_PROCEDURE).success
     assert bench.rests()
-    assert bench.call(ABORT_PROCEDURE).success
+    assert bench.call(Service.ABORT_PROCEDURE).success
     graph.wait(lambda: bench.is_in(ProcedureState.STATE_FAILED, "given up by a person"), "the end")
-    refused = bench.call(PLAN_PROCEDURE, PlanProcedure, procedure="goals: []")
+    refused = bench.call(Service.PLAN_PROCEDURE, PlanProcedure, procedure="goals: []")
     assert not refused.success
     assert "1 to 100 goals" in refused.message
 
 
-def disturbed(bench: Bench, calm: bool) -> None:
+def disturbed(calm: bool) -> EstimatedThread:
     found = [] if calm else [ThreadDisturbance(arc_length=0.01, force=2e-4, direction=Vector3(x=1.0))]
-    bench.graph.publish(
-        topics.ESTIMATED_THREAD, EstimatedThread(positions=[Point(), Point(x=0.01)], disturbances=found)
-    )
+    return EstimatedThread(positions=THREAD, disturbances=found)
 
 
-def unmeasured(bench: Bench, measured: bool) -> None:
-    since = 0.0 if measured else 1.5
-    bench.graph.publish(topics.ESTIMATED_THREAD, EstimatedThread(positions=THREAD, unmeasured_for=since))
-
-
-def invalid(bench: Bench, valid: bool) -> None:
-    bench.margins = SafetyMargins(valid=valid, slowdown=1.0, reason="" if valid else "the residual is too large")
+def unmeasured(measured: bool) -> EstimatedThread:
+    return EstimatedThread(positions=THREAD, unmeasured_for=0.0 if measured else 1.5)
 
 
 @pytest.mark.parametrize(
@@ -285,17 +267,21 @@ def invalid(bench: Bench, valid: bool) -> None:
     [
         (disturbed, "an unmodelled contact: the thread is held at 10 mm of the thread: 0.2 mN to the right"),
         (unmeasured, "the thread has not been measured for 1.5 s"),
-        (invalid, "the thread is not known: the residual is too large"),
+        (None, "the thread is not known: the residual is too large"),
     ],
 )
 def test_what_is_not_known_pauses_and_it_goes_on_by_itself_once_it_is(graph, make_bench, report: Any, reason: str):
     bench = make_bench()
     goal = bench.run()
-    report(bench, False)
-    bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
-    assert bench.state().resumes
-    assert bench.rests()
-    report(bench, True)
+    for known in (False, True):
+        if report is None:
+            bench.margins = SafetyMargins(valid=known, slowdown=1.0, reason="the residual is too large")
+        else:
+            graph.publish(topics.ESTIMATED_THREAD, report(known))
+        if not known:
+            bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, reason), "the pause")
+            assert bench.state().resumes
+            assert bench.rests()
     assert bench.result(goal)[0] == GoalStatus.STATUS_SUCCEEDED
 
 
@@ -329,11 +315,11 @@ def test_a_bridge_that_is_disarmed_pauses_until_it_is_resumed(graph, make_bench)
     bench.run()
     graph.publish(topics.BRIDGE_STATE, CoilBridgeState(armed=False))
     bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "the coil bridge is not armed"), "the pause")
-    assert "not armed" in bench.call(RESUME_PROCEDURE).message
+    assert "not armed" in bench.call(Service.RESUME_PROCEDURE).message
     graph.publish(topics.BRIDGE_STATE, CoilBridgeState(armed=True))
     graph.wait(lambda: bench.node._session._armed, "the bridge to be armed")
     assert bench.rests()
-    assert bench.call(RESUME_PROCEDURE).success
+    assert bench.call(Service.RESUME_PROCEDURE).success
     bench.until(lambda: bench.is_in(ProcedureState.STATE_RUNNING), "it to go on")
 
 
@@ -371,7 +357,7 @@ def test_a_second_node_that_commands_pauses_and_nothing_is_begun(graph, make_ben
     bench.run()
     other = graph.probe.create_publisher(topics.NEEDLE_COMMAND.message, topics.NEEDLE_COMMAND.name, 1)
     bench.until(lambda: bench.is_in(ProcedureState.STATE_PAUSED, "2 nodes publish needle/servo_cv"), "the pause")
-    assert bench.call(ABORT_PROCEDURE).success
+    assert bench.call(Service.ABORT_PROCEDURE).success
     _, result = bench.result(bench.send(NEAR))
     assert "2 nodes publish needle/servo_cv" in result.reason
     graph.probe.destroy_publisher(other)

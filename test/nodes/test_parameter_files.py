@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rclpy.context import Context
-from rclpy.parameter import parameter_value_to_python
-from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.nodes.parameters import init
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
-from magnetosuture_thread.resources import find_setup_file
-from test.nodes.programs import TIMEOUT
 
 COMMON = "/**: {ros__parameters: {needle_length: 0.006, thread_length: 0.05}}\n"
 OWN = "/**/path_follower: {ros__parameters: {speed: 0.004}}\n"
@@ -62,7 +56,6 @@ def followed(tmp_path: Path, domain: int):
     [
         ((), "/path_follower"),
         (LAB1, "/lab1/path_follower"),
-        (LEFT, "/left_follower"),
         ((*LAB1, *LEFT), "/lab1/left_follower"),
         (("-r", "path_follower:__node:=left_follower", "--remap", "__ns:=/a/b"), "/a/b/left_follower"),
         (("-r", "other:__node:=left_follower"), "/path_follower"),
@@ -115,10 +108,6 @@ def test_what_comes_later_counts(followed, texts: list[str], arguments: tuple[st
         (COMMON + "path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, path_follower', expected one"),
         (COMMON + "/lab2/path_follower: {ros__parameters: {speed: 0.002}}", LAB1, "got '/**, /lab2/path_follower'"),
         ("", (), "parameter file: got None, expected sections by node"),
-        ("hello", (), "parameter file: got 'content of type str', expected sections by node"),
-        ("[1, 2", (), "expected valid YAML"),
-        ("/**: {ros__parameters: {speed: 0.1, speed: 0.2}}", (), "speed is given twice"),
-        ("/**: {speed: 0.1}", (), "one key, ros__parameters"),
     ],
 )
 def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
@@ -134,38 +123,3 @@ def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
 def test_sections_of_others_do_not_matter(followed):
     text = "/lab1/camera: {ros__parameters: {exposure: 3}}\n/**/coil_bridge: {ros__parameters: {rate: 50.0}}\n"
     assert followed([OWN + text], LAB1)[1] == 0.004
-
-
-def test_a_bridge_that_is_pushed_into_a_namespace_has_its_setup(graph, programs, tmp_path: Path):
-    """Found from outside: it was active with no obstacles, another dish and another needle, without a warning."""
-    extra = tmp_path / "launch.yaml"  # what launch writes of parameters that it is given itself
-    extra.write_text(
-        "/**: {ros__parameters: {max_speed: 0.011}}\n/**/coil_bridge: {ros__parameters: {use_sim_time: true}}"
-    )
-    files = ("--params-file", str(find_setup_file("hernia_ring")), "--params-file", str(extra))
-    names = ("-r", "__node:=left_bridge", "-r", "__ns:=/lab1")
-    programs.start("coil_bridge", *names, *files, environment=graph_environment(graph.domain))
-    expected = {
-        "scene": "hernia_ring",
-        "needle_length": 0.0025,
-        "keep_out": 0.00025,
-        "needle_moment": 2.405e-4,
-        "max_speed": 0.011,
-        "use_sim_time": True,
-        "driver": "recording",
-    }
-    client = AsyncParameterClient(graph.probe, "/lab1/left_bridge")
-    graph.wait(client.services_are_ready, "the parameter services", TIMEOUT)
-    answers: list[Any] = []
-
-    def answered() -> bool:
-        # The node may have found the request's reader before that of the answer.
-        if not answers or (not answers[-1].done() and time.monotonic() > asked[0] + 1.0):
-            asked[0] = time.monotonic()
-            answers.append(client.get_parameters(list(expected)))
-        return any(answer.done() for answer in answers)
-
-    asked = [0.0]
-    graph.wait(answered, "an answer")
-    answer = next(each.result() for each in answers if each.done())
-    assert dict(zip(expected, map(parameter_value_to_python, answer.values), strict=True)) == expected

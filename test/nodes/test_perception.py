@@ -10,6 +10,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import PredictedThread, SafetyMargins
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.perception import perception
@@ -23,6 +24,15 @@ FRAMES = 8
 SCENE = "dish_35mm"
 
 
+BETWEEN = [f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.THREAD_OBSERVATION, topics.MEASURED_THREAD)]
+
+
+def found(end: Any) -> bool:
+    """Return whether a publisher or subscription has found its other end."""
+    count = end.get_subscription_count if isinstance(end, Publisher) else end.get_publisher_count
+    return bool(count())
+
+
 def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
     """Add both nodes, made by the composition."""
     overrides = [Parameter(name, value=value) for name, value in {"scene": SCENE, **parameters}.items()]
@@ -31,16 +41,6 @@ def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, Thread
         graph.nodes.append(node)
         graph.executor.add_node(node)
     return made
-
-
-def met(graph: Graph, tracker: VisionTrackerNode, model: ThreadModelNode) -> None:
-    """Wait until the model hears what the tracker says."""
-    names = {f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.MEASURED_THREAD)}
-    said = [entry for entry in tracker.publishers if entry.topic_name in names]
-    heard = [entry for entry in model.subscriptions if entry.topic_name in names]
-    assert len(said) == len(heard) == len(names)
-    graph.wait(lambda: all(entry.get_subscription_count() for entry in said), "the model to be found")
-    graph.wait(lambda: all(entry.get_publisher_count() for entry in heard), "the tracker to be found")
 
 
 def answers(graph: Graph, frames: list[np.ndarray]) -> tuple[list[PredictedThread], list[SafetyMargins]]:
@@ -81,7 +81,9 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
             try:
                 if alone:
                     tracker, model = graph.add(VisionTrackerNode, scene=SCENE), graph.add(ThreadModelNode, scene=SCENE)
-                    met(graph, tracker, model)
+                    ends = [each for node in (tracker, model) for each in (*node.publishers, *node.subscriptions)]
+                    between = [each for each in ends if each.topic_name in BETWEEN]
+                    graph.wait(lambda e=between: all(map(found, e)), "them to have found each other")
                 else:
                     together(graph)
                 predicted, margins = answers(graph, frames)

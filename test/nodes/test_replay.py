@@ -1,26 +1,20 @@
-"""Playing messages into a graph: the time, and what gets lost."""
+"""Playing messages into a graph: the time, what gets lost, and who has to be there."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import MARGINS, NEEDLE_POSE
+from magnetosuture_thread.interface import NEEDLE_POSE
 from magnetosuture_thread.nodes import player, timeline, topics
 from magnetosuture_thread.nodes.player import LiveReplay, Losses
 from magnetosuture_thread.nodes.timeline import Timeline
-from test.nodes import wire
-from test.nodes.margins import no_margins
 
 
 def test_time_stands_still_before_it_begins_and_while_it_is_paused(monkeypatch: pytest.MonkeyPatch):
@@ -71,66 +65,29 @@ def test_losses_are_counted_by_the_way_on_which():
     }
 
 
-@dataclass
-class Recorded:
-    """A recorded pose."""
-
-    time: int
-    topic: str = NEEDLE_POSE.recorded
-
-    @property
-    def data(self) -> bytes:
-        """Return its bytes."""
-        stamp = Time(sec=self.time // 10**9, nanosec=self.time % 10**9)
-        return serialize_message(wire.pose_message(stamp, np.zeros(2), np.array([1.0, 0.0])))
-
-
-def test_poses_that_a_graph_does_not_answer_are_counted(graph, monkeypatch: pytest.MonkeyPatch):
-    """Here the graph is a probe that answers every other pose."""
-    monkeypatch.setattr(player, "SETTLE", 0.5)
-    monkeypatch.setattr(player, "STUCK", 3.0)
+def test_a_graph_in_which_nobody_hears_an_input_is_not_complete(graph, monkeypatch: pytest.MonkeyPatch):
+    """Here the graph is a probe with all outputs, which hears poses but not the thread."""
+    monkeypatch.setattr(player, "SETTLE", 0.1)
     for topic in topics.OUTPUTS:
-        if topic.channel is not MARGINS and topic.channel is not NEEDLE_POSE:
+        if topic.channel is not NEEDLE_POSE:
             topic.publisher(graph.probe)
-    margins = topics.MARGINS.publisher(graph.probe)
-    asked: list[Any] = []
-
-    def answer(message: Any) -> None:
-        asked.append(message)
-        if len(asked) % 2:
-            margins.publish(no_margins(message.header.stamp, "for a test"))
-
-    graph.probe.create_subscription(topics.NEEDLE_POSE.message, topics.NEEDLE_POSE.name, answer, 100)
-    graph.probe.create_subscription(topics.CLOCK.message, topics.CLOCK.name, lambda message: None, 100)
-    heard: list[tuple[str, int]] = []
+    for topic in (topics.NEEDLE_POSE, topics.CLOCK):
+        graph.probe.create_subscription(topic.message, topic.name, lambda message: None, 100)
     live = LiveReplay(
         graph.domain,
         Timeline(10**9, 5.0),
         played=[topics.NEEDLE_POSE, topics.MEASURED_THREAD],
         nodes=1,
-        receive=lambda topic, time, data: heard.append((topic, time)),
+        receive=lambda topic, time, data: None,
         watch=lambda: None,
     )
     try:
-        # Nobody is there for the seen thread.
         monkeypatch.setattr(player, "START_TIMEOUT", 0.5)
         with pytest.raises(GraphError, match=r"nobody at .*/thread/measured"):
             live.wait_for_graph()
         monkeypatch.setattr(player, "START_TIMEOUT", 60.0)
-        graph.probe.create_subscription(
-            topics.MEASURED_THREAD.message, topics.MEASURED_THREAD.name, lambda message: None, 100
-        )
+        heard = topics.MEASURED_THREAD
+        graph.probe.create_subscription(heard.message, heard.name, lambda message: None, 100)
         live.wait_for_graph()
-        times: list[float] = []
-        live.play([Recorded(10**9 + k * 50_000_000) for k in range(8)], times.append)
     finally:
         live.close()
-    assert times == pytest.approx([0.05 * k for k in range(8)])
-    assert len(asked) == 8
-    assert live.losses.played == {NEEDLE_POSE.name: 8}
-    assert live.losses.dropped() == {"poses without an answer": 4, "outputs lost by the recording": 0}
-    # What is played in place of a node's output is passed on with the outputs.
-    assert [time for topic, time in heard if topic == NEEDLE_POSE.recorded] == [
-        10**9 + k * 50_000_000 for k in range(8)
-    ]
-    assert sum(topic == MARGINS.recorded for topic, _ in heard) == 4

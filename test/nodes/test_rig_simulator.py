@@ -16,7 +16,6 @@ from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes import wire
-from test.nodes.scenes import scene_told
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}
 
@@ -121,7 +120,7 @@ def test_a_rig_that_is_too_slow_lags_and_says_so_while_frames_go_on(graph, monke
     times = [nanoseconds(message.clock) for message in clocks]
     assert times == sorted(times)
     if simulated:  # the clock waits for the rig
-        assert times[-1] < node.time.stamp(node.rig.time) + 0.2e9
+        assert times[-1] < node._stamp(node.rig.time) + 0.2e9
     else:  # what is shown is of now
         assert abs(stamps[-1] - node.get_clock().now().nanoseconds) < 5e9
 
@@ -143,11 +142,11 @@ def test_rig_draws_a_new_scene_and_rejects_an_invalid_one(graph):
     graph.wait(lambda: bool(frames), "a frame")
     before = frames[-1].k[0]
     other = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.0, 0.01), 0.002)),))
-    graph.publish(topics.SCENE, scene_told(other))
+    graph.publish(topics.SCENE, wire.scene_message(0, other))
     graph.wait(lambda: node.rig.scene.version == other.version, "the other scene")
     graph.wait(lambda: frames[-1].k[0] < 0.9 * before, "a frame of the wider dish")
     on_needle = Scene(Dish(0.04), (SceneShape("post", "instrument", Disc((0.006, 0.0), 0.002)),))
-    graph.publish(topics.SCENE, scene_told(on_needle))
+    graph.publish(topics.SCENE, wire.scene_message(0, on_needle))
     refusal = "refused: scene: got post where the needle is"
     graph.wait(lambda: any(refusal in d.status[0].message for d in diagnostics), "the refusal")
     assert node.rig.scene.version == other.version

@@ -8,9 +8,9 @@ import pytest
 from rclpy.serialization import serialize_message
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import PackageNode
-from magnetosuture_thread.nodes.scene_follower import SceneFollower, initial_scene, received_scene
+from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.scene import Scene, read_scene
 from test.nodes import wire
 from test.scene.scenes import every_shape
@@ -18,14 +18,15 @@ from test.scene.scenes import every_shape
 POST, HERNIA = read_scene("dish_35mm_post"), read_scene("hernia_ring")
 
 
-class FollowerNode(PackageNode):
+class FollowerNode(GuardedNode):
     """A node that only follows, and may refuse a scene."""
 
     def __init__(self, file: str = "", **options: Any) -> None:
         super().__init__("follower", **options)
         self.changes: list[Scene] = []
         self.refusal: ConfigurationError | None = None
-        self.follower = SceneFollower(self, self.take, initial_scene(file))
+        self.health.ok("following")
+        self.follower = SceneFollower(self, self.take, read_scene(file) if file else None)
 
     def take(self, scene: Scene) -> None:
         """Take a scene, or refuse it."""
@@ -96,12 +97,12 @@ def test_a_scene_that_the_node_cannot_use_is_reported_and_the_one_before_stays(g
 
 def test_bytes_that_are_no_scene_are_refused():
     whole = serialize_message(wire.scene_message(wire.time(0), every_shape()))
-    assert received_scene(whole) == every_shape()
+    assert parse_scene_message(topics.SCENE.decode(whole)) == every_shape()
     assert len(whole) < topics.SCENE.max_bytes
     for length in (0, 40, len(whole) // 2, len(whole) - 9):
         with pytest.raises(InvalidInputError, match=r"^scene"):
-            received_scene(whole[:length])
+            parse_scene_message(topics.SCENE.decode(whole[:length]))
     with pytest.raises(InvalidInputError, match=r"^scene: got 131073 bytes, expected at most 131072"):
-        received_scene(bytes(topics.SCENE.max_bytes + 1))
+        topics.SCENE.decode(bytes(topics.SCENE.max_bytes + 1))
     with pytest.raises(InvalidInputError, match=r"^scene\.version: got"):  # ROS replaces what is no UTF-8
-        received_scene(whole.replace(b"gripper", b"grip\xff\xfe\xfd"))
+        parse_scene_message(topics.SCENE.decode(whole.replace(b"gripper", b"grip\xff\xfe\xfd")))

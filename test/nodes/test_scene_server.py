@@ -8,19 +8,18 @@ from typing import Any
 
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
-from magnetosuture_thread.interface import ADD_SHAPE, LOAD_SCENE, REMOVE_SHAPE, REPLACE_SHAPE
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
-from magnetosuture_thread.scene.files import MAX_SHAPE_CHARS
 from test.scene.scenes import every_shape
 
 SERVICES = {
-    "load": (LOAD_SCENE, LoadScene),
-    "add": (ADD_SHAPE, EditShape),
-    "replace": (REPLACE_SHAPE, EditShape),
-    "remove": (REMOVE_SHAPE, RemoveShape),
+    "load": (Service.LOAD_SCENE, LoadScene),
+    "add": (Service.ADD_SHAPE, EditShape),
+    "replace": (Service.REPLACE_SHAPE, EditShape),
+    "remove": (Service.REMOVE_SHAPE, RemoveShape),
 }
 DISC = "{disc: {center: [0.001, 0.002], radius: 0.001}, kind: instrument}"
 WIDER = "{disc: {center: [0.001, 0.002], radius: 0.002}, kind: instrument}"
@@ -101,21 +100,9 @@ HOSTILE: list[tuple[str, dict[str, str], str]] = [
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
     ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
     ("add", {"name": "post", "shape": DISC}, "post: got 'a name given twice', expected a name of its own"),
-    (
-        "add",
-        {"name": "a", "shape": "{disc: {center: [1, 2], radius: 0.5}"},
-        "shape: got \"did not find expected ',' or",
-    ),
     ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
-    ("add", {"name": "a", "shape": "{disc: {center: [1, 1], radius: 0.1}}"}, "a: got 'a shape outside of the dish"),
-    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 0.001}, friction: -0.1}"}, "a.friction: got -0.1"),
     ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
     ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
-    (
-        "add",
-        {"name": "a", "shape": "#" * (MAX_SHAPE_CHARS + 1)},
-        "shape: got '300001 characters', expected at most 300",
-    ),
     ("replace", {"name": "none", "shape": DISC}, "shape.name: got 'none', expected one of post"),
     ("remove", {"name": "x" * 100_000}, "shape.name: got 'xxxxxxxx"),
 ]

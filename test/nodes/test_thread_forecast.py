@@ -22,11 +22,11 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.interface import FORECAST_PATH
+from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
 from magnetosuture_thread.messages.packing import packed_forecast
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.thread_forecast import make_path_follower
+from magnetosuture_thread.nodes.thread_model import make_path_follower
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from test.estimator.threads import whole
@@ -104,11 +104,12 @@ def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: p
     heading, tail = WAY[0].heading, WAY[0].tail
     ahead = [Point(x=x, y=y) for x, y in (tail + np.outer([0.012, 0.03], heading)).tolist()]
     assert (
-        "no estimate yet" in graph.call(ForecastPath, FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.0).message
+        "no estimate yet"
+        in graph.call(ForecastPath, Service.FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.0).message
     )
     bench.show(0)
     graph.wait(lambda: len(forecasts) == 1, "a forecast")
-    answer = graph.call(ForecastPath, FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.2)
+    answer = graph.call(ForecastPath, Service.FORECAST_PATH, 60.0, path=ahead, speed=0.004, horizon=1.2)
     assert (answer.success, answer.message) == (True, "")
     found = answer.forecast
     assert found.header.stamp == stamp(0)
@@ -123,10 +124,7 @@ def test_a_client_is_told_what_happens_along_its_path(graph: Any, monkeypatch: p
     [
         ({"path": []}, "path: got 0 points"),
         ({"path": [Point(x=math.nan)]}, "path: got a point that is not finite"),
-        ({"path": [Point(x=9.0)]}, "expected within 0.5 m"),
-        ({"speed": -0.001}, "speed: got -0.001"),
         ({"speed": math.nan}, "speed: got nan"),
-        ({"horizon": 0.0}, "horizon: got 0.0"),
         ({"horizon": math.inf}, "horizon: got inf"),
         ({"path": [Point()] * 1001}, "1001"),
     ],

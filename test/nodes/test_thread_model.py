@@ -108,12 +108,9 @@ def test_the_papers_formulation_runs_in_the_graph(graph):
     ("spoil", "words"),
     [
         (lambda p: setattr(p.pose.pose.position, "x", math.nan), "finite coordinates"),
-        (lambda p: setattr(p.pose.pose.position, "y", math.inf), "finite coordinates"),
-        (lambda p: setattr(p.pose.pose.orientation, "w", math.nan), "a unit quaternion"),
         (lambda p: setattr(p.pose.pose.orientation, "w", 7.0), "a unit quaternion"),
         (lambda p: setattr(p.header, "frame_id", "map"), "'dish'"),
         (lambda p: setattr(p.header, "stamp", stamp(0.9)), "later than"),
-        (lambda p: setattr(p.header, "stamp", Time(sec=2**31 - 1, nanosec=2**32 - 1)), "header.stamp.nanosec"),
     ],
 )
 def test_a_bad_pose_is_refused_said_and_survived(graph, spoil, words):

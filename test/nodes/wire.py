@@ -28,6 +28,11 @@ compressed_image = decoded(topics.COMPRESSED_IMAGE, packing.packed_compressed_im
 scene_message = decoded(topics.SCENE, packed_scene)
 
 
+def no_margins(stamp: Any, reason: str) -> Any:
+    """Return the message that says that there are no margins, and why."""
+    return topics.MARGINS.decode(packing.packed_margins(stamp, None, reason))
+
+
 def header(stamp: Any) -> Header:
     """Return a header in the dish frame."""
     return Header(stamp=time(stamp), frame_id="dish")
