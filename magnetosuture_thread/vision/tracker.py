@@ -235,7 +235,7 @@ class VisionTracker:
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
         needle, picture, whole, reason = self._choose(image, time_s)
-        if needle is None:
+        if needle is None or picture is None:
             return no_pose(self._missing(), reason, view)
         found = self._measured(picture, needle, search=whole)
         if not whole and self._is_cut(found, picture):
@@ -296,9 +296,7 @@ class VisionTracker:
             self._mask = ((rounded, image.shape[:2]), mask)
         return self._mask[1]
 
-    def _choose(
-        self, image: np.ndarray, time: float
-    ) -> tuple[MeasuredNeedle, Picture, bool, str] | tuple[None, None, bool, str]:
+    def _choose(self, image: np.ndarray, time: float) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last, settings = self._found_dish().view, self._last, self._settings
         size = self._length.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
