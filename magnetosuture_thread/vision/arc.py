@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnetosuture_thread.vision.images import sampled
+from magnetosuture_thread.vision.images import straighten
 
 SET_TOLERANCE = 0.1  # of the length as it is set
 FRAMES = 8  # that must agree
@@ -48,7 +48,10 @@ class Arc:
 
     def strip(self, image: np.ndarray, along: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """Return an image at n lengths along the arc and m distances aside of it, shape (n, m)."""
-        return sampled(image, self.at(along[:, None], aside))
+        start = float(self.start[0]), float(self.start[1]), float(self.angle), float(self.curvature)
+        strip = np.empty((len(along), len(aside)))
+        straighten(image, start, along, aside, strip)
+        return strip
 
     @property
     def axis(self) -> tuple[float, float, float, float]:

@@ -13,6 +13,7 @@ height, parallax, calibration):
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -406,3 +407,25 @@ def sample_all(image, points, values):
     """Fill in an image at points, shape (m, 2); see `within`."""
     for index in range(len(points)):
         values[index] = within(image, points[index, 0], points[index, 1])
+
+
+@compiled
+def straighten(gray, start, along, aside, strip):
+    """Fill a strip with the image along an arc; see `Arc.at`.
+
+    Args:
+        gray: shape (rows, columns), uint8.
+        start: u, v, angle and curvature of the arc [px, px, rad, 1/px].
+        along: lengths along the arc, shape (n,) [px].
+        aside: distances aside of it, shape (m,) [px].
+        strip: filled, shape (n, m).
+    """
+    u, v, angle, curvature = start
+    for row in range(len(along)):
+        s = along[row]
+        half = 0.5 * curvature * s
+        chord = s if abs(half) < 1e-9 else s * math.sin(half) / half
+        x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
+        across, down = -math.sin(angle + 2.0 * half), math.cos(angle + 2.0 * half)
+        for column in range(len(aside)):
+            strip[row, column] = within(gray, x + aside[column] * across, y + aside[column] * down)

@@ -114,12 +114,17 @@ def _dark_components(picture: Picture, radius: float, cut: float, area: float) -
     cv2.bitwise_and(dark, inside, dark)
     if picture.mask is not None:
         dark[picture.mask.depth > cut] = 0
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(dark, connectivity=8)
+    outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     result = []
-    for label in 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= MIN_AREA * area):
-        left, top, width, height = stats[label, :4]
-        rows, columns = np.nonzero(labels[top : top + height, left : left + width] == label)
-        result.append(np.column_stack([columns + left, rows + top]).astype(float))
+    for outline in outlines:
+        left, top, width, height = cv2.boundingRect(outline)
+        if width * height < MIN_AREA * area:  # A component is no larger than its box, so most are passed over at once.
+            continue
+        own = np.zeros((height, width), np.uint8)
+        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-left, -top))
+        rows, columns = np.nonzero(own & dark[top : top + height, left : left + width])
+        if len(rows) >= MIN_AREA * area:
+            result.append(np.column_stack([columns + left, rows + top]).astype(float))
     return result
 
 
