@@ -16,9 +16,9 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.parameter_files import EVERY_NODE
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.vision.arc import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.dish import find_dish
 from magnetosuture_thread.vision.images import check_image, measured_channel
-from magnetosuture_thread.vision.needle.arc import FRAMES, SET_TOLERANCE
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 

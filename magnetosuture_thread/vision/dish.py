@@ -1,21 +1,31 @@
-"""Finds the petri dish, a bright disc within a dark rim, how far the camera over it is tilted, and whether it moves.
+"""Finds the petri dish, how far the camera over it is tilted, and whether it moves.
 
-The dish is found by its rim; without one, as in a photograph, by the edge of its wall, see `ellipse`.
+The dish is a bright disc within a dark rim; without one, as in a photograph, an ellipse that the edges of its wall
+agree on, whatever is brighter.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.vision.ellipse import FINE_AGREEMENT, Ellipse, edge_along, find_ellipse, fitted_robustly
-from magnetosuture_thread.vision.images import Gray, measured_channel, middle, sampled
+from magnetosuture_thread.vision.images import Gray, measured_channel, middle, sampled, shrunk
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
+
+COARSE_SIDE = 160  # rows or columns of the image in which an ellipse is looked for
+MIN_RADIUS, MAX_RADIUS = 0.12, 0.8  # of the shorter side
+CELL = 2.0  # px; of votes
+RING = 1.03  # ratio of radii of a ring
+BINS = 72  # directions
+ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
+AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
+MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
+NORMALS, FINE_REACH = 180, 0.03  # along which the edge is measured; how far, of the radius
 
 RAYS, RIM_RAYS = 180, 72  # along which the rim is looked for, and of the quick check
 SHARE_OF_RAYS = 0.6  # of the rays must meet the fitted circle
@@ -29,11 +39,332 @@ NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most
 
 DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
 SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
-AGREEING = 3  # frames in a row that must agree on a new view
 LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
 
+Circle = tuple[float, float, float, int]  # u, v and radius [px], and how many points agree
 
-Guess = tuple[float, float, float]  # u, v and radius of a circle [px]
+
+@dataclass(frozen=True)
+class Ellipse:
+    """An ellipse in an image.
+
+    Attributes:
+        centre_px: u and v [px].
+        major: half of the longer axis [px].
+        minor: half of the shorter one [px].
+        direction: of the shorter one [rad], from u towards v.
+    """
+
+    centre_px: tuple[float, float]
+    major: float
+    minor: float
+    direction: float
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Unit vectors along the shorter and the longer axis, by rows, shape (2, 2)."""
+        cosine, sine = math.cos(self.direction), math.sin(self.direction)
+        return np.array([[cosine, sine], [-sine, cosine]])
+
+    def points(self, count: int) -> tuple[Points, Points]:
+        """Return points of the ellipse and its outward normals, both of shape (count, 2)."""
+        turns = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        circle = np.column_stack([np.cos(turns), np.sin(turns)])
+        normals = circle * (self.major, self.minor) @ self.axes
+        return self.at(circle), normals / np.hypot(*normals.T)[:, None]
+
+    def coordinates(self, points: Points) -> Points:
+        """Return points along the shorter and the longer axis, in halves of them, shape (m, 2)."""
+        return np.asarray((points - self.centre_px) @ self.axes.T / (self.minor, self.major))
+
+    def at(self, coordinates: Points) -> Points:
+        """Return the points of coordinates, the inverse of `coordinates` [px]."""
+        return np.asarray(coordinates * (self.minor, self.major) @ self.axes + self.centre_px)
+
+    def is_cut(self, shape: tuple[int, ...]) -> bool:
+        """Say whether a part of it lies outside of an image of a shape (rows, columns)."""
+        points, _ = self.points(60)
+        return not ((points > 0.0) & (points < np.array(shape[1::-1]) - 1.0)).all()
+
+    def scaled(self, factor: float) -> Ellipse:
+        """Return the ellipse in an image enlarged by a factor."""
+        shift = 0.5 * (factor - 1.0)
+        u, v = (value * factor + shift for value in self.centre_px)
+        return replace(self, centre_px=(u, v), major=self.major * factor, minor=self.minor * factor)
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges of an image of a shape (rows, columns): their places and unit gradients, both of shape (m, 2)."""
+
+    points: Points
+    normals: Points
+    shape: tuple[int, ...]
+
+    def radii(self, ellipse: Ellipse) -> tuple[Points, np.ndarray]:
+        """Return the edges' coordinates in an ellipse, and which of their gradients lie along its normals."""
+        at = ellipse.coordinates(self.points)
+        normal = at / (ellipse.minor, ellipse.major)
+        along = (normal * (self.normals @ ellipse.axes.T)).sum(axis=1)
+        return at, np.abs(along) > ALIGNMENT * np.hypot(*normal.T)
+
+
+def find_ellipse(image: np.ndarray) -> Ellipse | None:
+    """Find the inner edge of a dish's wall, by gradients alone.
+
+    In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
+    is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
+    with the most votes, random samples of five edges give ellipses, and the one is kept that edges in the most
+    directions agree on, within a share of its radius. In the full image the edge is measured along its normals.
+
+    Args:
+        image: shape (rows, columns) or (rows, columns, 3), uint8.
+
+    Returns:
+        The ellipse, or None if no edges agree on one.
+    """
+    factor = max(1.0, min(image.shape[:2]) / COARSE_SIDE)
+    size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
+    if max(size) > 4 * COARSE_SIDE:  # no frame of a camera
+        return None
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
+    edges = _edges_of(small)
+    if len(edges.points) < 40:
+        return None
+    found = _candidates(edges, 1.0, 0.0)
+    if not found or max(share for _, share, _ in found) < 0.8:
+        found += [each for way in range(4) for each in _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)]
+    if not found:
+        return None
+    _, _, best = max(found, key=lambda each: each[0])
+    return _refined(image, best.scaled(image.shape[1] / small.shape[1]))
+
+
+def edge_along(gray: Gray, at: Ellipse, reach: float = FINE_REACH) -> Points:
+    """Return where an image changes most along the normals of an ellipse, in the stronger sign, shape (m, 2).
+
+    Args:
+        gray: shape (rows, columns), uint8.
+        at: the ellipse [px].
+        reach: how far to look to both sides of it, as a share of its radius.
+    """
+    step, half = 0.5, int(2.0 * max(4.0, reach * at.major))
+    points, normals = at.points(NORMALS)
+    offsets = step * np.arange(-half, half + 1)
+    profiles = sampled(gray, points[:, None] + offsets[:, None] * normals[:, None])
+    # Slope of a line through five samples.
+    slopes = (2.0 * (profiles[:, 4:] - profiles[:, :-4]) + profiles[:, 3:-1] - profiles[:, 1:-3]) / (10.0 * step)
+    inside = ((points >= 1.0) & (points <= np.array(gray.shape[::-1]) - 2.0)).all(axis=1)
+    rows, steepest = np.arange(NORMALS), np.abs(slopes).argmax(axis=1)
+    strongest = np.where(inside, slopes[rows, steepest], 0.0)
+    sign = 1.0 if np.sum(np.sign(strongest) * np.sqrt(np.abs(strongest))) > 0.0 else -1.0
+    slopes = sign * slopes
+    steepest = slopes.argmax(axis=1)
+    kept = inside & (steepest > 0) & (steepest < slopes.shape[1] - 1)
+    kept &= slopes[rows, steepest] > 0.5  # grey levels a pixel
+    rows, steepest = rows[kept], steepest[kept]
+    before, top, after = (np.abs(slopes[rows, steepest + shift]) for shift in (-1, 0, 1))
+    bend = before - 2.0 * top + after
+    part = np.where(bend < 0.0, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
+    return np.asarray(points[rows] + (offsets[steepest + 2] + step * part)[:, None] * normals[rows])
+
+
+def fitted_robustly(points: Points, begin: Ellipse) -> Ellipse | None:
+    """Return the ellipse that most points agree on, near a first one; None if few do."""
+    kept, at = points, begin
+    for tolerance in (4.0 * FINE_AGREEMENT, 2.0 * FINE_AGREEMENT, FINE_AGREEMENT):
+        fitted = _fitted(kept)
+        if fitted is None:
+            return None
+        at = fitted
+        kept = points[np.abs(np.hypot(*at.coordinates(points).T) - 1.0) < max(tolerance, 1.0 / at.major)]
+        if len(kept) < NORMALS // 4:
+            return None
+    if math.dist(at.centre_px, begin.centre_px) > 0.05 * begin.major or abs(at.major / begin.major - 1.0) > 0.08:
+        return None
+    return at
+
+
+def _edges_of(image: np.ndarray) -> _Edges:
+    """Return the points of an image whose gradient is greatest along its own direction, at most 3000."""
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+    along_u, along_v = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.125) for order in ((1, 0), (0, 1)))
+    strength = np.hypot(along_u, along_v)
+    if image.ndim == 3:  # of the colour that changes most
+        most = strength.argmax(axis=2)[..., None]
+        along_u, along_v, strength = (np.take_along_axis(a, most, axis=2)[..., 0] for a in (along_u, along_v, strength))
+    rows, columns = (index + 1 for index in np.nonzero(strength[1:-1, 1:-1] >= 4.0))
+    value = strength[rows, columns]
+    normals = np.column_stack([along_u[rows, columns], along_v[rows, columns]]) / value[:, None]
+    right, down = np.rint(normals).astype(int).T
+    thin = (value >= strength[rows + down, columns + right]) & (value > strength[rows - down, columns - right])
+    chosen = np.flatnonzero(thin)
+    chosen = np.sort(chosen[np.argsort(value[chosen], kind="stable")[-3000:]])  # The weak ones are texture.
+    return _Edges(
+        np.column_stack([columns, rows])[chosen].astype(float), normals[chosen].astype(float), image.shape[:2]
+    )
+
+
+def _candidates(edges: _Edges, ratio: float, direction: float) -> list[tuple[float, float, Ellipse]]:
+    """Return ellipses with their scores and supports, of edges stretched in a direction by a ratio."""
+    along = np.array([math.cos(direction), math.sin(direction)])
+    stretch = np.eye(2) + (ratio - 1.0) * np.outer(along, along)
+    back = np.linalg.inv(stretch)
+    normals = edges.normals @ back
+    moved = _Edges(edges.points @ stretch, normals / np.hypot(*normals.T)[:, None], edges.shape)
+    return [each for centre in _centres(moved, ratio) for each in _around(edges, moved, centre, back)]
+
+
+def _centres(edges: _Edges, ratio: float) -> list[Points]:
+    """Return the four places with the most votes of edges along their gradients, each of shape (2,).
+
+    The image was stretched by a ratio in some direction.
+    """
+    side, size = min(edges.shape), np.array(edges.shape[::-1])
+    low = -0.15 * side - (ratio - 1.0) * size
+    wide, tall = np.ceil((size + 0.15 * side + 2.0 * (ratio - 1.0) * size - low) / CELL).astype(int)
+    radii = np.arange(MIN_RADIUS * side, MAX_RADIUS * side, CELL)
+    steps = np.concatenate([-radii, radii])[:, None, None]
+    cells = np.floor((edges.points + steps * edges.normals - low) / CELL).astype(int).reshape(-1, 2)
+    cells = cells[((cells >= 0) & (cells < (wide, tall))).all(axis=1)]
+    votes = np.bincount(cells[:, 1] * wide + cells[:, 0], minlength=wide * tall).reshape(tall, wide)
+    votes = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), 1.5)
+    votes -= cv2.blur(votes, (31, 31))
+    found = []
+    for _ in range(4):
+        _, _, _, (column, row) = cv2.minMaxLoc(votes)
+        votes[max(0, row - 4) : row + 5, max(0, column - 4) : column + 5] = -np.inf
+        found.append(low + CELL * (np.array([column, row]) + 0.5))
+    return found
+
+
+def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> list[tuple[float, float, Ellipse]]:
+    """Return the ellipses around a centre with their scores and supports.
+
+    Args:
+        edges: of the image.
+        moved: the same in the stretched image.
+        centre: in the stretched image, shape (2,) [px].
+        back: matrix that takes points of the stretched image back, shape (2, 2).
+    """
+    smallest, largest = MIN_RADIUS * min(edges.shape), MAX_RADIUS * min(edges.shape)
+    offset = moved.points - centre
+    away = np.hypot(*offset.T)
+    facing = np.abs((offset * moved.normals).sum(axis=1)) > ALIGNMENT * away
+    rings = (np.log(np.maximum(away, 1e-9) / smallest) / math.log(RING)).astype(int)
+    marks = np.zeros((int(math.log(largest / smallest) / math.log(RING)) + 2, BINS), np.bool_)
+    inside = facing & (away >= smallest) & (rings < len(marks))
+    marks[rings[inside], _sectors(offset[inside])] = True
+    spread = marks.copy()  # An ellipse is no circle: it lies in several rings.
+    for shift in (1, 2):
+        spread[shift:] |= marks[:-shift]
+        spread[:-shift] |= marks[shift:]
+    support = spread.sum(axis=1)
+    found = []
+    for _ in range(2):
+        ring = int(support.argmax())
+        if support[ring] < 0.35 * BINS:
+            break
+        support[max(0, ring - 4) : ring + 5] = 0
+        radius = smallest * RING ** (ring + 0.5)
+        some = np.flatnonzero(facing & (np.abs(away - radius) < 0.14 * radius))
+        points = _through(offset[some[:: 1 + len(some) // 300]], max(0.8, AGREEMENT * radius))
+        ellipse = _fitted((centre + points) @ back) if points is not None else None
+        if ellipse is None:
+            continue
+        share, seen = _support(edges, ellipse)
+        if seen >= 0.5 and share >= 0.6 + 0.5 * (1.0 - seen):  # Of a short arc chance is more.
+            score = share * math.sqrt(seen) * (ellipse.major / min(edges.shape)) ** 0.25
+            found.append((score, share, ellipse))
+    return found
+
+
+def _sectors(offsets: Points) -> np.ndarray:
+    """Return in which of `BINS` directions offsets lie, shape (m,)."""
+    return ((np.arctan2(offsets[:, 1], offsets[:, 0]) / (2.0 * np.pi) + 1.0) * BINS).astype(int) % BINS
+
+
+def _support(edges: _Edges, ellipse: Ellipse) -> tuple[float, float]:
+    """Return in which share of the directions in the frame edges agree with an ellipse, and the share in the frame."""
+    points, _ = ellipse.points(BINS)
+    inside = ((points > 1.0) & (points < np.array(edges.shape[::-1]) - 2.0)).all(axis=1)
+    if not inside.any():
+        return 0.0, 0.0
+    at, facing = edges.radii(ellipse)
+    agree = facing & (np.abs(np.hypot(*at.T) - 1.0) < max(0.8 / ellipse.major, AGREEMENT))
+    marks = np.zeros(BINS, bool)
+    marks[_sectors(at[agree])] = True
+    return float((marks & inside).sum() / inside.sum()), float(inside.mean())
+
+
+def _through(offsets: Points, tolerance: float) -> Points | None:
+    """Return points of the ellipse near a centre that edges in the most directions agree on, by random samples of five.
+
+        r(t) = c_0 + c_1 cos t + c_2 sin t + c_3 cos 2t + c_4 sin 2t
+
+    Args:
+        offsets: of the edges from the centre, shape (m, 2) [px].
+        tolerance: between an edge and the ellipse [px].
+
+    Returns:
+        Offsets of `BINS` points from the centre, shape (BINS, 2); None where no edges agree.
+    """
+    if len(offsets) < 20:
+        return None
+    basis, radii, sectors = (
+        _harmonics(np.arctan2(offsets[:, 1], offsets[:, 0])),
+        np.hypot(*offsets.T),
+        _sectors(offsets),
+    )
+    picked = np.random.default_rng(0).integers(0, len(offsets), (1000, 5))
+    spread = np.diff(np.sort(sectors[picked], axis=1), axis=1).min(axis=1) > 2  # directions apart
+    picked = picked[spread][:400]
+    systems = basis[picked]
+    picked = picked[np.abs(np.linalg.det(systems)) > 1e-3]
+    shapes = np.linalg.solve(basis[picked], radii[picked][..., None])[..., 0]
+    eccentric, flat = np.hypot(shapes[:, 1], shapes[:, 2]), np.hypot(shapes[:, 3], shapes[:, 4])
+    shapes = shapes[(eccentric < 0.2 * shapes[:, 0]) & (flat < 0.12 * shapes[:, 0])]
+    if not len(shapes):
+        return None
+    sample, edge = np.nonzero(np.abs(shapes @ basis.T - radii) < tolerance)
+    marks = np.zeros((len(shapes), BINS), np.bool_)
+    marks[sample, sectors[edge]] = True
+    turns = np.linspace(0.0, 2.0 * np.pi, BINS, endpoint=False)
+    best = _harmonics(turns) @ shapes[marks.sum(axis=1).argmax()]
+    return np.asarray(best[:, None] * np.column_stack([np.cos(turns), np.sin(turns)]))
+
+
+def _harmonics(turns: np.ndarray) -> np.ndarray:
+    """Return the functions of `_through` at some angles, shape (m, 5)."""
+    return np.column_stack(
+        [np.ones_like(turns), np.cos(turns), np.sin(turns), np.cos(2.0 * turns), np.sin(2.0 * turns)]
+    )
+
+
+def _refined(image: np.ndarray, ellipse: Ellipse) -> Ellipse | None:
+    """Return an ellipse measured along its normals, in the image's own pixels."""
+    gray = measured_channel(image)
+    factor = max(1, round(min(gray.shape) / 960))  # rows or columns are enough to measure in
+    gray, at = shrunk(gray, factor), ellipse.scaled(1.0 / factor)
+    for reach in (FINE_REACH, 0.5 * FINE_REACH):
+        fitted = fitted_robustly(edge_along(gray, at, reach), at)
+        if fitted is None:
+            break
+        at = fitted
+    return at.scaled(float(factor)) if at.minor > MIN_RATIO * at.major else None
+
+
+def _fitted(points: Points) -> Ellipse | None:
+    """Return the least-squares ellipse of points; None where there is none near a circle."""
+    if len(points) < 6:
+        return None
+    mean = points.mean(axis=0)
+    (u, v), axes, angle = cv2.fitEllipseDirect((points - mean).astype(np.float32))
+    minor, major = 0.5 * min(axes), 0.5 * max(axes)
+    if not (np.isfinite([u, v, minor, major]).all() and major > 1.0 and minor > MIN_RATIO * major):
+        return None
+    direction = math.radians(angle) + (0.0 if axes[0] <= axes[1] else 0.5 * math.pi)
+    return Ellipse((float(u + mean[0]), float(v + mean[1])), major, minor, direction)
 
 
 @dataclass(frozen=True)
@@ -43,45 +374,10 @@ class Tilt:
     Attributes:
         angle: between its axis and the dish's normal [rad].
         direction: in the image, along which the dish looks shortened [rad], from u towards v.
-        rotation: of the dish's x axis in the image [rad]; see `DishView`.
     """
 
     angle: float
     direction: float
-    rotation: float = 0.0
-
-    @property
-    def direction_in_dish(self) -> np.ndarray:
-        """Direction along which the dish looks shortened, in the dish frame, shape (2,)."""
-        angle = -self.direction - self.rotation
-        return np.array([math.cos(angle), math.sin(angle)])
-
-    def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
-        """Return what perspective leaves unknown, shape (3, 3) [m, m, rad].
-
-        An ellipse does not tell which side is nearer.
-
-        Args:
-            tail: in the dish frame, shape (2,) [m].
-            heading: unit tangent there, shape (2,).
-            radius: of the dish [m].
-        """
-        along = self.direction_in_dish
-        change = perspective(tail, heading, radius)
-        either = change @ (math.tan(self.angle) * along)
-        # Light and noise change a tilt by 2 degrees.
-        return np.outer(either, either) + unseen_tilt_covariance(tail, heading, math.radians(2.0), radius)
-
-    def corrected(self, image: np.ndarray, view: DishView) -> np.ndarray:
-        """Return a frame in which the dish is a circle about its centre: stretched along the direction by 1 / cos."""
-        along = np.array([math.cos(self.direction), math.sin(self.direction)])
-        tilted = np.eye(3)
-        tilted[:2, :2] += (math.cos(self.angle) - 1.0) * np.outer(along, along)
-        to_centre = np.array([[1.0, 0.0, view.centre_px[0]], [0.0, 1.0, view.centre_px[1]], [0.0, 0.0, 1.0]])
-        inverse = to_centre @ tilted @ np.linalg.inv(to_centre)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        size = image.shape[1::-1]
-        return np.asarray(cv2.warpPerspective(image, inverse, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
 def perspective(tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
@@ -137,13 +433,22 @@ class FoundDish:
 
     def covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
         """Return what the view leaves unknown of a tail and a heading in a dish, shape (3, 3) [m, m, rad]."""
-        total = np.zeros((3, 3))
-        total[:2, :2] = self.scale_error**2 * np.outer(tail, tail)  # A wrong scale shifts what is far from the centre.
-        if self.tilt is not None:
-            total += self.tilt.covariance(tail, heading, radius)
-        elif self.unseen_tilt:
-            total += unseen_tilt_covariance(tail, heading, self.unseen_tilt, radius)
+        total = self.tilt_covariance(tail, heading, radius)
+        total[:2, :2] += self.scale_error**2 * np.outer(tail, tail)  # A wrong scale shifts what is far from the centre.
         return total
+
+    def tilt_covariance(self, tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
+        """Return what the camera's tilt leaves unknown, shape (3, 3) [m, m, rad]; see `perspective`.
+
+        An ellipse does not tell which side is nearer. Below the angle `unseen_tilt` there is no ellipse.
+        """
+        if self.tilt is None:
+            return unseen_tilt_covariance(tail, heading, self.unseen_tilt, radius)
+        angle = -self.tilt.direction - self.view.rotation
+        along = np.array([math.cos(angle), math.sin(angle)])  # in the dish frame
+        either = perspective(tail, heading, radius) @ (math.tan(self.tilt.angle) * along)
+        # Light and noise change a tilt by 2 degrees.
+        return np.outer(either, either) + unseen_tilt_covariance(tail, heading, math.radians(2.0), radius)
 
     @property
     def warning(self) -> str:
@@ -152,13 +457,20 @@ class FoundDish:
         return "; ".join(filter(None, (tilted, self.remark)))
 
     def prepared(self, image: np.ndarray) -> np.ndarray:
-        """Return a frame with a bright floor and a round dish."""
+        """Return a frame with a bright floor and a round dish: a tilted one is stretched by 1 / cos of the angle."""
         if self.dark_field:
             image = 255 - image
-        if self.homography is not None:
-            size = image.shape[1::-1]
-            return np.asarray(cv2.warpPerspective(image, self.homography, size, borderMode=cv2.BORDER_REPLICATE))
-        return image if self.tilt is None else self.tilt.corrected(image, self.view)
+        homography = self.homography
+        if self.tilt is not None:
+            along = np.array([math.cos(self.tilt.direction), math.sin(self.tilt.direction)])
+            homography = np.eye(3)
+            homography[:2, :2] += (1.0 / math.cos(self.tilt.angle) - 1.0) * np.outer(along, along)
+            centre = np.array(self.view.centre_px)
+            homography[:2, 2] = centre - homography[:2, :2] @ centre
+        if homography is None:
+            return image
+        size = image.shape[1::-1]
+        return np.asarray(cv2.warpPerspective(image, homography, size, borderMode=cv2.BORDER_REPLICATE))
 
 
 def see_dish(
@@ -173,17 +485,16 @@ def see_dish(
         photographed: whether to look for a dish as in a photograph where there is no other, which takes long.
     """
     gray = measured_channel(image)
-    guesses: dict[int, Guess | None] = {}
     fixed = settings.fixed_view()
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
-        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _with_given(find_dish(gray, diameter, guesses), settings) is None
-        dark = dark and _with_given(find_dish(255 - gray, diameter, guesses), settings) is not None
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _with_given(find_dish(gray, diameter), settings) is None
+        dark = dark and _with_given(find_dish(255 - gray, diameter), settings) is not None
         return FoundDish(fixed, dark, homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
-        found = _with_given(find_dish(gray, diameter, guesses), settings)
+        found = _with_given(find_dish(gray, diameter), settings)
         if found is None:
             continue
         view, remark = found
@@ -222,14 +533,13 @@ def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: 
     if ellipse is None:
         return None
     gray, found = measured_channel(image), DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major)
-    tilt, unseen_tilt = tilt_of(ellipse, settings.camera_rotation), MIN_ANGLE
+    tilt, unseen_tilt = tilt_of(ellipse), MIN_ANGLE
     if tilt is not None and ellipse.is_cut(image.shape):
-        # A part of an ellipse does not determine its axes: an edge that is off by a pixel looks like a tilt.
-        circle = fit_circle(edge_along(gray, ellipse), max(1.0, FINE_AGREEMENT * ellipse.major))
-        cut = find_cut_dish(gray, circle[:3], diameter) if circle is not None else None
+        cut = _find_cut_dish(gray, ellipse, diameter)
         if cut is None:
             return None
-        found, tilt, unseen_tilt = cut, None, math.radians(10.0)
+        found = cut
+        tilt, unseen_tilt = None, math.radians(10.0)
     if (given := _with_given(found, settings)) is None:
         return None
     view, remark = given
@@ -254,9 +564,7 @@ class DishWatch:
     """
 
     def __init__(self, settings: VisionTrackerSettings, diameter: float) -> None:
-        self._settings = settings
-        self._diameter = diameter
-        self._fixed = settings.fixed_view()
+        self._settings, self._diameter, self._fixed = settings, diameter, settings.fixed_view()
         self.found: FoundDish | None = None
         self._anew: list[FoundDish] = []
         self._searched = 0  # frames in a row without a dish
@@ -301,7 +609,7 @@ class DishWatch:
         if self._anew and not self._agree(found, self._anew[-1]):
             self._anew = []
         self._anew.append(found)
-        if len(self._anew) < AGREEING:
+        if len(self._anew) < 3:  # frames in a row that must agree on a new view
             return "the dish is not where it was", prepared
         self.found, self._anew = found, []
         return "", found.prepared(image)
@@ -322,7 +630,7 @@ class DishWatch:
         return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)
 
 
-def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None] | None = None) -> DishView | None:
+def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
     """Find the dish by the inner edge of its rim.
 
     A circle transform of a small image gives the first guess; then rays from its centre meet the edge
@@ -333,70 +641,54 @@ def find_dish(gray: np.ndarray, diameter: float, guesses: dict[int, Guess | None
     Args:
         gray: image, shape (rows, columns), uint8.
         diameter: the dish's inner diameter [m], which gives the scale.
-        guesses: first guesses by the rows of the small image; filled. Those of the negative are the same.
 
     Returns:
         The view, or None if no dish is seen: too few rays agree on a circle.
     """
-    guesses = {} if guesses is None else guesses
-    for side in (60, 120):  # rows of the small image; the second only if the first fails
-        if side not in guesses:
-            guesses[side] = _first_guess(gray, side)
-        guess = guesses[side]
-        if guess is None:
-            continue
-        fitted = _fit_rim(gray, guess)
+    for rows in (60, 120):  # of the small image; the second only if the first fails
+        guess = _first_guess(gray, rows)
+        fitted = _fit_rim(gray, guess) if guess is not None else None
         if fitted is None or fitted[0][3] < SHARE_OF_RAYS * RAYS:
             continue
-        (u, v, radius, _), _, darkest = fitted
-        ring = fit_circle(darkest, 0.5 * AGREEMENT_PX)
-        if ring is not None and ring[3] >= SHARE_OF_RAYS * RAYS and np.hypot(ring[0] - u, ring[1] - v) < AGREEMENT_PX:
+        (u, v, radius, _), _, ring = fitted
+        if ring is not None and ring[3] >= SHARE_OF_RAYS * RAYS and math.dist(ring[:2], (u, v)) < AGREEMENT_PX:
             u, v = ring[:2]
-        elif _is_saturated(gray, u, v, radius):  # Then the edge lies where the light makes it seem to.
-            continue
         return DishView((u, v), 0.5 * diameter / radius)
     return None
 
 
-def _fit_rim(gray: Gray, guess: Guess) -> tuple[tuple[float, float, float, int], Points, Points] | None:
-    """Return the circle along a rim's inner edge, that edge and the darkest ring; None if too few rays agree."""
-    edges = darkest = np.empty((0, 2))
-    fitted = (*guess, 0)
+def _fit_rim(gray: Gray, guess: tuple[float, float, float]) -> tuple[Circle, Points, Circle | None] | None:
+    """Return the circle along a rim's inner edge, that edge, and the circle along the rim's darkest ring.
+
+    None if too few rays agree on the first.
+    """
+    circle, edges, darkest = (*guess, 0), np.empty((0, 2)), np.empty((0, 2))
     # In shares of the radius: by a first guess, and once it is known.
     for reach, step in ((0.12, 1.0), (REACH, 0.5)):
-        u, v, radius, _ = fitted
+        u, v, radius, _ = circle
         edges, darkest = rim_points(gray, (u, v), radius, reach * radius, step, RAYS)
         found = fit_circle(edges, AGREEMENT_PX)
         if found is None:
             return None
-        fitted = found
-    return fitted, edges, darkest
+        circle = found
+    return circle, edges, fit_circle(darkest, 0.5 * AGREEMENT_PX)
 
 
-def find_cut_dish(gray: np.ndarray, guess: Guess, diameter: float) -> DishView | None:
-    """Find a dish that the frame cuts off by what is seen of its rim: its darkest ring, and its inner edge around that.
+def _find_cut_dish(gray: Gray, ellipse: Ellipse, diameter: float) -> DishView | None:
+    """Find a dish that the frame cuts off, near an ellipse, by what is seen of its rim; None if too few rays agree.
 
-    Args:
-        gray: image, shape (rows, columns), uint8.
-        guess: a circle near it [px].
-        diameter: the dish's inner diameter [m].
-
-    Returns:
-        The view, or None if too few rays agree on a circle, of those that meet it in the frame.
+    A part of an ellipse does not determine its axes: an edge that is off by a pixel looks like a tilt.
     """
-    fitted = _fit_rim(gray, guess)
+    fitted = _fit_rim(gray, (*ellipse.centre_px, 0.5 * (ellipse.major + ellipse.minor)))
     if fitted is None:
         return None
-    (u, v, radius, _), edges, darkest = fitted
-    turns = 2.0 * np.pi * np.arange(RAYS) / RAYS
-    rim = np.array([u, v]) + radius * np.column_stack([np.cos(turns), np.sin(turns)])
-    inside = ((rim > 0.0) & (rim < np.array(gray.shape[::-1]) - 1.0)).all(axis=1).sum()
-    ring = fit_circle(darkest, 0.5 * AGREEMENT_PX)
+    (u, v, radius, _), edges, ring = fitted
+    points, _ = Ellipse((u, v), radius, radius, 0.0).points(RAYS)
+    inside = ((points > 0.0) & (points < np.array(gray.shape[::-1]) - 1.0)).all(axis=1).sum()
     if ring is None or ring[3] < 0.75 * inside or inside < 0.4 * RAYS:
         return None
     # By an edge that light shifts, a part of a circle tells its centre and its radius apart badly.
-    radius = middle(np.hypot(*(edges - ring[:2]).T))
-    return DishView((ring[0], ring[1]), 0.5 * diameter / radius)
+    return DishView(ring[:2], 0.5 * diameter / middle(np.hypot(*(edges - ring[:2]).T)))
 
 
 def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> tuple[float, int]:
@@ -408,28 +700,16 @@ def rim_shift(gray: np.ndarray, centre: tuple[float, float], radius: float) -> t
         radius: and its radius [px].
 
     Returns:
-        How far the rim's darkest ring has moved since, a median over the rays that see it, turned into a
-        shift of its centre [px], and how many of the `RIM_RAYS` rays see it.
+        How far the circle through the rim's darkest ring has moved since [px], and how many of the `RIM_RAYS` rays
+        agree on it.
     """
     edges, darkest = rim_points(gray, centre, radius, 7.0, 1.0, RIM_RAYS)
-    seen = darkest if len(darkest) >= len(edges) // 2 else edges
-    if len(seen) < 8:
-        return 0.0, len(seen)
-    offset = seen - centre
-    distance = np.hypot(*offset.T)
-    ways = offset / distance[:, None]
-    system = np.column_stack([ways, np.ones(len(ways))])
-    kept = np.ones(len(ways), bool)
-    for _ in range(3):
-        normal = system[kept].T @ system[kept] + 1e-9 * np.eye(3)
-        shift = np.linalg.solve(normal, system[kept].T @ distance[kept])
-        residual = np.abs(distance - system @ shift)
-        kept = residual < max(0.5, 2.0 * float(np.median(residual)))
-    return float(np.hypot(shift[0], shift[1])), int(kept.sum())
+    circle = fit_circle(darkest if len(darkest) >= len(edges) // 2 else edges, 0.5 * AGREEMENT_PX)
+    return (math.dist(circle[:2], centre), circle[3]) if circle is not None else (0.0, 0)
 
 
-def _first_guess(gray: np.ndarray, rows: int) -> Guess | None:
-    """Return centre and radius of the strongest large circle, found in a small image of about so many rows."""
+def _first_guess(gray: np.ndarray, rows: int) -> tuple[float, float, float] | None:
+    """Return centre and radius of the strongest large circle, found in a small image of about so many rows [px]."""
     factor = max(1, round(min(gray.shape) / rows))
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) if factor > 1 else gray
     size = (gray.shape[1] // factor, gray.shape[0] // factor)
@@ -503,15 +783,7 @@ def floor_level(gray: np.ndarray, view: DishView, diameter: float) -> float:
     return middle(gray[top:bottom:4, left:right:4])
 
 
-def _is_saturated(gray: np.ndarray, u: float, v: float, radius: float) -> bool:
-    """Say whether the floor near the rim is as bright as the image can show."""
-    angles = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    at = np.column_stack([u + 0.93 * radius * np.cos(angles), v + 0.93 * radius * np.sin(angles)])
-    columns, rows = np.clip(at.round().astype(int), 0, np.array(gray.shape[::-1]) - 1).T
-    return float(np.mean(gray[rows, columns] >= 253)) > 0.15
-
-
-def fit_circle(points: Points, agreement: float) -> tuple[float, float, float, int] | None:
+def fit_circle(points: Points, agreement: float) -> Circle | None:
     """Fit a circle by least squares, leaving out what is far from it.
 
         minimise  sum (x^2 + y^2 - 2 u x - 2 v y - c)^2,    r^2 = c + u^2 + v^2
@@ -538,10 +810,10 @@ def fit_circle(points: Points, agreement: float) -> tuple[float, float, float, i
     return float(centre[0]), float(centre[1]), radius, len(kept)
 
 
-def tilt_of(ellipse: Ellipse, rotation: float) -> Tilt | None:
+def tilt_of(ellipse: Ellipse) -> Tilt | None:
     """Return the tilt under which a circle is seen as an ellipse; None below what one tells."""
     angle = math.acos(min(1.0, ellipse.minor / ellipse.major))
-    return Tilt(angle, ellipse.direction, rotation) if angle > MIN_ANGLE else None
+    return Tilt(angle, ellipse.direction) if angle > MIN_ANGLE else None
 
 
 def find_tilt(gray: Gray, view: DishView, diameter: float) -> tuple[Tilt | None, DishView]:
@@ -564,7 +836,7 @@ def find_tilt(gray: Gray, view: DishView, diameter: float) -> tuple[Tilt | None,
     spread = np.hypot(*ellipse.coordinates(points).T) - 1.0
     near = np.abs(spread) < FINE_AGREEMENT
     noise = float(np.sqrt(np.mean(spread[near] ** 2) * 2.0 / near.sum()))
-    tilt = tilt_of(ellipse, view.rotation)
+    tilt = tilt_of(ellipse)
     if tilt is None or near.sum() < RAYS // 2 or 0.5 * (1.0 - ellipse.minor / ellipse.major) < 4.0 * noise:
         return None, view
     # The circle lies half-way between both axes, so that its scale becomes that of the longer one.

@@ -1,10 +1,20 @@
-"""Images: from bytes to pixels, what of them is measured on, and samples between pixels."""
+"""Images: from bytes to pixels, what of them is measured on, and samples between pixels.
+
+On masks by the scene:
+
+Needle and thread lie outside of every shape of the scene. With d(p) the distance of a pixel p from the outlines,
+positive inside of a shape, and a tolerance t for what the scene's outline and the visible one may differ by (camera
+height, parallax, calibration):
+
+    solid:    d > t              no needle, no thread
+    outline:  |d| <= t + blur    a dark line may be the thread or the shape's own edge
+"""
 
 from __future__ import annotations
 
 import io
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -14,34 +24,164 @@ from PIL import Image
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.untrusted import MAX_PIXELS
-from magnetosuture_thread.vision.scene_mask import SceneMask
 from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 
+BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
+OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
+
 CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
-FLOOR_FACTOR = 8  # the floor's brightness is known on a grid of this many pixels
+CELL_PX = 8  # side of a cell of the grid on which the floor's brightness is known
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
-GLARE = 1.07  # of the floor's brightness: above, a pixel shows the lamp
-NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
 
 Gray = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Layer:
-    """One brightness of each pixel, and of the floor behind it.
+class SceneMask:
+    """Where the shapes of a scene are in a frame or in a part of it.
 
     Attributes:
-        pixels: shape (rows, columns), uint8.
-        small: the same, shrunk by area.
-        floor: how bright what is behind all slender things is, in the pixels of `small`.
+        depth: distance from the outlines, positive inside of a shape, shape (rows, columns), float32 [px].
+        tolerance_px: see the module [px].
+        rim: points along the outlines and the index of their shape, shape (m, 3) [px].
+        floor_cells: for each cell of the floor's grid the column and row of the nearest one that no shape covers,
+            shape (rows, columns, 2), int16.
     """
 
-    pixels: np.ndarray
-    small: np.ndarray
-    floor: np.ndarray
+    depth: NDArray[np.float32]
+    tolerance_px: float
+    rim: Points
+    floor_cells: NDArray[np.int16]
+
+    def part(self, left: int, top: int, right: int, bottom: int) -> SceneMask:
+        """Return the mask of a part of the frame; left and top are multiples of `CELL_PX` [px]."""
+        cell = CELL_PX
+        cells = self.floor_cells[top // cell : -(-bottom // cell), left // cell : -(-right // cell)]
+        return replace(
+            self,
+            depth=self.depth[top:bottom, left:right],
+            rim=self.rim - (left, top, 0.0),
+            floor_cells=cells - np.array([left // cell, top // cell], np.int16),
+        )
+
+    @property
+    def band_px(self) -> float:
+        """Distance from an outline up to which a dark line may be the shape's own edge [px]."""
+        return self.tolerance_px + BLUR_PX
+
+    def show_floor(self, cells: Gray) -> Gray:
+        """Return the brightness of cells, of those that a shape covers that of the nearest one that shows the floor."""
+        rows, columns = cells.shape
+        floor = self.floor_cells[:rows, :columns]
+        nothing = np.empty(0)
+        shown = cv2.remap(cells, floor, nothing, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(shown, dtype=np.uint8)
+
+    def deepest(self, low: Points, high: Points) -> float:
+        """Return how deep the deepest pixel of a box (u, v) to (u, v) lies in a shape; negative if it touches none."""
+        left, top = (max(0, int(value)) for value in low)
+        box = self.depth[top : max(top, int(high[1]) + 1), left : max(left, int(high[0]) + 1)]
+        return float(cv2.minMaxLoc(box)[1]) if box.size else -OUTSIDE_DEPTH_PX
+
+    def depths(self, points: Points) -> NDArray[np.float32]:
+        """Return how deep points lie in a shape, negative outside of all, shape (m,) [px]."""
+        rows, columns = self.depth.shape
+        at = np.round(points).astype(np.intp)
+        return self.depth[np.clip(at[:, 1], 0, rows - 1), np.clip(at[:, 0], 0, columns - 1)]
+
+
+def scene_mask(scene: Scene, view: DishView, shape: tuple[int, ...], tolerance: float) -> SceneMask | None:
+    """Return the mask of a frame; None for a scene without shapes.
+
+    Args:
+        scene: dish and shapes.
+        view: where the dish is in the frame.
+        shape: rows and columns of the frame.
+        tolerance: what the scene's outline and the visible one may differ by [m].
+    """
+    if not scene.shapes:
+        return None
+    rows, columns = shape[:2]
+    inside = np.zeros((rows, columns), np.uint8)
+    for geometry in scene.obstacles:  # One after the other: shapes may overlap, and even-odd filling would undo it.
+        own = np.zeros_like(inside)
+        rings = [np.round(view.to_pixels(ring) * 16.0).astype(np.int32) for ring in mask_outlines(geometry)]
+        cv2.fillPoly(own, rings, 255, cv2.LINE_8, 4)
+        cv2.bitwise_or(inside, own, inside)
+    # Filling takes every pixel that an edge touches: half a pixel too many, as blur makes a dark shape look too.
+    depth = _distance(inside) - _distance(cv2.bitwise_not(inside))
+    cells = cv2.resize(inside, (max(2, columns // CELL_PX), max(2, rows // CELL_PX)), interpolation=cv2.INTER_AREA)
+    floor_cells = _nearest_uncovered(cells > 0.1 * 255.0)
+    return SceneMask(depth, tolerance / view.metres_per_pixel, _rim(scene, view), floor_cells)
+
+
+def mask_outlines(geometry: Disc | Polygon) -> list[Points]:
+    """Return the rings of a shape, a disc as a polygon, each of shape (m, 2) [m]."""
+    if isinstance(geometry, Disc):
+        turn = np.linspace(0.0, 2.0 * np.pi, 128, endpoint=False)
+        return [np.asarray(geometry.centre) + geometry.radius * np.column_stack([np.cos(turn), np.sin(turn)])]
+    return geometry.rings
+
+
+def _nearest_uncovered(covered: NDArray[np.bool_]) -> NDArray[np.int16]:
+    """Return column and row of the nearest uncovered cell to each, its own where all are covered."""
+    rows, columns = np.indices(covered.shape).astype(np.int16)
+    itself = np.stack([columns, rows], axis=-1)
+    if covered.all():
+        return itself
+    _, labels = cv2.distanceTransformWithLabels(
+        covered.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner = np.zeros((int(labels.max()) + 1, 2), np.int16)
+    owner[labels[~covered]] = itself[~covered]
+    return owner[labels]
+
+
+def _rim(scene: Scene, view: DishView) -> Points:
+    """Return points along all outlines, with the index of their shape, shape (m, 3) [px]."""
+    parts = []
+    for index, geometry in enumerate(scene.obstacles):
+        for ring in mask_outlines(geometry):
+            closed = view.to_pixels(np.vstack([ring, ring[:1]]))
+            points = points_at(closed, np.arange(0.0, arc_lengths(closed)[-1], 4.0))
+            parts.append(np.column_stack([points, np.full(len(points), float(index))]))
+    return np.vstack(parts)
+
+
+def _distance(inside: Gray) -> NDArray[np.float32]:
+    """Return the distance of each pixel of a mask from its edge, half a pixel from the next one; 0 outside [px]."""
+    if inside.all():
+        return np.full(inside.shape, OUTSIDE_DEPTH_PX, np.float32)
+    apart = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(np.maximum(apart - 0.5, 0.0), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Wall:
+    """The dish's wall in a picture: its centre (u, v) and its radius [px]."""
+
+    centre: tuple[float, float]
+    radius: float
+
+    def distances(self, box: tuple[slice, slice]) -> np.ndarray:
+        """Return how far the pixels of some rows and columns are from the centre [px]."""
+        rows, columns = box
+        v = np.arange(rows.start, rows.stop)[:, None] - self.centre[1]
+        return np.hypot(np.arange(columns.start, columns.stop) - self.centre[0], v)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One brightness of each pixel, and of the floor behind it, both of shape (rows, columns), uint8."""
+
+    pixels: Gray
+    floor: Gray
 
 
 @dataclass(frozen=True)
@@ -52,16 +192,16 @@ class Picture:
         brightest: the greatest of the three colours of each pixel. Steel is dark in all of them, a coloured thread in
             some only.
         darkest: the least of them. A thread of any colour is dark in one.
-        factor: how much smaller `small` is.
-        origin: (u, v) of the first pixel in the whole frame.
+        view: where the dish is, in the picture's pixels.
+        wall: of the dish, in the picture's pixels.
         mask: where the scene's shapes are; None if it has none.
         image: as it came, grey or BGR.
     """
 
     brightest: Layer
     darkest: Layer
-    factor: int
-    origin: tuple[int, int]
+    view: DishView
+    wall: Wall
     mask: SceneMask | None
     image: np.ndarray
 
@@ -81,92 +221,61 @@ def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
     return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
-def prepare(image: np.ndarray, factor: int, origin: tuple[int, int] = (0, 0), mask: SceneMask | None = None) -> Picture:
-    """Make an image ready to measure on, shape (rows, columns) or (rows, columns, 3) in BGR order, uint8."""
+def prepare(image: np.ndarray, view: DishView, dish_radius: float, mask: SceneMask | None = None) -> Picture:
+    """Make an image ready to measure on.
+
+    Args:
+        image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
+        view: where the dish is in it.
+        dish_radius: [m]
+        mask: where the scene's shapes are in it; None if there are none.
+    """
+    wall = Wall(view.centre_px, dish_radius / view.metres_per_pixel)
+    places = _floor_places(image.shape[:2], wall)
     if image.ndim == 2:
         # Copied where need be: compiled code is compiled once more for each other layout of memory.
-        both = _channel(np.ascontiguousarray(image), factor, mask)
-        return Picture(both, both, factor, origin, mask, image)
+        both = _layer(np.ascontiguousarray(image), places, mask)
+        return Picture(both, both, view, wall, mask, image)
     one, two, three = cv2.split(image)
-    brightest = _channel(np.asarray(cv2.max(cv2.max(one, two), three)), factor, mask)
-    darkest = _channel(np.asarray(cv2.min(cv2.min(one, two), three)), factor, mask)
-    return Picture(brightest, darkest, factor, origin, mask, image)
+    brightest = _layer(np.asarray(cv2.max(cv2.max(one, two), three)), places, mask)
+    darkest = _layer(np.asarray(cv2.min(cv2.min(one, two), three)), places, mask)
+    return Picture(brightest, darkest, view, wall, mask, image)
 
 
-def _channel(pixels: np.ndarray, factor: int, mask: SceneMask | None) -> Layer:
-    """Shrink an image and estimate the floor behind what lies on it.
+def _floor_places(shape: tuple[int, ...], wall: Wall) -> NDArray[np.float32]:
+    """Return for each cell the place (u, v) among the cells where its floor is taken from, shape (rows, columns, 2).
+
+    Near the wall and beyond it, where the floor is mixed with the rim's dark, it is that of the place `FLOOR_DEPTH_PX`
+    inside of the wall on the way to the centre.
+    """
+    size = np.array(shape[1::-1])
+    cells = np.maximum(2, size // CELL_PX)
+    per_cell = size / cells
+    u = (np.arange(cells[0]) + 0.5) * per_cell[0] - 0.5 - wall.centre[0]
+    v = (np.arange(cells[1])[:, None] + 0.5) * per_cell[1] - 0.5 - wall.centre[1]
+    share = np.minimum(1.0, max(0.0, wall.radius - FLOOR_DEPTH_PX) / np.maximum(np.hypot(u, v), 1.0))
+    at = np.stack([share * u + wall.centre[0], share * v + wall.centre[1]], axis=-1)
+    return np.asarray((at + 0.5) / per_cell - 0.5, dtype=np.float32)
+
+
+def _layer(pixels: Gray, places: NDArray[np.float32], mask: SceneMask | None) -> Layer:
+    """Estimate the floor behind what lies on it.
 
     The floor is the median over a window that all slender things fill by less than half, so that light that changes
     over the dish doesn't matter. What a shape of the scene covers shows no floor.
     """
-    small = pixels
-    if factor > 1:
-        small = cv2.resize(pixels, None, fx=1.0 / factor, fy=1.0 / factor, interpolation=cv2.INTER_AREA)
-    cells = (max(2, pixels.shape[1] // FLOOR_FACTOR), max(2, pixels.shape[0] // FLOOR_FACTOR))
-    rough = cv2.resize(small, cells, interpolation=cv2.INTER_AREA)
+    rough = cv2.resize(pixels, places.shape[1::-1], interpolation=cv2.INTER_AREA)
     if mask is not None:
         rough = mask.show_floor(rough)
     floor = cv2.medianBlur(rough, 9)  # cells: wider than a needle, a thread, a speck
-    return Layer(pixels, small, cv2.resize(floor, small.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    floor = cv2.remap(floor, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return Layer(pixels, np.asarray(cv2.resize(floor, pixels.shape[::-1], interpolation=cv2.INTER_LINEAR)))
 
 
-@dataclass(frozen=True)
-class Wall:
-    """The dish's wall in a picture.
-
-    Attributes:
-        centre: of the dish (u, v) [px].
-        radius: of the dish [px].
-    """
-
-    centre: tuple[float, float]
-    radius: float
-
-    def distances(self, box: tuple[slice, slice]) -> np.ndarray:
-        """Return how far the pixels of some rows and columns are from the centre [px]."""
-        rows, columns = box
-        v = np.arange(rows.start, rows.stop)[:, None] - self.centre[1]
-        return np.hypot(np.arange(columns.start, columns.stop) - self.centre[0], v)
-
-    def floor(self, channel: Layer, factor: int, box: tuple[slice, slice]) -> np.ndarray:
-        """Return how bright the floor is in some rows and columns, `FLOOR_DEPTH_PX` inside of the wall and beyond.
-
-        There the floor of a channel is mixed with the rim. What is farther out has the brightness of the place on
-        the way to the centre that is so far inside.
-        """
-        rows, columns = box
-        floor = np.empty((rows.stop - rows.start, columns.stop - columns.start), np.uint8)
-        inside = max(0.0, self.radius - FLOOR_DEPTH_PX)
-        _fill_floor(channel.floor, float(factor), self.centre, inside, (columns.start, rows.start), floor)
-        return floor
-
-
-def without_wall(channel: Layer, pixels: Gray, factor: int, wall: Wall, around: Points, reach: float) -> Gray:
-    """Return pixels of a channel in which all beyond the wall has the floor's brightness around a point.
-
-    What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
-
-    Args:
-        channel: of the frame.
-        pixels: of it, without the needle.
-        factor: how much smaller the channel's floor is.
-        wall: of the dish.
-        around: the point, shape (2,) [px].
-        reach: half of the side of the square around it [px].
-    """
-    rows, columns = pixels.shape
-    left, top = np.maximum(around - reach, 0.0).astype(int)
-    right, bottom = np.minimum(around + reach + 1.0, (columns, rows)).astype(int)
-    box = slice(top, max(top, bottom)), slice(left, max(left, right))
-    result = pixels.copy()
-    np.copyto(result[box], wall.floor(channel, factor, box), where=wall.distances(box) > wall.radius)
-    return result
-
-
-def glare_mask(picture: Picture) -> np.ndarray:
-    """Return where the lamp is reflected, in the pixels of `small`, uint8: 255 there."""
-    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=GLARE, beta=2.0)
-    return cv2.compare(cv2.medianBlur(picture.brightest.small, 3), bound, cv2.CMP_GT)
+def glare_mask(picture: Picture) -> Gray:
+    """Return where the lamp is reflected, 255 there."""
+    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=1.07, beta=2.0)  # of the floor's brightness
+    return np.asarray(cv2.compare(cv2.medianBlur(picture.brightest.pixels, 5), bound, cv2.CMP_GT))
 
 
 def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
@@ -273,15 +382,6 @@ def sampled(image: NDArray[Any], points: Points) -> NDArray[np.float64]:
     return values
 
 
-def straightened(
-    image: NDArray[Any], axis: tuple[float, float, float, float], along: NDArray[Any], aside: NDArray[Any]
-) -> Points:
-    """Return an image along and aside of an arc, shape (m, n); see `straighten`."""
-    strip = np.empty((len(along), len(aside)))
-    straighten(image, axis, along, aside, strip)
-    return strip
-
-
 @compiled
 def sample(image, u, v):
     """Return an image at a point, bilinear; 0 outside."""
@@ -300,18 +400,6 @@ def within(image, u, v):
     u = min(max(u, 0.0), image.shape[1] - 1.001)
     v = min(max(v, 0.0), image.shape[0] - 1.001)
     return sample(image, u, v)
-
-
-@compiled
-def _fill_floor(image, factor, centre, inside, corner, floor):
-    """Fill in the floor of a box whose first pixel is the corner; see `Wall.floor`."""
-    for row in range(floor.shape[0]):
-        for column in range(floor.shape[1]):
-            u, v = corner[0] + column - centre[0], corner[1] + row - centre[1]
-            share = min(1.0, inside / max(math.hypot(u, v), 1.0))
-            x = (share * u + centre[0] - 0.5 * (factor - 1.0)) / factor
-            y = (share * v + centre[1] - 0.5 * (factor - 1.0)) / factor
-            floor[row, column] = np.uint8(within(image, x, y) + 0.5)
 
 
 @compiled
@@ -341,47 +429,3 @@ def straighten(gray, start, along, aside, strip):
         across, down = -math.sin(angle + 2.0 * half), math.cos(angle + 2.0 * half)
         for column in range(len(aside)):
             strip[row, column] = within(gray, x + aside[column] * across, y + aside[column] * down)
-
-
-@compiled
-def straighten_both(one, other, start, first, aside, strip, other_strip):
-    """Fill two strips with two images along an arc at steps of a pixel, as `straighten` does.
-
-    The arc's direction is turned on from row to row, and both images are sampled at once: half the time.
-
-    Args:
-        one: shape (rows, columns).
-        other: of the same shape.
-        start: u, v, angle and curvature of the arc [px, px, rad, 1/px].
-        first: length along the arc of the first row [px].
-        aside: distances aside of it, shape (m,) [px].
-        strip: filled, shape (n, m).
-        other_strip: filled, of the same shape.
-    """
-    u, v, angle, curvature = start
-    rows, columns = one.shape
-    last_u, last_v = columns - 1.001, rows - 1.001
-    half = 0.5 * curvature * first
-    chord = first if abs(half) < 1e-9 else first * math.sin(half) / half
-    x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
-    ahead, down = math.cos(angle + 2.0 * half), math.sin(angle + 2.0 * half)
-    half = 0.5 * curvature
-    cosine, sine = math.cos(half), math.sin(half)
-    chord = 1.0 if abs(half) < 1e-9 else sine / half
-    for index in range(len(strip)):
-        for place in range(len(aside)):
-            at_u = min(max(x - aside[place] * down, 0.0), last_u)
-            at_v = min(max(y + aside[place] * ahead, 0.0), last_v)
-            column, row = np.uint64(int(at_u)), np.uint64(int(at_v))
-            right, below = at_u - column, at_v - row
-            left, above = 1.0 - right, 1.0 - below
-            upper = left * one[row, column] + right * one[row, column + NEXT]
-            lower = left * one[row + NEXT, column] + right * one[row + NEXT, column + NEXT]
-            strip[index, place] = above * upper + below * lower
-            upper = left * other[row, column] + right * other[row, column + NEXT]
-            lower = left * other[row + NEXT, column] + right * other[row + NEXT, column + NEXT]
-            other_strip[index, place] = above * upper + below * lower
-        # A chord of an arc is turned by half of the arc's turn, what follows it by the other half.
-        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
-        x, y = x + chord * ahead, y + chord * down
-        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine

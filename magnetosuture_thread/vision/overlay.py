@@ -25,7 +25,7 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: str = "") -> np.ndarray:
     """Draw dish, thread and needle over a frame, and the state as text.
 
-    Pieces of the thread whose place along it is known are green, and joined by dashes; others are red. A dot is the
+    Pieces of the thread whose place along it is known are green, and joined by thin lines; others are red. A dot is the
     thread's end, a ring where it goes on unseen, and thin lines surround what may hide it.
 
     Args:
@@ -134,19 +134,12 @@ def _pieces(image: np.ndarray, view: DishView, observation: ThreadObservation, u
         placed = bool(np.isfinite(piece.arc_length[0]))
         colour = THREAD if placed else (60, 60, 220)
         if placed and before is not None:
-            _dashes(image, before, line[0], THREAD, unit)
+            _line(image, np.array([before, line[0]]), THREAD, 1)
         before = line[-1] if placed else None
         _line(image, line, colour, unit)
         for end, at in ((piece.first_end, line[0]), (piece.last_end, line[-1])):
             if end is not PieceEnd.TAIL:
                 _circle(image, at, 2.5 * unit, colour, -1 if end is PieceEnd.FREE else unit)
-
-
-def _dashes(image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple[int, int, int], unit: int) -> None:
-    length = float(np.hypot(*(end - start)))
-    along = (end - start) / max(length, 1e-9)
-    for at in np.arange(0.0, length, 8.0 * unit):
-        _line(image, start + along * np.array([[at], [min(at + 4.0 * unit, length)]]), colour, unit)
 
 
 def _plate(image: np.ndarray, track: Track, title: str, unit: int) -> None:

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,19 +19,25 @@ from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
 from magnetosuture_thread.scene.scene import Scene
 from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.dish import DishWatch, FoundDish, Tilt
-from magnetosuture_thread.vision.ellipse import find_ellipse
-from magnetosuture_thread.vision.images import FLOOR_FACTOR, Picture, Wall, check_image, prepare, sampled, shrunk
+from magnetosuture_thread.vision.arc import LengthEstimator, MeasuredNeedle
+from magnetosuture_thread.vision.centreline import find_centreline, without_needle
+from magnetosuture_thread.vision.dish import DishWatch, FoundDish
+from magnetosuture_thread.vision.images import (
+    CELL_PX,
+    Picture,
+    SceneMask,
+    check_image,
+    prepare,
+    sampled,
+    scene_mask,
+    shrunk,
+)
 from magnetosuture_thread.vision.lens import Lens
-from magnetosuture_thread.vision.needle.arc import LengthEstimator, MeasuredNeedle
-from magnetosuture_thread.vision.needle.measure import axis_guesses, find_needles, search_factor
-from magnetosuture_thread.vision.scene_mask import SceneMask, scene_mask
+from magnetosuture_thread.vision.needle import axis_guesses, find_needles
+from magnetosuture_thread.vision.observe import observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.centreline import find_centreline, without_needle
-from magnetosuture_thread.vision.thread.observe import observe
-from magnetosuture_thread.vision.thread.walk import Ridge, smoothed, walk_on, worth
+from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 
-UNKNOWN_HEADING = "a needle of which nothing tells which end is the tail"
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
@@ -91,131 +98,6 @@ def no_pose(state: State, reason: str, view: DishView | None) -> Track:
     return Track(state, reason, 0.0, nothing, nothing, nothing, 0.0, np.empty((0, 0)), np.empty((0, 2)), view)
 
 
-@dataclass(frozen=True)
-class FrameReader:
-    """Finds needle and thread in frames with one view of the dish.
-
-    Needles and lines are in the pixels of the picture that they were found in; tracks are in the dish frame.
-
-    Attributes:
-        settings: what to look for.
-        dish: where it is in the frame.
-        radius: of the dish [m].
-        mask: where the scene's shapes are in the frame; None if it has none.
-    """
-
-    settings: VisionTrackerSettings
-    dish: FoundDish
-    radius: float
-    mask: SceneMask | None
-
-    def picture(self, image: np.ndarray, box: tuple[int, int, int, int] | None = None) -> Picture:
-        """Make a part of a prepared frame ready to measure on.
-
-        Args:
-            image: the frame.
-            box: left, top, right, bottom [px]; None for all of the dish.
-        """
-        view = self.dish.view
-        if box is None:
-            reach = self.radius / view.metres_per_pixel + 32.0  # with what tells the floor's light at the wall
-            box = region(image, np.subtract(view.centre_px, reach), np.add(view.centre_px, reach))
-        left, top, right, bottom = box
-        part = self.mask.part(left, top, right, bottom) if self.mask is not None else None
-        factor = search_factor(self.settings.needle_width / view.metres_per_pixel)
-        return prepare(image[top:bottom, left:right], factor, (left, top), part)
-
-    def needles(
-        self, picture: Picture, estimator: LengthEstimator, toward: np.ndarray | None = None
-    ) -> tuple[list[MeasuredNeedle], list[str]]:
-        """Find the needles in a picture, by the length as it is set or measured; see `find_needles`."""
-        settings, scale = self.settings, self.dish.view.metres_per_pixel
-        size = estimator.size(settings.needle_length, settings.needle_width, scale)
-        return find_needles(picture, self._local(picture), self.radius, size, toward)
-
-    def centreline(self, picture: Picture, gray: np.ndarray, needle: MeasuredNeedle) -> Points:
-        """Return the thread's centreline from a needle's tail on, shape (m, 2) [px]; m = 1 if none is visible.
-
-        Args:
-            picture: the frame or a part of it.
-            gray: its darkest colour without the needle.
-            needle: in its pixels.
-        """
-        if not needle.heading_known:
-            return needle.tail_px[None]
-        scale = self.dish.view.metres_per_pixel
-        wall = Wall(self._local(picture).centre_px, self.radius / scale)
-        return find_centreline(picture, gray, needle, MAX_LENGTH_RATIO * self.settings.thread_length / scale, wall)
-
-    def with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> tuple[MeasuredNeedle | None, str]:
-        """Return the needle that a thread leaves, and why there is none if there is none.
-
-        `needles` are all that were found, at least one. A needle that is alone needs no thread.
-        """
-        if len(needles) == 1:
-            return needles[0], ""
-        least = 0.04 * self.settings.thread_length / self.dish.view.metres_per_pixel
-        lines = [
-            self.centreline(picture, without_needle(picture.darkest, picture.factor, needle), needle)
-            for needle in needles
-        ]
-        with_thread = [needle for needle, line in zip(needles, lines, strict=True) if arc_lengths(line)[-1] >= least]
-        return (with_thread[0], "") if len(with_thread) == 1 else (None, f"{len(needles)} needles in the dish")
-
-    def track(
-        self,
-        picture: Picture,
-        needle: MeasuredNeedle,
-        otherwise: State,
-        *,
-        search: bool,
-    ) -> Track:
-        """Return what a frame shows whose needle is known.
-
-        Args:
-            picture: the frame or a part of it.
-            needle: in its pixels.
-            otherwise: the state if it is unknown which end is the tail.
-            search: whether to look for pieces of the thread that the centreline does not show; see `observe`.
-        """
-        view, local = self.dish.view, self._local(picture)
-        heading, tail = view.directions_to_dish(needle.direction_px), local.to_dish(needle.tail_edge_px)
-        given = self.settings.metres_per_pixel > 0.0
-        length, gray = self.settings.thread_length, without_needle(picture.darkest, picture.factor, needle)
-        line = self.centreline(picture, gray, needle)
-        observation = observe(
-            picture, smoothed(gray), needle, line, local, self.radius, length, scale_known=given, search=search
-        )
-        if self.dish.tilt is not None:  # What a straight camera's view leaves unknown moves all points alike.
-            pieces = tuple(_less_sure(piece, self.dish.tilt, self.radius) for piece in observation.pieces)
-            observation = replace(observation, pieces=pieces)
-        return Track(
-            state=State.TRACKED if needle.heading_known else otherwise,
-            reason="" if needle.heading_known else UNKNOWN_HEADING,
-            confidence=needle.confidence,
-            tail=tail,
-            tip=local.to_dish(needle.tip_px),
-            heading=heading,
-            curvature=-needle.curvature_px / view.metres_per_pixel,
-            covariance=_in_dish(needle, view) + self.dish.covariance(tail, heading, self.radius),
-            centreline=local.to_dish(line),
-            view=view,
-            warning=self.dish.warning,
-            observation=observation,
-        )
-
-    def _local(self, picture: Picture) -> DishView:
-        """Return the view in the pixels of a picture."""
-        return replace(self.dish.view, centre_px=tuple(np.subtract(self.dish.view.centre_px, picture.origin).tolist()))
-
-
-def _less_sure(piece: ThreadPiece, tilt: Tilt, radius: float) -> ThreadPiece:
-    """Return a piece with what a tilt leaves unknown of where it is, as far out as it reaches."""
-    farthest = piece.points[np.argmax(np.hypot(*piece.points.T))]
-    view = tilt.covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
-    return replace(piece, deviation=np.sqrt(piece.deviation**2 + np.linalg.eigvalsh(view)[-1]))
-
-
 def _in_dish(needle: MeasuredNeedle, view: DishView) -> np.ndarray:
     """Return the covariance of tail and heading in the dish frame, shape (3, 3)."""
     along = view.directions_to_dish(needle.direction_px)
@@ -254,12 +136,9 @@ class VisionTracker:
 
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
         self._given = settings
-        self._factor = 1  # by which frames are shrunk
-        self._settings = settings  # in shrunk frames
         self._scene = scene
-        self._dish = DishWatch(settings, scene.dish.diameter)
         self._lens: Lens | None = None
-        self._masks: dict[tuple[DishView, tuple[int, ...]], SceneMask | None] = {}
+        self._mask: tuple[Any, SceneMask | None] = ((), None)  # what it was made for, and the mask
         self._shape: tuple[int, ...] = ()
         self.reset()
 
@@ -267,58 +146,37 @@ class VisionTracker:
         """Take another scene. The needle is still tracked, unless the dish has another size."""
         other_dish = scene.dish.diameter != self._scene.dish.diameter
         self._scene = scene
-        self._masks.clear()
+        self._mask = ((), None)
         if other_dish:
-            self._rescale()
+            self._begin_anew()
 
     def set_lens(self, lens: Lens | None) -> None:
         """Take the camera's lens, whose distortion is undone in every frame of its size; None if it is not known.
 
         The view is in the pixels of the frame without distortion. Another lens begins anew.
         """
-        if lens is self._lens or (lens is not None and lens.same_as(self._lens)):
+        if lens == self._lens:
             return
         straight = all(each is None or each.is_straight for each in (lens, self._lens))
         self._lens = lens
         if not straight:
-            self._masks.clear()
-            self._rescale()
+            self._begin_anew()
 
-    def _straight(self, image: np.ndarray, factor: int) -> np.ndarray:
-        """Return a frame shrunk, and without the lens's distortion."""
-        small = shrunk(image, factor)
-        if self._lens is None or self._lens.problem_with(image.shape) is not None:
-            return small
-        return self._lens.undistorted(small, factor)
+    def reset(self) -> None:
+        """Forget the needle and the dish."""
+        self._time: float | None = None
+        self._begin_anew()
 
-    def _with_doubt(self, track: Track, image: np.ndarray) -> Track:
-        """Return a track with a warning if the lens is not that of the frame."""
-        problem = self._lens.problem_with(image.shape) if self._lens is not None else None
-        if problem is None:
-            return track
-        return replace(track, warning="; ".join(filter(None, (track.warning, f"{problem}; it is not used"))))
-
-    def _rescale(self) -> None:
-        """Choose the size that frames are looked at in, and begin anew."""
+    def _begin_anew(self) -> None:
+        """Choose the size that frames are looked at in, and forget what was seen, not the time of the last frame."""
         diameter = self._scene.dish.diameter
         self._factor = self._given.working_factor(self._shape, diameter) if self._shape else 1
         self._settings = self._given.shrunk(self._factor)
         self._dish = DishWatch(self._settings, diameter)
         self._length = LengthEstimator()
-        self._forget()
-
-    def reset(self) -> None:
-        """Forget the needle and the dish."""
-        self._time: float | None = None
-        self._length = LengthEstimator()
-        self._forget()
-
-    def _forget(self) -> None:
-        """Forget what was seen, not the time of the last frame."""
-        self._dish.forget()
         self._last: _Pose | None = None
         self._anew: list[_Pose] = []
-        self._thread: np.ndarray = np.empty((0, 2))  # in pixels, with the needle's ends
+        self._thread: Points = np.empty((0, 2))  # in pixels, with the needle's ends
 
     def look(self, image: np.ndarray) -> Track:
         """Look at one frame alone; what other frames showed doesn't matter.
@@ -330,8 +188,9 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         alone = VisionTracker(replace(self._given, confirm_frames=1), self._scene)
-        alone._lens, alone._masks = self._lens, self._masks
+        alone._lens, alone._mask = self._lens, self._mask
         found = alone.track(image, 0.0)
+        self._mask = alone._mask
         return replace(found, state=State.TRACKED if found.state is State.TRACKED else State.LOST, needle_length=None)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
@@ -352,10 +211,16 @@ class VisionTracker:
         self._advance(time_s)
         if image.shape[:2] != self._shape:
             self._shape = image.shape[:2]
-            self._rescale()
-        found = self._track(self._straight(image, self._factor), time_s)
-        found = self._with_doubt(_enlarged(found, self._factor), image)
-        return replace(found, needle_length=self._length.length)
+            self._begin_anew()
+        small, problem = shrunk(image, self._factor), None
+        if self._lens is not None:
+            problem = self._lens.problem_with(image.shape)
+            small = self._lens.undistorted(small, self._factor) if problem is None else small
+        found = self._track(small, time_s)
+        if problem is not None:
+            found = replace(found, warning="; ".join(filter(None, (found.warning, f"{problem}; it is not used"))))
+        view = found.view.shrunk(1.0 / self._factor) if found.view is not None else None
+        return replace(found, view=view, needle_length=self._length.length)
 
     def _track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame, shrunk."""
@@ -369,41 +234,19 @@ class VisionTracker:
             return no_pose(self._missing(), reason, view)
         if before is not None and view is not before:  # The camera was bumped: what was seen before lies elsewhere.
             self._last, self._anew = None, []
-        assert self._dish.found is not None
-        mask = self._mask_for(image, view)
-        reader = FrameReader(self._settings, self._dish.found, self._scene.dish.radius, mask)
-        chosen, picture, whole, reason = self._choose(image, reader, time_s)
-        if chosen is None or picture is None:
+        needle, picture, whole, reason = self._choose(image, time_s)
+        if needle is None or picture is None:
             return no_pose(self._missing(), reason, view)
-        found = reader.track(picture, chosen, self._missing(), search=whole)
+        found = self._measured(picture, needle, search=whole)
         if not whole and self._is_cut(found, picture):
-            cut, picture = picture, reader.picture(image)
-            chosen = chosen.shifted((cut.origin[0] - picture.origin[0], cut.origin[1] - picture.origin[1]))
-            found = reader.track(picture, chosen, self._missing(), search=True)
-        if not chosen.heading_known:
-            return found
-        if chosen.size_measured:
-            length = chosen.length_px - chosen.tail_shift_px
-            self._length.add(length * view.metres_per_pixel, chosen.confidence)
-        ends = np.array([found.tail, found.tip])
-        self._thread = view.to_pixels(np.vstack([ends, found.centreline]))
+            complete = self._picture(image)
+            needle = needle.shifted(np.subtract(complete.view.centre_px, picture.view.centre_px))
+            found = self._measured(complete, needle, search=True)
+        if needle.heading_known:
+            if needle.size_measured:
+                self._length.add((needle.length_px - needle.tail_shift_px) * view.metres_per_pixel, needle.confidence)
+            self._thread = view.to_pixels(np.vstack([found.tail, found.tip, found.centreline]))
         return found
-
-    def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
-        """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
-
-        The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.
-        """
-        u, v = (round(value / VIEW_STEP_PX) * VIEW_STEP_PX for value in view.centre_px)
-        radius = round(self._scene.dish.radius / view.metres_per_pixel / VIEW_STEP_PX) * VIEW_STEP_PX
-        rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
-        key = (rounded, image.shape[:2])
-        if key not in self._masks:
-            if len(self._masks) >= 8:
-                self._masks.clear()
-            tolerance = self._settings.outline_tolerance
-            self._masks[key] = scene_mask(self._scene, rounded, image.shape[:2], tolerance, FLOOR_FACTOR)
-        return self._masks[key]
 
     def _advance(self, time_s: float) -> None:
         """Take the time of the next frame."""
@@ -415,64 +258,150 @@ class VisionTracker:
             self.reset()
         self._time = time_s
 
-    def _is_cut(self, found: Track, picture: Picture) -> bool:
-        """Say whether the thread may go on beyond the part of the frame that was looked at."""
-        assert found.view is not None
-        if found.reason:
-            return False
-        if not found.observation.complete:
-            return True
-        line = found.view.to_pixels(found.centreline)
-        if _length(line) < 0.9 * _length(self._thread[2:]):  # of the thread before
-            return True
-        u, v = line[-1] - picture.origin
-        rows, columns = picture.shape
-        return bool(min(u, v, columns - 1 - u, rows - 1 - v) < 20.0)  # px from its border
-
     def _missing(self) -> State:
         return State.LOST if self._last is not None else State.SEARCHING
 
-    def _choose(
-        self, image: np.ndarray, reader: FrameReader, time: float
-    ) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
+    def _found_dish(self) -> FoundDish:
+        """Return the dish of a frame in which it was found."""
+        assert self._dish.found is not None
+        return self._dish.found
+
+    def _picture(self, image: np.ndarray, box: tuple[int, int, int, int] | None = None) -> Picture:
+        """Make a part of a prepared frame ready to measure on.
+
+        Args:
+            image: the frame.
+            box: left, top, right, bottom [px]; None for all of the dish.
+        """
+        view, radius = self._found_dish().view, self._scene.dish.radius
+        if box is None:
+            reach = radius / view.metres_per_pixel + 32.0  # with what tells the floor's light at the wall
+            box = region(image, np.subtract(view.centre_px, reach), np.add(view.centre_px, reach))
+        left, top, right, bottom = box
+        mask = self._mask_for(image, view)
+        part = mask.part(left, top, right, bottom) if mask is not None else None
+        local = replace(view, centre_px=(view.centre_px[0] - left, view.centre_px[1] - top))
+        return prepare(image[top:bottom, left:right], local, radius, part)
+
+    def _mask_for(self, image: np.ndarray, view: DishView) -> SceneMask | None:
+        """Return where the scene's shapes are, made anew where scene, view or the frame's size changed.
+
+        The view is rounded, so that the noise of a dish found in every frame anew makes no new mask.
+        """
+        u, v = (round(value / VIEW_STEP_PX) * VIEW_STEP_PX for value in view.centre_px)
+        radius = round(self._scene.dish.radius / view.metres_per_pixel / VIEW_STEP_PX) * VIEW_STEP_PX
+        rounded = DishView((u, v), self._scene.dish.radius / radius, view.rotation)
+        if self._mask[0] != (rounded, image.shape[:2]):
+            mask = scene_mask(self._scene, rounded, image.shape[:2], self._settings.outline_tolerance)
+            self._mask = ((rounded, image.shape[:2]), mask)
+        return self._mask[1]
+
+    def _choose(self, image: np.ndarray, time: float) -> tuple[MeasuredNeedle | None, Picture | None, bool, str]:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
-        view, last = reader.dish.view, self._last
+        view, last, settings = self._found_dish().view, self._last, self._settings
+        size = self._length.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
         for whole in (False, True) if last is not None else (True,):
             box: tuple[int, int, int, int] | None = None
             toward: np.ndarray | None = None
             if last is not None and not whole:
                 box, (_, angle) = self._region(image, view, time), last.at(time)
                 toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = reader.picture(image, box)
-            needles, refused = reader.needles(picture, self._length, toward)
-            needles = [self._as_before(needle, picture, view, time) for needle in needles]
-            within = [needle for needle in needles if self._fits(_pose(needle, picture, view, time), last)]
+            picture = self._picture(image, box)
+            needles, refused = find_needles(picture, size, toward)
+            needles = [self._as_before(needle, picture, time) for needle in needles]
+            within = [needle for needle in needles if self._fits(_pose(needle, picture, time), last)]
             if len(within) == 1 and not (whole and not within[0].heading_known):
-                self._take(_pose(within[0], picture, view, time), last)
+                self._take(_pose(within[0], picture, time), last)
                 return within[0], picture, whole, ""
         if not needles:
             self._anew = []
             others = f"; dark things: {', '.join(refused)}" if refused else ""
             return None, None, True, f"no needle in the dish{others}"
-        chosen, reason = (within[0], "") if len(within) == 1 else reader.with_thread(picture, needles)
+        chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
-            return chosen, picture, True, reason
-        pose = _pose(chosen, picture, view, time)
+            if chosen is None:
+                return None, None, True, f"{len(needles)} needles in the dish"
+            return chosen, picture, True, ""
+        pose = _pose(chosen, picture, time)
         if self._fits(pose, last):
             self._take(pose, last)
             return chosen, picture, True, ""
         if self._anew and not self._fits(pose, self._anew[-1]):
             self._anew = []
         self._anew.append(pose)
-        if len(self._anew) >= self._settings.confirm_frames:
+        if len(self._anew) >= settings.confirm_frames:
             self._take(pose, self._anew[-2] if len(self._anew) > 1 else None)
             return chosen, picture, True, ""
         if last is not None:
             return None, None, True, "a needle farther from the last one than it can move"
-        return None, None, True, f"a needle seen in {len(self._anew)} of {self._settings.confirm_frames} frames"
+        return None, None, True, f"a needle seen in {len(self._anew)} of {settings.confirm_frames} frames"
 
-    def _as_before(self, needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> MeasuredNeedle:
+    def _with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> MeasuredNeedle | None:
+        """Return the only needle that a thread leaves, of those that were found; one that is alone needs no thread."""
+        if len(needles) == 1:
+            return needles[0]
+        least = 0.04 * self._settings.thread_length / picture.view.metres_per_pixel
+        lines = [self._centreline(picture, without_needle(picture.darkest, needle), needle) for needle in needles]
+        having = [needle for needle, line in zip(needles, lines, strict=True) if arc_lengths(line)[-1] >= least]
+        return having[0] if len(having) == 1 else None
+
+    def _centreline(self, picture: Picture, gray: np.ndarray, needle: MeasuredNeedle) -> Points:
+        """Return the thread's centreline from a needle's tail on, shape (m, 2) [px]; m = 1 if none is visible.
+
+        `gray` is the darkest colour without the needle.
+        """
+        if not needle.heading_known:
+            return needle.tail_px[None]
+        max_length = MAX_LENGTH_RATIO * self._settings.thread_length / picture.view.metres_per_pixel
+        return find_centreline(picture, gray, needle, max_length)
+
+    def _measured(self, picture: Picture, needle: MeasuredNeedle, *, search: bool) -> Track:
+        """Return what a picture shows of a needle and its thread.
+
+        Args:
+            picture: the frame or a part of it.
+            needle: in its pixels.
+            search: whether to look for pieces of the thread that the centreline does not show; see `observe`.
+        """
+        dish, view, radius = self._found_dish(), picture.view, self._scene.dish.radius
+        heading, tail = view.directions_to_dish(needle.direction_px), view.to_dish(needle.tail_edge_px)
+        gray = without_needle(picture.darkest, needle)
+        line = self._centreline(picture, gray, needle)
+        scale_known = self._settings.metres_per_pixel > 0.0
+        length = self._settings.thread_length
+        observation = observe(picture, smoothed(gray), needle, line, length, scale_known=scale_known, search=search)
+        if dish.tilt is not None:  # What a straight camera's view leaves unknown moves all points alike.
+            pieces = tuple(_less_sure(piece, dish, radius) for piece in observation.pieces)
+            observation = replace(observation, pieces=pieces)
+        return Track(
+            state=State.TRACKED if needle.heading_known else self._missing(),
+            reason="" if needle.heading_known else "a needle of which nothing tells which end is the tail",
+            confidence=needle.confidence,
+            tail=tail,
+            tip=view.to_dish(needle.tip_px),
+            heading=heading,
+            curvature=-needle.curvature_px / view.metres_per_pixel,
+            covariance=_in_dish(needle, view) + dish.covariance(tail, heading, radius),
+            centreline=view.to_dish(line),
+            view=dish.view,
+            warning=dish.warning,
+            observation=observation,
+        )
+
+    def _is_cut(self, found: Track, picture: Picture) -> bool:
+        """Say whether the thread may go on beyond the part of the frame that was looked at."""
+        if found.reason:
+            return False
+        if not found.observation.complete:
+            return True
+        line = picture.view.to_pixels(found.centreline)
+        if arc_lengths(line)[-1] < 0.9 * arc_lengths(self._thread[2:])[-1]:  # of the thread before
+            return True
+        (u, v), (rows, columns) = line[-1], picture.shape
+        return bool(min(u, v, columns - 1 - u, rows - 1 - v) < 20.0)  # px from its border
+
+    def _as_before(self, needle: MeasuredNeedle, picture: Picture, time: float) -> MeasuredNeedle:
         """Return a needle the other way round if it lies where the last one was, and its shape does not rule that out.
 
         Between two frames it cannot turn round, and a thread that touches the tip makes that look like a tail. But
@@ -483,7 +412,7 @@ class VisionTracker:
         if needle.direction_is_clear or not needle.heading_known:
             return needle
         other = needle.reversed()
-        fits = [self._fits(_pose(each, picture, view, time), self._last) for each in (needle, other)]
+        fits = [self._fits(_pose(each, picture, time), self._last) for each in (needle, other)]
         return other if fits == [False, True] else needle
 
     def _fits(self, pose: _Pose, last: _Pose | None) -> bool:
@@ -492,10 +421,9 @@ class VisionTracker:
             return False
         after = pose.time - last.time
         tail, angle = last.at(pose.time)
-        assert self._dish.view is not None
         # 3 px and 6 degrees off the prediction, beside what the needle's greatest speed allows.
-        reach = self._settings.max_needle_speed * after + 3.0 * self._dish.view.metres_per_pixel
-        turn = abs((pose.angle - angle + math.pi) % (2.0 * math.pi) - math.pi)
+        reach = self._settings.max_needle_speed * after + 3.0 * self._found_dish().view.metres_per_pixel
+        turn = abs(_wrapped(pose.angle - angle))
         max_shift = min(self._settings.max_turn_rate * after + math.radians(6.0), 0.5 * math.pi)
         return math.dist(pose.tail, tail) < reach and turn < max_shift
 
@@ -508,8 +436,7 @@ class VisionTracker:
         if before is not None:
             after = pose.time - before.time
             velocity = before.velocity + SMOOTHING * ((pose.tail - before.tail) / after - before.velocity)
-            turned = (pose.angle - before.angle + math.pi) % (2.0 * math.pi) - math.pi
-            turn_rate = before.turn_rate + SMOOTHING * (turned / after - before.turn_rate)
+            turn_rate = before.turn_rate + SMOOTHING * (_wrapped(pose.angle - before.angle) / after - before.turn_rate)
             velocity *= min(1.0, self._settings.max_needle_speed / max(float(np.hypot(*velocity)), 1e-12))
             turn_rate = max(-self._settings.max_turn_rate, min(self._settings.max_turn_rate, turn_rate))
         direction_is_clear = pose.direction_is_clear or (before is not None and before.direction_is_clear)
@@ -522,35 +449,34 @@ class VisionTracker:
         moved = self._last.at(time)[0] - self._last.tail
         reach = 32.0 + self._settings.max_needle_speed * (time - self._last.time) / view.metres_per_pixel
         corners = np.vstack([self._thread, self._thread[:2] + view.directions_to_pixels(moved / view.metres_per_pixel)])
-        low, high = corners.min(axis=0) - reach, corners.max(axis=0) + reach
-        return region(image, low, high)
+        return region(image, corners.min(axis=0) - reach, corners.max(axis=0) + reach)
+
+
+def _less_sure(piece: ThreadPiece, dish: FoundDish, radius: float) -> ThreadPiece:
+    """Return a piece with what a tilt leaves unknown of where it is, as far out as it reaches."""
+    farthest = piece.points[np.argmax(np.hypot(*piece.points.T))]
+    unknown = dish.tilt_covariance(farthest, np.array([1.0, 0.0]), radius)[:2, :2]
+    return replace(piece, deviation=np.sqrt(piece.deviation**2 + np.linalg.eigvalsh(unknown)[-1]))
 
 
 def region(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[int, int, int, int]:
     """Return the box of whole cells of the floor's grid around two corners: left, top, right, bottom [px]."""
     rows, columns = image.shape[:2]
-    last = FLOOR_FACTOR * (np.array([columns, rows]) // FLOOR_FACTOR - 1)
-    left, top = np.clip(FLOOR_FACTOR * np.floor_divide(low, FLOOR_FACTOR), 0, last).astype(int).tolist()
-    ends = FLOOR_FACTOR * (np.floor_divide(high, FLOOR_FACTOR) + 1)
-    right, bottom = np.clip(ends, (left + FLOOR_FACTOR, top + FLOOR_FACTOR), (columns, rows)).astype(int).tolist()
+    last = CELL_PX * (np.array([columns, rows]) // CELL_PX - 1)
+    left, top = np.clip(CELL_PX * np.floor_divide(low, CELL_PX), 0, last).astype(int).tolist()
+    ends = CELL_PX * (np.floor_divide(high, CELL_PX) + 1)
+    right, bottom = np.clip(ends, (left + CELL_PX, top + CELL_PX), (columns, rows)).astype(int).tolist()
     return left, top, right, bottom
 
 
-def _enlarged(track: Track, factor: int) -> Track:
-    """Return a track whose view is that of the frame before it was shrunk."""
-    if track.view is None or factor == 1:
-        return track
-    return replace(track, view=track.view.shrunk(1.0 / factor))
-
-
-def _pose(needle: MeasuredNeedle, picture: Picture, view: DishView, time: float) -> _Pose:
-    heading = view.directions_to_dish(needle.direction_px)
-    tail = view.to_dish(needle.tail_edge_px + picture.origin)
+def _pose(needle: MeasuredNeedle, picture: Picture, time: float) -> _Pose:
+    heading = picture.view.directions_to_dish(needle.direction_px)
+    tail = picture.view.to_dish(needle.tail_edge_px)
     return _Pose(time, tail, math.atan2(heading[1], heading[0]), np.zeros(2), 0.0, needle.direction_is_clear)
 
 
-def _length(points: np.ndarray) -> float:
-    return float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 class RepetitionDetector:
@@ -673,7 +599,6 @@ def warm_up() -> bool:
     image = cv2.GaussianBlur(image, (0, 0), 0.9)
     # What a plain frame does not reach: a needle in one dark thing with its thread, crossings, and other pieces.
     sampled(np.zeros((4, 4), np.float32), np.zeros((1, 2)))
-    find_ellipse(image)
     core = np.zeros((60, 60), np.uint8)
     core[10, 5:55] = core[10:50, 54] = core[49, 5:55] = 1  # long and winding
     axis_guesses(cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0, 30.0, 5.0)

@@ -121,7 +121,7 @@ def test_frames_are_seen_through_the_lens_in_camera_info(short_bag: Path, tmp_pa
 
     def through_lens(told: bool, old: RecordedMessage, message: Any) -> Any:
         if old.topic == interface.CAMERA_INFO.recorded:
-            message.k, message.d = lens.matrix.ravel(), lens.coefficients if told else np.zeros(5)
+            message.k, message.d = np.array(lens.matrix), np.array(lens.coefficients) if told else np.zeros(5)
         elif old.topic == FRAME:
             message.data = cv2.imencode(".png", bend(decode_image(message.data), view))[1].ravel()
         return message

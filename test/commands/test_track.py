@@ -96,8 +96,8 @@ def test_a_lens_from_a_file_is_undone_before_the_camera_is_calibrated(
 ):
     case, image = frame_of("distortion", 2, 31)
     assert case.lens is not None
-    values = {"rows": 3, "cols": 3, "data": case.lens.matrix.ravel().tolist()}
-    coefficients = {"rows": 1, "cols": 5, "data": case.lens.coefficients.tolist()}
+    values = {"rows": 3, "cols": 3, "data": list(case.lens.matrix)}
+    coefficients = {"rows": 1, "cols": 5, "data": list(case.lens.coefficients)}
     info = {"image_width": case.size[0], "image_height": case.size[1], "camera_matrix": values}
     info |= {"distortion_model": case.lens.model, "distortion_coefficients": coefficients}
     frame, lens, output = tmp_path / "frame.png", tmp_path / "lens.yaml", tmp_path / "camera.yaml"

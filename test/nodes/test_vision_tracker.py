@@ -33,7 +33,7 @@ def compressed(image: np.ndarray, stamp) -> CompressedImage:
 def camera_info(lens: Lens) -> CameraInfo:
     """Return a lens as a message."""
     message = CameraInfo(width=lens.size[0], height=lens.size[1], distortion_model=lens.model)
-    message.k, message.d = lens.matrix.ravel().tolist(), lens.coefficients.tolist()
+    message.k, message.d = list(lens.matrix), list(lens.coefficients)
     return message
 
 

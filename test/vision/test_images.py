@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.vision.images import (
     decode_image,
     glare_mask,
     prepare,
     unpack_image,
 )
+
+VIEW = DishView((160.0, 120.0), 8e-5)
 
 
 def test_bytes_that_are_no_image_are_refused():
@@ -51,11 +54,11 @@ def test_the_floor_is_what_is_behind_slender_things():
     gray = np.tile(np.linspace(120, 220, 320).astype(np.uint8), (240, 1))
     floor = gray.copy()
     gray[118:122, 60:200] = 40
-    picture = prepare(gray, 2)
-    assert np.abs(picture.brightest.floor.astype(float) - floor[::2, ::2]).max() < 6.0
+    picture = prepare(gray, VIEW, 0.02)
+    assert np.abs(picture.brightest.floor.astype(float) - floor).max() < 6.0
     assert not glare_mask(picture).any()
     gray[40:60, 100:120] = 250
-    assert glare_mask(prepare(gray, 2))[22:28, 52:58].all()
+    assert glare_mask(prepare(gray, VIEW, 0.02))[44:56, 104:116].all()
 
 
 def png(width: int, height: int) -> bytes:

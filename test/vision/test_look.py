@@ -17,7 +17,6 @@ from magnetosuture_thread.scene import Scene as DishScene
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import (
-    NOWHERE,
     PIXEL,
     SCENE,
     VIEW,
@@ -112,25 +111,6 @@ def test_a_larger_dish_with_a_faint_thread_is_tracked():
     mean, share = line_error(view.to_pixels(seen.centreline), view.to_pixels(thread))
     assert mean < 1.0
     assert share > 0.95
-
-
-def test_without_a_needle_it_says_lost():
-    seen = TRACKER.look(render(Pose(np.array([0.5, 0.5]), 0.0)))
-    assert (seen.state, seen.reason) == (State.LOST, "no needle in the dish")
-
-
-def test_a_needle_without_a_thread_has_no_centreline():
-    seen = TRACKER.look(render(Pose(np.zeros(2), 0.7), NOWHERE))
-    assert seen.reason == ""
-    assert len(seen.centreline) == 1
-
-
-def test_grey_frames_of_another_size_are_taken():
-    pose = Pose(np.zeros(2), 0.2)
-    grey = cv2.resize(render(pose)[:, :, 1], (800, 600), interpolation=cv2.INTER_CUBIC)
-    seen = TRACKER.look(grey)
-    assert seen.reason == ""
-    assert pose.is_right(seen)
 
 
 @pytest.mark.parametrize("rotation", [0.5, -2.0])

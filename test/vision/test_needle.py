@@ -18,16 +18,14 @@ from benchmarks.vision.frames import render as render_case
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.vision.images import prepare
-from magnetosuture_thread.vision.needle.arc import (
-    REVERSED_PX,
+from magnetosuture_thread.vision.arc import (
     Arc,
-    LengthEstimator,
     MeasuredNeedle,
     NeedleSize,
     fit_arc,
 )
-from magnetosuture_thread.vision.needle.measure import find_needles
+from magnetosuture_thread.vision.images import prepare
+from magnetosuture_thread.vision.needle import find_needles
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from test.vision.scenes import NOWHERE, VIEW, Pose, render
@@ -67,8 +65,7 @@ def camera_of(curvature: float) -> DishCamera:
 
 def find(frame: np.ndarray, toward: np.ndarray | None = None) -> tuple[list[MeasuredNeedle], list[str]]:
     """Return the needles in a frame, and why other things are none."""
-    picture = prepare(np.ascontiguousarray(frame[:, :, 1]), 2)
-    return find_needles(picture, VIEW, 0.0175, SIZE, toward)
+    return find_needles(prepare(frame[:, :, 1], VIEW, 0.0175), SIZE, toward)
 
 
 @given(
@@ -134,37 +131,6 @@ def test_speckles_are_not_searched_for_long():
     for u in range(180, 460, 30):
         cv2.circle(speckled, (u, 240), 9, (30, 30, 30), -1)
     assert find(speckled) == ([], ["10 dark things"])
-
-
-def test_a_needle_the_other_way_round_has_its_tail_and_the_doubt_of_it_at_the_other_end():
-    needle = MeasuredNeedle(Arc(np.array([10.0, 20.0]), 0.5, 0.0), 30.0, 4.0, covariance=np.diag([0.01, 0.04, 0.001]))
-    needle = replace(needle, tail_shift_px=0.4, size_measured=True)
-    other = needle.reversed()
-    np.testing.assert_allclose(other.tail_edge_px, needle.tip_px)
-    assert not other.size_measured
-    np.testing.assert_allclose(other.tail_px, needle.tip_px)
-    np.testing.assert_allclose(other.tip_px, needle.tail_px)
-    np.testing.assert_allclose(other.direction_px, -needle.direction_px)
-    assert other.covariance is not None
-    assert other.covariance[1, 1] == pytest.approx(0.04 + 30.0**2 * 0.001), "the tip swings by the heading's error"
-    assert other.covariance[1, 2] == pytest.approx(-30.0 * 0.001)
-    assert other.covariance[0, 0] == pytest.approx(0.01 + REVERSED_PX**2), "it is not known where along it ends"
-    assert other.covariance[2, 2] == 0.001
-
-
-def test_a_length_is_measured_once_eight_confident_frames_in_a_row_agree():
-    estimator = LengthEstimator()
-    for _ in range(9):
-        estimator.add(0.009, confidence=0.2)
-    for length in (*[0.007] * 7, 0.0072, *[0.007] * 7):
-        estimator.add(length, confidence=0.9)
-        assert estimator.length is None
-    assert estimator.size(0.0068, 4e-4, 1e-4).length_px == pytest.approx(68.0)
-    estimator.add(0.007, confidence=0.9)  # the eighth after the one that was another
-    assert estimator.length == 0.007
-    measured, given = estimator.size(0.0068, 4e-4, 1e-4), LengthEstimator().size(0.0068, 4e-4, 1e-4)
-    assert (measured.length_px, measured.width_px) == pytest.approx((70.0, 4.0))
-    assert measured.tolerance < given.tolerance
 
 
 FRAMES = 24

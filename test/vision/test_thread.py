@@ -12,18 +12,20 @@ from benchmarks.vision.measurements import Row, frame_of, measure, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
+from magnetosuture_thread.vision.appearance import Appearance, Hiding, Strand
+from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle
+from magnetosuture_thread.vision.centreline import WALL_PX, find_centreline, without_needle
 from magnetosuture_thread.vision.images import Wall, prepare
-from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle
+from magnetosuture_thread.vision.observe import BARE_COLOUR, Placed, find_order, is_bare_beyond, observe
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
-from magnetosuture_thread.vision.thread.appearance import Appearance, Hiding, Strand
-from magnetosuture_thread.vision.thread.centreline import WALL_PX, find_centreline, without_needle
-from magnetosuture_thread.vision.thread.observe import BARE_COLOUR, Placed, find_order, is_bare_beyond, observe
-from magnetosuture_thread.vision.thread.walk import smoothed
 from magnetosuture_thread.vision.tracker import Track, VisionTracker
-from test.vision.scenes import PIXEL, SCENE, VIEW, Pose, blob, line_error, render
+from magnetosuture_thread.vision.walk import smoothed
+from test.vision.scenes import SCENE, line_error
 
 NEEDLE = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
 TRACKER = VisionTracker(VisionTrackerSettings(), SCENE)
+SCALE = 8e-5
+DRAWN_VIEW = DishView((320.0, 240.0), SCALE)
 
 
 def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 140) -> np.ndarray:
@@ -37,9 +39,8 @@ def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 1
 
 def walk(image: np.ndarray, max_length: float = 400.0, reach: float = 230.0) -> np.ndarray:
     """Follow the thread."""
-    picture = prepare(image, 2)
-    gray = without_needle(picture.darkest, 2, NEEDLE)
-    return find_centreline(picture, gray, NEEDLE, max_length, Wall((320.0, 240.0), reach + WALL_PX))
+    picture = prepare(image, DRAWN_VIEW, (reach + WALL_PX) * SCALE)
+    return find_centreline(picture, without_needle(picture.darkest, NEEDLE), NEEDLE, max_length)
 
 
 def wave(length: float = 150.0) -> np.ndarray:
@@ -71,23 +72,6 @@ def test_it_follows_the_line_to_its_end_and_no_farther(noise: float, level: int)
     np.testing.assert_array_equal(found[0], NEEDLE.tail_px)
 
 
-def test_it_goes_over_a_short_gap_and_ends_at_a_long_one():
-    line = wave()
-    for gap, crosses in ((7.0, True), (35.0, False)):
-        image = drawn(line)
-        image[200:280, int(230.0 - gap) : 230] = 225
-        assert (walk(image)[-1, 0] < 170.0) == crosses
-
-
-def test_under_glare_the_thread_may_go_on():
-    line = np.column_stack([300.0 - np.linspace(0.0, 180.0, 300), 240.0 + np.linspace(0.0, 30.0, 300)])
-    image = drawn(line)
-    image[:, 190:222] = 225  # a gap too long to cross ...
-    assert walk(image)[-1, 0] > 200.0
-    image[:, 192:220] = 252  # ... but not where the lamp is seen instead of the floor
-    assert walk(image)[-1, 0] < 130.0
-
-
 def test_it_stops_at_the_longest_length_and_at_the_wall():
     assert walk(drawn(wave()), max_length=60.0)[-1, 0] > 240.0
     near_wall = walk(drawn(wave()), reach=100.0)
@@ -115,13 +99,6 @@ def test_the_walk_goes_straight_through_its_own_crossing(sign: float, radius: fl
     check_order(walk(drawn(line), max_length=250.0), line)
 
 
-def test_the_walk_crosses_under_the_needle():
-    turned = np.clip((np.linspace(0.0, 237.0, 800) - 25.0) / 26.0, 0.0, 1.5 * np.pi)
-    line = winding(np.pi + turned)
-    assert line[:, 0].max() > 330.0 or line[:, 1].min() < 200.0
-    check_order(walk(drawn(line), max_length=250.0), line)
-
-
 def test_a_near_pass_beside_an_earlier_part_does_not_capture_it():
     """A hairpin whose arms are 7 px apart."""
     s = np.linspace(0.0, 237.0, 1200)
@@ -129,23 +106,9 @@ def test_a_near_pass_beside_an_earlier_part_does_not_capture_it():
     check_order(walk(drawn(line), max_length=250.0), line)
 
 
-def test_the_thread_is_followed_through_a_hot_spot_and_up_to_the_wall():
-    tail = np.array([0.004, 0.0])
-    thread = np.column_stack([np.linspace(0.004, 0.0235, 200), 0.002 * np.sin(np.linspace(0.0, 3.0, 200))])
-    spot = blob(np.array([0.0105, 0.0016]), 4e-4, (255.0, 255.0, 255.0))
-    seen = TRACKER.look(render(Pose(tail, np.pi), thread, covers=(spot,)))
-    assert seen.reason == ""
-    reach = np.linalg.norm(seen.centreline, axis=1)
-    assert 0.0175 - 6.0 * PIXEL < reach.max() < 0.0175
-    mean, _ = line_error(VIEW.to_pixels(seen.centreline), VIEW.to_pixels(thread))
-    assert mean < 1.0
-
-
 SEED = 4712
 FRAMES = 6
 COVERS = ["cover_1.5mm", "cover_3mm", "cover_6mm", "cover_10mm", "two_covers", "hand_instrument"]
-SCALE = 8e-5
-DRAWN_VIEW = DishView((320.0, 240.0), SCALE)
 DARK = Appearance(width_px=3.0, darkness=np.array([1.0, 1.0]), strength=60.0, noise=1.0)
 SHORT_NEEDLE = MeasuredNeedle(Arc(np.array([20.0, 20.0]), 0.0, 0.0), 40.0, 5.0)
 
@@ -217,7 +180,7 @@ def bare_dish(size: int = 400) -> Hiding:
     solid[150:250, 150:250] = 255
     wall = Wall((0.5 * size, 0.5 * size), 0.5 * size)
     inside = np.ones(solid.shape, np.bool_)
-    return Hiding(solid, (solid > 0).astype(np.int32), inside, np.full(solid.shape, 200.0, np.float32), wall)
+    return Hiding(solid, (solid > 0).astype(np.int32), inside, wall)
 
 
 def line(start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
@@ -289,7 +252,7 @@ def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_
     image *= 1.0 + across * (np.arange(160) > 80)[:, None, None] - 0.5 * across * (np.arange(160) != 80)[:, None, None]
     image[:, 81:] *= 1.0 + 0.5 * colour * BARE_COLOUR * np.array([-1.0, 0.0, 1.0])
     image[79:82, 20:81] -= DARK.strength
-    picture = prepare(np.round(image).astype(np.uint8), 1)
+    picture = prepare(np.round(image).astype(np.uint8), DishView((80.0, 80.0), SCALE), 0.0175)
     points = np.column_stack([np.arange(20.0, 81.0, 2.0), np.full(31, 80.0)])
     strength = np.where(fades & (np.arange(31) > 24), 2.0, DARK.strength)
     strand = Strand(points, strength, np.ones(31, np.bool_))
@@ -298,9 +261,9 @@ def test_an_end_is_bare_in_light_from_one_side_but_not_where_the_colour_changes_
 
 def observed(image: np.ndarray, needle: MeasuredNeedle, walk: np.ndarray, length: float) -> ThreadObservation:
     """Return what is observed of a thread of a length [m], with a walk along it [px]."""
-    picture = prepare(image, 2)
-    gray = smoothed(without_needle(picture.darkest, 2, needle))
-    return observe(picture, gray, needle, walk, DRAWN_VIEW, 0.0172, length, scale_known=True)
+    picture = prepare(image, DRAWN_VIEW, 0.0172)
+    gray = smoothed(without_needle(picture.darkest, needle))
+    return observe(picture, gray, needle, walk, length, scale_known=True)
 
 
 def straight_thread() -> tuple[MeasuredNeedle, np.ndarray]:
@@ -333,18 +296,3 @@ def test_a_thread_is_complete_only_if_bare_floor_lies_beyond_its_end(bare: bool)
     seen = observed(image, needle, walk, 150.0 * SCALE)
     assert seen.complete == bare
     assert [piece.last_end for piece in seen.pieces] == [PieceEnd.FREE if bare else PieceEnd.UNKNOWN]
-
-
-def test_a_piece_whose_place_is_unknown_has_no_direction():
-    needle = MeasuredNeedle(Arc(np.array([300.0, 240.0]), 0.0, 0.0), 87.0, 5.0)
-    image = np.full((480, 640), 225, np.uint8)
-    cv2.line(image, (300, 240), (387, 240), 50, 5)
-    cv2.line(image, (300, 240), (220, 240), 100, 2)
-    cv2.line(image, (240, 330), (320, 340), 100, 2)  # in no way from the other
-    image[200:300, 160:221] = 140
-    walk = line((300.0, 240.0), (221.0, 240.0))
-    seen = observed(image, needle, walk, 260.0 * SCALE)
-    first, *others = seen.pieces
-    assert (first.arc_length, first.direction_known) == ((0.0, 0.0), True)
-    assert [np.isnan(piece.arc_length[0]) for piece in others] == [True]
-    assert not others[0].direction_known

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.vision.arc import MeasuredNeedle
 from magnetosuture_thread.vision.images import Gray, Picture, Wall, glare_mask, middle, runs, sampled
-from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
 
 REACH_PX, STEP_PX = 16.0, 0.5  # of profiles: to both sides, and between samples
 BESIDE_PX = 2.5  # from a thread's edge to the floor beside it
@@ -249,14 +249,12 @@ class Hiding:
         solid: 255 there, shape (rows, columns), uint8.
         areas: number of the connected area at each pixel, 0 for bare floor, shape (rows, columns), int32.
         inside: whether a pixel is farther than `WALL_PX` from the wall, shape (rows, columns).
-        floor: brightness of the bare floor in the darkest colour, shape (rows, columns), float32 [grey levels].
         wall: of the dish; beyond it, less `WALL_PX`, nothing is told.
     """
 
     solid: Gray
     areas: NDArray[np.int32]
     inside: NDArray[np.bool_]
-    floor: NDArray[np.float32]
     wall: Wall
 
     def area_at(self, point: Points) -> int:
@@ -277,47 +275,40 @@ class Hiding:
         return [outline for outline in simple if len(outline) > 2]
 
 
-def find_hiding(picture: Picture, needle: MeasuredNeedle, wall: Wall, metres_per_pixel: float) -> Hiding:
-    """Find what may hide a thread in a picture.
-
-    Args:
-        picture: the frame or a part of it.
-        needle: in the picture's pixels.
-        wall: of the dish, in the picture's pixels.
-        metres_per_pixel: of the picture [m].
-    """
+def find_hiding(picture: Picture, needle: MeasuredNeedle) -> Hiding:
+    """Find what may hide a thread in a picture; the needle is in its pixels."""
+    wall = picture.wall
     rows, columns = picture.shape
-    glare = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    solid = cv2.resize(glare, (columns, rows), interpolation=cv2.INTER_NEAREST)
+    solid = cv2.morphologyEx(glare_mask(picture), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     within = np.zeros((rows, columns), np.uint8)
     u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - WALL_PX))
     cv2.circle(within, (u, v), reach, 1, -1, cv2.LINE_8, 4)
     inside = within.view(np.bool_)
     cv2.multiply(solid, within, solid)
-    objects, floor = _objects(picture, wall, 1e-6 / metres_per_pixel**2)  # m^2
-    cv2.bitwise_or(solid, objects, solid)
+    cv2.bitwise_or(solid, _objects(picture, 1e-6 / picture.view.metres_per_pixel**2), solid)  # m^2
     if picture.mask is not None:
         cv2.bitwise_or(solid, cv2.compare(picture.mask.depth, -picture.mask.tolerance_px, cv2.CMP_GT), solid)
     axis = needle.arc.at(np.linspace(0.0, needle.length_px + NEEDLE_PX, 24))
     at = np.round(axis * 16.0).astype(np.int32)
     cv2.polylines(solid, [at], False, 255, max(1, round(needle.width_px + 2.0 * NEEDLE_PX)), cv2.LINE_8, 4)
     _, areas = cv2.connectedComponents(solid, connectivity=8, ltype=cv2.CV_32S)
-    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside, floor, wall)
+    return Hiding(solid, np.asarray(areas, dtype=np.int32), inside, wall)
 
 
-def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Gray, NDArray[np.float32]]:
-    """Return where objects are, and the floor's brightness in the darkest colour."""
+def _objects(picture: Picture, min_area: float) -> Gray:
+    """Return where objects of at least an area [px^2] are, 255 there."""
     rows, columns = picture.shape
     size = (-(-columns // SHRUNK), -(-rows // SHRUNK))
     small = cv2.resize(picture.image, size, interpolation=cv2.INTER_AREA)
     small = cv2.medianBlur(small, 5)  # wider than twice a needle, narrower than an object
     cells = (max(4, columns // 8), max(4, rows // 8))  # to whose means the light is fitted
+    wall = picture.wall
     near = Wall(wall.centre, wall.radius - WALL_PX)
     places = _places(cells, picture.shape, near)
     means = np.atleast_3d(cv2.resize(small, cells, interpolation=cv2.INTER_AREA)).reshape(len(places), -1)
     inside = np.hypot(places[:, 1], places[:, 2]) < 1.0
     if inside.sum() < 4 * places.shape[1]:
-        return np.zeros((rows, columns), np.uint8), np.full((rows, columns), 1.0, np.float32)
+        return np.zeros((rows, columns), np.uint8)
     some = np.zeros(cells[::-1], np.bool_)
     some[::2, ::2] = True  # far more than enough for so few weights
     fitted = inside & some.ravel()
@@ -339,8 +330,7 @@ def _objects(picture: Picture, wall: Wall, min_area: float) -> tuple[Gray, NDArr
     large[0] = False
     objects = cv2.resize(np.where(large, 255, 0).astype(np.uint8)[labels], (columns, rows))
     objects = cv2.dilate(objects, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3)))
-    darkest = reduce(np.minimum, cv2.split(light))
-    return cv2.compare(objects, 127, cv2.CMP_GT), cv2.resize(darkest, (columns, rows))
+    return np.asarray(cv2.compare(objects, 127, cv2.CMP_GT))
 
 
 def _places(size: tuple[int, int], shape: tuple[int, int], wall: Wall) -> NDArray[np.float64]:

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.vision.images import RIM_PX, Picture, Wall, middle, straightened
-from magnetosuture_thread.vision.needle.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
-from magnetosuture_thread.vision.needle.template import (
+from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
+from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, middle
+from magnetosuture_thread.vision.template import (
     BESIDE_PX,
     BLOOM_PX,
     FIRST_ROUNDS,
@@ -27,7 +26,6 @@ from magnetosuture_thread.vision.needle.template import (
     fit_template,
     tail_shift,
 )
-from magnetosuture_thread.vision.scene_mask import SceneMask
 
 AT_WALL = "at the wall"
 MIN_AREA = 0.33  # of the needle's own
@@ -43,13 +41,8 @@ CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no
 ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
 
 
-def search_factor(width_px: float) -> int:
-    """Return by how much an image may be shrunk to search for a needle of a width [px]."""
-    return 2 if width_px >= 4.0 else 1
-
-
 def find_needles(
-    picture: Picture, view: DishView, dish_radius: float, size: NeedleSize, toward: np.ndarray | None = None
+    picture: Picture, size: NeedleSize, toward: np.ndarray | None = None
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find all that may be the needle.
 
@@ -57,8 +50,6 @@ def find_needles(
 
     Args:
         picture: the frame or a part of it.
-        view: where the dish is in the picture, whose first pixel is (0, 0).
-        dish_radius: [m]
         size: of the needle in the picture.
         toward: where the needle must point, u right and v down; settles which end is which where both look
             alike, as when the tip is blurred.
@@ -66,43 +57,34 @@ def find_needles(
     Returns:
         The needles, and in words why each of the other candidates is none.
     """
-    needles, refused = _measured(picture, view, dish_radius, size, toward)
+    needles, refused = _measured(picture, size, toward, tight=False)
     if not needles and refused:
         # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
-        needles, again = _measured(picture, view, dish_radius, size, toward, tight=True)
+        needles, again = _measured(picture, size, toward, tight=True)
         refused = [reason for reason in refused if reason != AT_WALL] or again or refused
     return needles, refused
 
 
 def _measured(
-    picture: Picture,
-    view: DishView,
-    dish_radius: float,
-    size: NeedleSize,
-    toward: np.ndarray | None,
-    *,
-    tight: bool = False,
+    picture: Picture, size: NeedleSize, toward: np.ndarray | None, *, tight: bool
 ) -> tuple[list[MeasuredNeedle], list[str]]:
     """Find the needles of a size, shapes and wall cut out up to their very outlines if `tight`."""
-    radius = dish_radius / view.metres_per_pixel
-    radius = radius - RIM_PX if tight else 0.985 * radius  # at first off the rim
-    wall = Wall(view.centre_px, radius)
+    mask, wall = picture.mask, picture.wall
+    radius = wall.radius - RIM_PX if tight else 0.985 * wall.radius  # at first off the rim
+    cut = 0.0 if tight or mask is None else mask.tolerance_px
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
-    mask, factor = picture.mask, picture.factor
-    candidates = _dark_components(picture, view, radius, size.length_px * size.width_px, tight)
+    candidates = _dark_components(picture, radius, cut, size.length_px * size.width_px)
     if len(candidates) > 6:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
-        if not tight and np.hypot(*(points - view.centre_px).T).max() > radius - 2.0:
+        if not tight and np.hypot(*(points - wall.centre).T).max() > radius - 2.0:
             refused.append(AT_WALL)  # which may have cut off a part
             continue
-        low, high = points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX
-        near = mask is not None and mask.deepest(low, high) > 0.0
-
-        steel = SteelMap.around(points, picture.brightest, picture.darkest, factor, wall)
+        steel = SteelMap.around(points, picture)
+        near = mask is not None and mask.deepest(points.min(axis=0) - AROUND_PX, points.max(axis=0) + AROUND_PX) > 0.0
         if mask is not None and near:
-            steel = steel.hidden_where(mask.depth[steel.box] > (0.0 if tight else mask.tolerance_px))
+            steel = steel.hidden_where(mask.depth[steel.box] > cut)
         if tight:
             steel = steel.hidden_where(wall.distances(steel.box) > radius)
         found = measure_needle(steel, size, toward)
@@ -115,41 +97,34 @@ def _measured(
     return needles, refused
 
 
-def _dark_components(picture: Picture, view: DishView, radius_px: float, area: float, tight: bool) -> list[np.ndarray]:
-    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2)."""
-    factor = picture.factor
-    shift = 0.5 * (factor - 1)
-    u, v = ((c - shift) / factor for c in view.centre_px)
-    radius = radius_px / factor
-    left, top = (max(0, int(c - radius)) for c in (u, v))
-    window = slice(top, max(top, int(v + radius) + 2)), slice(left, max(left, int(u + radius) + 2))
-    dark = cv2.compare(
-        picture.brightest.small[window],
-        cv2.convertScaleAbs(picture.brightest.floor[window], alpha=0.55),
-        cv2.CMP_LT,
-    )
-    if dark is None or dark.size == 0:
-        return []
-    mask = np.zeros(dark.shape, np.uint8)
-    cv2.circle(mask, (round((u - left) * 16), round((v - top) * 16)), round(radius * 16), 255, -1, cv2.LINE_8, 4)
+def _dark_components(picture: Picture, radius: float, cut: float, area: float) -> list[np.ndarray]:
+    """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2).
+
+    Args:
+        picture: the frame or a part of it.
+        radius: around the dish's centre, beyond which nothing is searched [px].
+        cut: depth in a shape of the scene from which on nothing is searched [px].
+        area: of a needle [px^2].
+    """
+    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=0.55)
+    dark = cv2.compare(picture.brightest.pixels, bound, cv2.CMP_LT)
+    inside = np.zeros(picture.shape, np.uint8)
+    u, v, reach = (round(16.0 * value) for value in (*picture.wall.centre, radius))
+    cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
+    cv2.bitwise_and(dark, inside, dark)
     if picture.mask is not None:
-        cut = picture.mask.solid(picture.brightest.small.shape[::-1], 0.0 if tight else picture.mask.tolerance_px)
-        cv2.subtract(mask, cut[window], mask)
-    cv2.bitwise_and(dark, mask, dark)
+        dark[picture.mask.depth > cut] = 0
     outlines, _ = cv2.findContours(dark, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     result = []
     for outline in outlines:
-        # A component is no larger than its box, so most are passed over at once.
-        x, y, wide, high = cv2.boundingRect(outline)
-        if wide * high * factor**2 < MIN_AREA * area:
+        left, top, width, height = cv2.boundingRect(outline)
+        if width * height < MIN_AREA * area:  # A component is no larger than its box, so most are passed over at once.
             continue
-        own = np.zeros((high, wide), np.uint8)
-        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-x, -y))
-        rows, columns = np.nonzero(own & dark[y : y + high, x : x + wide])
-        if len(rows) * factor**2 < MIN_AREA * area:
-            continue
-        at = np.column_stack([columns + x + left, rows + y + top]).astype(float)
-        result.append(at * factor + shift)
+        own = np.zeros((height, width), np.uint8)
+        cv2.drawContours(own, [outline], -1, 255, -1, cv2.LINE_8, offset=(-left, -top))
+        rows, columns = np.nonzero(own & dark[top : top + height, left : left + width])
+        if len(rows) >= MIN_AREA * area:
+            result.append(np.column_stack([columns + left, rows + top]).astype(float))
     return result
 
 
@@ -535,7 +510,7 @@ def _excess(dark: np.ndarray, fit: TemplateFit, width: float) -> tuple[float, fl
     half = 0.5 * width
     along, aside = _across(fit, half)
     drawn = drawn_needle(along, aside, fit.length, half, 0.5 * fit.width + BLOOM_PX - half, THIN)
-    more = np.maximum(straightened(dark, fit.arc.axis, along, aside) - drawn, 0.0)
+    more = np.maximum(fit.arc.strip(dark, along, aside) - drawn, 0.0)
     outside, beside = int((np.abs(aside) >= half + 0.5).sum()) // 2, int((aside > half + 1.5).sum())
     across, tip, tail = slice(outside, len(aside) - outside), along > fit.length + 1.0, along < -1.5
     beyond_tip, beyond_tail = (more[e, across].sum() / max((1.0 - drawn[e, across]).sum(), 1e-9) for e in (tip, tail))
@@ -558,8 +533,8 @@ def _steel_rows(steel: SteelMap, fit: TemplateFit, thin: float) -> tuple[np.ndar
     half = 0.5 * fit.width
     along, aside = np.arange(int(fit.length)) + 0.5, _across(fit, half)[1]
     drawn = drawn_needle(along, aside, fit.length, half, BLOOM_PX, thin)
-    missing = np.maximum(drawn - straightened(steel.perhaps, fit.arc.axis, along, aside), 0.0).sum(axis=1)
-    surely = straightened(steel.surely, fit.arc.axis, along, aside[np.abs(aside) < half])
+    missing = np.maximum(drawn - fit.arc.strip(steel.perhaps, along, aside), 0.0).sum(axis=1)
+    surely = fit.arc.strip(steel.surely, along, aside[np.abs(aside) < half])
     total = drawn.sum(axis=1)
     return missing / np.maximum(total, 1e-9), STEP_PX * total, surely.max(axis=1)
 
@@ -574,7 +549,7 @@ def _bluntness(dark: np.ndarray, fit: TemplateFit) -> np.ndarray:
     """
     half = 0.5 * fit.width
     along, aside = _across(fit, half)
-    seen = straightened(dark, fit.arc.axis, along, aside)
+    seen = fit.arc.strip(dark, along, aside)
     blunt = drawn_needle(along, aside, fit.length, half, BLOOM_PX, 1.0)
     forward = drawn_needle(along, aside, fit.length, half, BLOOM_PX, THIN)
     backward = drawn_needle(fit.length - along, aside, fit.length, half, BLOOM_PX, THIN)
@@ -589,25 +564,6 @@ def _bluntness(dark: np.ndarray, fit: TemplateFit) -> np.ndarray:
     return result
 
 
-def _fading(surely: np.ndarray, fit: TemplateFit) -> float:
-    """Return over how much more length the steel fades at a tail than at the body's sides [px].
-
-    Glare over a tail ends it less sharply than lens and sensor do.
-    """
-    beyond, across = np.arange(-4.0, 4.1, 0.25), np.linspace(-0.3, 0.3, 5) * fit.width
-    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
-    tail = _fade(beyond, straightened(surely, fit.arc.axis, beyond, across).min(axis=1))
-    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
-    sides = (np.median(straightened(surely, fit.arc.axis, body, side * outside), axis=0) for side in (-1.0, 1.0))
-    return tail - min(_fade(-outside, usual) for usual in sides)
-
-
-def _fade(along: np.ndarray, share: np.ndarray) -> float:
-    """Return the length over which a share rises from 0.2 to 0.8."""
-    low, high = (int((share >= level).argmax()) if (share >= level).any() else -1 for level in (0.2, 0.8))
-    return float(along[high] - along[low])
-
-
 def _thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, float | None]:
     """Return how far off the middle of the beginning and the end of an axis a thread goes on there; None: none does.
 
@@ -617,7 +573,7 @@ def _thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, fl
     aside = np.arange(-0.5 * fit.width - 3.0, 0.5 * fit.width + 3.1, 0.5)
     result: list[float | None] = []
     for arc in (fit.arc, fit.reversed()):
-        dark = straightened(steel.perhaps, arc.axis, beyond, aside)
+        dark = arc.strip(steel.perhaps, beyond, aside)
         widths = 0.5 * dark.sum(axis=1)
         if middle(widths) < 0.25:
             result.append(None)
@@ -627,10 +583,42 @@ def _thread_offsets(steel: SteelMap, fit: TemplateFit) -> tuple[float | None, fl
     return result[0], result[1]
 
 
+def _ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
+    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread.
+
+    Half of the width of a thread that leaves sideways lies beyond the tail too.
+    """
+    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
+    dark = fit.arc.strip(steel.surely, -np.arange(1.0, 0.2 * fit.length + 4.0), aside)
+    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
+    if len(light) and light[0] < fit.width and _leaves_sideways(steel, fit):
+        return False
+    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)
+
+
+def _fading(surely: np.ndarray, fit: TemplateFit) -> float:
+    """Return over how much more length the steel fades at a tail than at the body's sides [px].
+
+    Glare over a tail ends it less sharply than lens and sensor do.
+    """
+    beyond, across = np.arange(-4.0, 4.1, 0.25), np.linspace(-0.3, 0.3, 5) * fit.width
+    # A thread that leaves the tail is thinner than the needle: the least across it is the floor behind the tail.
+    tail = _fade(beyond, fit.arc.strip(surely, beyond, across).min(axis=1))
+    body, outside = np.linspace(0.3, 0.6, 12) * fit.length, np.arange(0.5 * fit.width + 4.0, 0.0, -0.25)
+    sides = (np.median(fit.arc.strip(surely, body, side * outside), axis=0) for side in (-1.0, 1.0))
+    return tail - min(_fade(-outside, usual) for usual in sides)
+
+
+def _fade(along: np.ndarray, share: np.ndarray) -> float:
+    """Return the length over which a share rises from 0.2 to 0.8."""
+    low, high = (int((share >= level).argmax()) if (share >= level).any() else -1 for level in (0.2, 0.8))
+    return float(along[high] - along[low])
+
+
 def _leaves_sideways(steel: SteelMap, fit: TemplateFit) -> bool:
     """Say whether something wide and dark lies beside a tail, whose edge may be taken for the tail's."""
     side = 0.5 * fit.width + 1.7
-    dark = straightened(steel.surely, fit.arc.axis, np.arange(-1.0, 3.1), np.array([-side, side]))
+    dark = fit.arc.strip(steel.surely, np.arange(-1.0, 3.1), np.array([-side, side]))
     return bool(dark.mean(axis=0).max() > 0.6)
 
 
@@ -641,21 +629,6 @@ def _lies_over_tail(steel: SteelMap, fit: TemplateFit) -> bool:
     """
     aside = 0.35 * fit.width
     across = np.array([-aside, -0.75, 0.0, 0.75, aside])
-    left, beside, centre, other, right = np.median(
-        straightened(steel.dark, fit.arc.axis, np.arange(2.0, 12.0), across), axis=0
-    )
+    left, beside, centre, other, right = np.median(fit.arc.strip(steel.dark, np.arange(2.0, 12.0), across), axis=0)
     most = max(abs(left - right), abs(beside - other), 0.5 * (beside + other) - centre)
     return bool(most > 0.12 * steel.depth)
-
-
-def _ends_beyond(steel: SteelMap, fit: TemplateFit) -> bool:
-    """Say whether what goes on beyond a tail, as wide as the body, ends soon: more of a needle, and no thick thread.
-
-    Half of the width of a thread that leaves sideways lies beyond the tail too.
-    """
-    aside = np.arange(-1.5 * fit.width, 1.5 * fit.width + 0.1, 0.5)
-    dark = straightened(steel.surely, fit.arc.axis, -np.arange(1.0, 0.2 * fit.length + 4.0), aside)
-    light = np.flatnonzero(dark[:-2, len(aside) // 2] < 0.5)  # A thick thread that bends away is dark beside it.
-    if len(light) and light[0] < fit.width and _leaves_sideways(steel, fit):
-        return False
-    return len(light) > 0 and bool(0.5 * (dark[light[0] + 2] > 0.5).sum() < 0.5 * fit.width)

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magnetosuture_thread.vision.images import straighten
+
 SET_TOLERANCE = 0.1  # of the length as it is set
 FRAMES = 8  # that must agree
 AGREEMENT = 0.02  # share of the length within which they agree
@@ -40,10 +42,16 @@ class Arc:
         half = 0.5 * self.curvature * s
         middle, turned = self.angle + half, self.angle + 2.0 * half
         chord = 2.0 / self.curvature * np.sin(half) if abs(self.curvature) > 1e-12 else s
-        result = np.empty((*s.shape, 2))
-        result[..., 0] = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
-        result[..., 1] = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
-        return result
+        u = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
+        v = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
+        return np.stack([u, v], axis=-1)
+
+    def strip(self, image: np.ndarray, along: np.ndarray, aside: np.ndarray) -> np.ndarray:
+        """Return an image at n lengths along the arc and m distances aside of it, shape (n, m)."""
+        start = float(self.start[0]), float(self.start[1]), float(self.angle), float(self.curvature)
+        strip = np.empty((len(along), len(aside)))
+        straighten(image, start, along, aside, strip)
+        return strip
 
     @property
     def axis(self) -> tuple[float, float, float, float]:
@@ -136,7 +144,7 @@ class MeasuredNeedle:
     tail_shift_px: float = 0.0
     direction_is_clear: bool = True
 
-    def shifted(self, offset: tuple[float, float]) -> MeasuredNeedle:
+    def shifted(self, offset: np.ndarray | tuple[float, float]) -> MeasuredNeedle:
         """Return the needle in pixels that begin elsewhere."""
         return replace(self, arc=replace(self.arc, start=self.arc.start + offset))
 

@@ -26,9 +26,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from magnetosuture_thread.vision.images import Gray, Picture, Wall, middle, runs, sampled
-from magnetosuture_thread.vision.needle.arc import MeasuredNeedle
-from magnetosuture_thread.vision.thread.appearance import (
+from magnetosuture_thread.vision.appearance import (
     FAINTEST,
     GAP_PX,
     MIN_SHARE,
@@ -52,8 +50,10 @@ from magnetosuture_thread.vision.thread.appearance import (
     strengths,
     tangents_of,
 )
-from magnetosuture_thread.vision.thread.crossings import chances_of, cubic
-from magnetosuture_thread.vision.thread.walk import Ridge, walk_on
+from magnetosuture_thread.vision.arc import MeasuredNeedle
+from magnetosuture_thread.vision.centreline import chances_of, cubic
+from magnetosuture_thread.vision.images import Gray, Picture, middle, runs, sampled
+from magnetosuture_thread.vision.walk import Ridge, path_buffers, walk_on
 
 MIN_SEED_PX, MIN_LENGTH_PX = 6, 12.0  # of a ridge from which a walk begins, and of a piece
 MAX_TWICE_PX = 10.0  # along another line, that a line may run near it where it only crosses it
@@ -63,7 +63,7 @@ BARE_COLOUR = 0.03  # of it, by which colours may change apart, on average over 
 LENGTH_TOLERANCE = 0.03  # of the thread's length, that a whole thread may be seen shorter or longer by
 LENGTH_ERROR = 0.01  # of an arc length: by noise along the walk
 END_ERROR_PX = 4.0  # of an arc length, by the places where pieces begin and end
-MEETS_PX = 6.0  # from another piece's end, where the way through a crossing isn't known
+TURNING = 60.0  # rad^2 / m; variance by which a thread's tangent turns along it
 MAX_PRICE = 12.0  # of one gap; half of it for each end that is joined to none
 
 
@@ -72,8 +72,6 @@ def observe(
     gray: Gray,
     needle: MeasuredNeedle,
     walk: Points,
-    view: DishView,
-    radius: float,
     thread_length: float,
     *,
     scale_known: bool,
@@ -90,8 +88,6 @@ def observe(
         gray: its darkest colour without the needle, smoothed.
         needle: in the picture's pixels.
         walk: along the thread from the needle's tail on, shape (m, 2), m = 1 if none is seen [px].
-        view: of the dish, in the picture's pixels.
-        radius: of the dish [m].
         thread_length: of the whole thread [m].
         scale_known: whether the scale is given, so that it has no error.
         search: whether to look for other pieces, where the walk doesn't show all.
@@ -99,7 +95,7 @@ def observe(
     if len(walk) < 2 or arc_lengths(walk)[-1] < SPACING_PX:
         return ThreadObservation()
     walk = respaced(walk, SPACING_PX)
-    below = below_needle(needle, walk)
+    view, below = picture.view, below_needle(needle, walk)
     thread = appearance_of(picture, gray, walk, ~below)
     line = strand_along(gray, thread, walk, below)
     length = thread_length / view.metres_per_pixel
@@ -117,8 +113,7 @@ def observe(
     if not search:
         first = in_dish.piece(parts[0], (PieceEnd.TAIL, PieceEnd.UNKNOWN), (0.0, 0.0))
         return ThreadObservation((first,), hidden=(_outline(needle, view),))
-    wall = Wall(view.centre_px, radius / view.metres_per_pixel)
-    hiding = find_hiding(picture, needle, wall, view.metres_per_pixel)
+    hiding = find_hiding(picture, needle)
     on_floor = np.array([hiding.area_at(point) == 0 for point in line.points])
     line = Strand(line.points, line.strength, line.visible & on_floor)
     parts = parts_without(
@@ -135,7 +130,7 @@ def observe(
             known += [each for each in fresh if len(each) > MIN_LENGTH_PX]
     remaining = length * (1.0 + LENGTH_TOLERANCE) - sum(float(arc_lengths(each)[-1]) for each in known)
     others = known[1:] + find_pieces(picture, gray, thread, hiding, known, remaining)
-    strands = _cut_where_met(begun, others)
+    strands = [begun]
     strands += [strand_along(gray, thread, respaced(other, SPACING_PX)) for other in others]
     ends, areas = [], []
     for number, strand in enumerate(strands):
@@ -146,23 +141,6 @@ def observe(
         ends.append([first_end, last_end])
         areas.append((first_area, last_area))
     return _joined(strands, ends, areas, hiding, in_dish, length)
-
-
-def _cut_where_met(strand: Strand, others: list[Points]) -> list[Strand]:
-    """Cut the piece that leaves the needle where another piece begins on it: there the thread may go on along it."""
-    ends = np.array([end for other in others for end in (other[0], other[-1])]).reshape(-1, 2)
-    if not len(ends):
-        return [strand]
-    apart = np.hypot(*(strand.points[:, None] - ends[None]).transpose(2, 0, 1))
-    inside = arc_lengths(strand.points)
-    met = (apart.min(axis=1) < MEETS_PX) & (inside > MEETS_PX) & (inside < inside[-1] - 2.0 * MEETS_PX)
-    found = runs(met)
-    if not found:
-        return [strand]
-    parts = [strand.part(0, found[0][0])]
-    for (_, first), last in zip(found, [begin for begin, _ in found[1:]] + [len(met)], strict=True):
-        parts.append(strand.part(first, last))
-    return [parts[0], *(part for part in parts[1:] if len(part.points) * SPACING_PX > GAP_PX)]
 
 
 @dataclass(frozen=True)
@@ -271,15 +249,6 @@ class Placed:
     chance: float = 1.0
 
 
-@dataclass(frozen=True)
-class _Gap:
-    """A way below a hiding area: its price, the straight distance, and the length of its curve [px]."""
-
-    price: float
-    chord: float
-    length: float
-
-
 def find_order(
     lines: list[Points],
     areas: list[tuple[int, int]],
@@ -307,25 +276,31 @@ def find_order(
         below = [(number, side) for number, both in enumerate(areas) for side in (0, 1) if both[side] == area]
         others = sorted((each for each in below if each != end), key=lambda each: -lengths[each[0]])
         ends = [end, *others][:8]  # of which all pairings can be tried
-        # A thread's tangent varies by 60 rad^2 for each metre.
-        gaps = _gaps_below(ends, lines, lengths, longest, hiding, 60.0 * metres_per_pixel)
         costs = np.full((len(ends), len(ends)), math.inf)
         np.fill_diagonal(costs, 0.5 * MAX_PRICE)
-        for (one, other), gap in gaps.items():
-            costs[one, other] = costs[other, one] = gap.price
+        straight_and_curved: dict[int, tuple[float, float]] = {}  # lengths of the ways from the end [px]
+        for one, other in combinations(range(len(ends)), 2):
+            (before, first_side), (after, last_side) = ends[one], ends[other]
+            leaving = lines[before] if first_side else lines[before][::-1]
+            arriving = lines[after][::-1] if last_side else lines[after]
+            gap = _gap(leaving, arriving, hiding, TURNING * metres_per_pixel) if before != after else None
+            if gap is not None and lengths[before] + gap[1] + lengths[after] <= longest:
+                if one == 0:
+                    straight_and_curved[other] = gap[1:]
+                costs[one, other] = costs[other, one] = gap[0]
         chances = chances_of(costs, 0)
         best = int(chances.argmax())
         index, side = ends[best]
         if best == 0 or chances[best] < 0.98 or any(index == each.index for each in placed):
             break
-        gap, last = gaps[0, best], placed[-1]
-        if sum(way) + gap.chord + lengths[index] > longest:
+        (chord, curved), last = straight_and_curved[best], placed[-1]
+        if sum(way) + chord + lengths[index] > longest:
             break
         low, high = (arc + lengths[last.index] for arc in last.arc_length)
         # A half circle is the longest way below what hides it.
-        arc = (low + gap.chord, high + 0.5 * math.pi * gap.length)
+        arc = (low + chord, high + 0.5 * math.pi * curved)
         placed.append(Placed(index, side == 1, arc, last.chance * float(chances[best])))
-        way += [gap.chord, lengths[index]]
+        way += [chord, lengths[index]]
         end = (index, 1 - side)
     last = placed[-1]
     if not areas[end[0]][end[1]] and last.arc_length[1] + lengths[last.index] < length[0]:
@@ -338,30 +313,11 @@ def find_order(
     return result
 
 
-def _gaps_below(
-    ends: list[tuple[int, int]],
-    lines: list[Points],
-    lengths: list[float],
-    longest: float,
-    hiding: Hiding,
-    turning: float,
-) -> dict[tuple[int, int], _Gap]:
-    """Return the ways between the ends of pieces below one area, by their places among these ends."""
-    gaps = {}
-    for one, other in combinations(range(len(ends)), 2):
-        (before, first_side), (after, side) = ends[one], ends[other]
-        if before == after:
-            continue
-        leaving = lines[before] if first_side else lines[before][::-1]
-        arriving = lines[after][::-1] if side else lines[after]
-        gap = _gap(leaving, arriving, hiding, turning)
-        if gap is not None and lengths[before] + gap.chord + lengths[after] <= longest:
-            gaps[one, other] = gap
-    return gaps
+def _gap(before: Points, after: Points, hiding: Hiding, turning: float) -> tuple[float, float, float] | None:
+    """Return the way from a piece's end to the beginning of another; None where it is not hidden, or too bent.
 
-
-def _gap(before: Points, after: Points, hiding: Hiding, turning: float) -> _Gap | None:
-    """Return the way from a piece's end to the beginning of another; None where it is not hidden, or too bent."""
+    It is told by its price, the straight distance, and the length of its curve [px].
+    """
     start, end = before[-1], after[0]
     leaving, arriving = end_direction(before), -end_direction(after[::-1])
     chord = float(np.hypot(*(end - start)))
@@ -375,7 +331,7 @@ def _gap(before: Points, after: Points, hiding: Hiding, turning: float) -> _Gap 
     curve = cubic(start, end, leaving * chord, arriving * chord, 17)
     length = float(arc_lengths(curve)[-1])
     bare = sum(hiding.area_at(point) == 0 for point in curve[1:-1]) * length / len(curve)
-    return _Gap(price, chord, length) if bare <= 10.0 else None  # px of it may lie on bare floor
+    return (price, chord, length) if bare <= 10.0 else None  # px of it may lie on bare floor
 
 
 def _angle(from_: Points, to: Points) -> float:
@@ -457,7 +413,7 @@ def find_pieces(
         cv2.circle(fresh, (round(seed[0]), round(seed[1])), MIN_SEED_PX, 0, -1)
         for part in fresh_parts(line, known + found):
             long = MIN_LENGTH_PX <= arc_lengths(part)[-1] <= max_length
-            if long and _is_thread(picture, gray, thread, hiding, part):
+            if long and looks_alike(picture, thread, part, 0.35):
                 found.append(part)
     return sorted(found, key=lambda line: -arc_lengths(line)[-1])
 
@@ -493,7 +449,7 @@ def _traced(
     """Walk from a place along a ridge to both of its ends."""
     halves = []
     for turn in (math.pi, 0.0):
-        path, strong = np.zeros((int(max_length) + 16, 6)), np.zeros(int(max_length) + 16, np.bool_)
+        path, strong = path_buffers(max_length)
         path[0, :5] = seed[0], seed[1], seed[2] + turn, 0.0, strength
         count = walk_on(ridge, dish, max_length, path, strong, 1)
         halves.append(path[:count, :2].copy())
@@ -519,16 +475,6 @@ def fresh_parts(line: Points, known: list[Points]) -> list[Points]:
         if last - first < MAX_TWICE_PX and first > 0 and last < len(twice):
             twice[first:last] = False
     return [line[first:last] for first, last in runs(~twice) if last - first > 1]
-
-
-def _is_thread(picture: Picture, gray: Gray, thread: Appearance, hiding: Hiding, line: Points) -> bool:
-    """Say whether a line looks like the thread and lies on the floor."""
-    reach = thread.beside_px
-    ground = sampled(gray, across(line, np.array([-reach, reach])))
-    floor = sampled(hiding.floor, line)[:, None]
-    if abs(float(np.median(ground / floor)) - 1.0) > 0.06:  # of the floor's brightness
-        return False
-    return looks_alike(picture, thread, line, 0.35)
 
 
 def end_direction(points: Points) -> Points:

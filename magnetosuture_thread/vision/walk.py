@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.images import middle, sample, shrunk
+from magnetosuture_thread.vision.images import middle, sample
 
 STEP_PX = 2.0  # of the walk
 AHEAD = 9  # steps looked ahead, of which five count in full
@@ -31,32 +31,35 @@ class Ridge(NamedTuple):
         hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
         noise: strength where nothing is.
         faintest: a strength above noise that is no noise.
-        scale: how much smaller the ridge is than the picture.
     """
 
     strength: np.ndarray
     hidden: np.ndarray
     noise: float
     faintest: float
-    scale: int = 1
 
 
-def black_hat(gray: np.ndarray, hidden: np.ndarray, scale: int) -> Ridge:
+def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray) -> Ridge:
     """Return how much darker an image is than the brightest background within a few pixels.
 
     An edge has no black-hat, so that shadows, covers and the rim are no thread.
 
     Args:
         gray: shape (rows, columns), uint8.
-        hidden: where nothing can be seen, not 0 there, of any size, uint8.
-        scale: by which the image is shrunk first.
+        hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
+        inside: the dish, whose noise is measured, not 0 there, of the same shape, uint8.
     """
-    small = shrunk(gray, scale)
-    hidden = cv2.resize(hidden, small.shape[::-1], interpolation=cv2.INTER_NEAREST)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
-    strength = cv2.morphologyEx(smoothed(small), cv2.MORPH_BLACKHAT, kernel)
-    noise = middle(strength[::5, ::5])
-    return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise), scale)
+    strength = cv2.morphologyEx(smoothed(gray), cv2.MORPH_BLACKHAT, kernel)
+    some = strength[::5, ::5][inside[::5, ::5] > 0]
+    noise = middle(some) if some.size else 0.0
+    return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise))
+
+
+def path_buffers(max_length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return room for a path of a length [px] and for which of its vertices are visible; see `walk_on`."""
+    max_steps = int(max_length) + 16  # steps are longer than a pixel
+    return np.zeros((max_steps, 6)), np.zeros(max_steps, np.bool_)
 
 
 def smoothed(gray: np.ndarray) -> np.ndarray:
@@ -183,45 +186,29 @@ def walk_on(ridge, dish, max_length, path, strong, count):
 @compiled
 def refine(ridge, points, strong):
     """Centre the vertices once more, now that their neighbours on both sides are known, and even them out."""
-    strength, noise, count = ridge.strength, ridge.noise, len(points)
+    count = len(points)
     if count < 4:
         return
-    normals, profile, shifts = np.zeros((count, 2)), np.zeros(ACROSS), np.zeros(count)
+    angles, shifts = np.zeros(count), np.zeros(count)
     for index in range(1, count):
         before, after = max(0, index - 2), min(count - 1, index + 2)
-        x, y = points[after, 0] - points[before, 0], points[after, 1] - points[before, 1]
-        length = max(1e-9, math.hypot(x, y))
-        normals[index, 0], normals[index, 1] = -y / length, x / length
+        angles[index] = math.atan2(points[after, 1] - points[before, 1], points[after, 0] - points[before, 0])
+        if strong[index]:
+            shifts[index], _ = centred(ridge, points[index, 0], points[index, 1], angles[index], 1.0)
     for index in range(1, count):
-        if not strong[index]:
-            continue
-        for place in range(ACROSS):
-            aside = (place - ACROSS // 2) * ASIDE_PX
-            u, v = points[index, 0] + aside * normals[index, 0], points[index, 1] + aside * normals[index, 1]
-            profile[place] = sample(strength, u, v) - noise
-        bound, total, moment = 0.3 * max(0.0, profile.max()), 0.0, 0.0
-        for place in range(ACROSS):
-            if profile[place] > bound:
-                total += profile[place] - bound
-                moment += (profile[place] - bound) * (place - ACROSS // 2) * ASIDE_PX
-        if total > 0.0:
-            shifts[index] = min(1.0, max(-1.0, moment / total))
-    for index in range(1, count):
-        before, after = index - 1, min(count - 1, index + 1)
-        even = 0.5 * shifts[index] + 0.25 * (shifts[before] + shifts[after])
-        points[index, 0] += even * normals[index, 0]
-        points[index, 1] += even * normals[index, 1]
+        even = 0.5 * shifts[index] + 0.25 * (shifts[index - 1] + shifts[min(count - 1, index + 1)])
+        points[index, 0] -= even * math.sin(angles[index])
+        points[index, 1] += even * math.cos(angles[index])
 
 
 @compiled
-def ways_out(ridge, tail, max_hidden, simple, ways):
+def ways_out(ridge, tail, max_hidden, ways):
     """Find the arcs along which a thread may leave the tail.
 
     Args:
         ridge: see `Ridge`.
         tail: u, v and the needle's direction there [px, px, rad].
         max_hidden: of a way, at most [px].
-        simple: whether sharp bends and ways along the needle are not tried.
         ways: filled with angle, curvature, length up to where it can be seen, strength, score and greatest turn, the
             best first, shape (most, 6).
 
@@ -232,8 +219,6 @@ def ways_out(ridge, tail, max_hidden, simple, ways):
     ends = [(0.0, 0.0)] * len(ways)
     for index in range(90):
         angle = 2.0 * math.pi * index / 90
-        if simple and math.cos(angle - tail[2]) > math.cos(math.radians(28.0)):
-            continue
         for side in (-1.0, 1.0):
             for bend in (0.0, 0.04, 0.08, 0.12):
                 if side * bend == 0.0 and side > 0.0:
@@ -241,9 +226,8 @@ def ways_out(ridge, tail, max_hidden, simple, ways):
                 count = _try(ridge, tail, (angle, side * bend, math.pi), max_hidden, ways, ends, count)
             for bend in (0.17, 0.23, 0.31, 0.42):  # after a sharp bend the thread goes straight on
                 for turn in (math.pi, 0.75 * math.pi):
-                    if not simple:
-                        count = _try(ridge, tail, (angle, side * bend, turn), max_hidden, ways, ends, count)
-    for index in range(0 if simple else 181):  # below the needle
+                    count = _try(ridge, tail, (angle, side * bend, turn), max_hidden, ways, ends, count)
+    for index in range(181):  # below the needle
         for bend in (0.0, 0.005, -0.005):
             arc = (tail[2] + math.radians(75.0) * (2.0 * index / 180 - 1.0), bend, math.pi)
             count = _try(ridge, tail, arc, max_hidden, ways, ends, count)
@@ -362,7 +346,7 @@ def worth(path, strong, count):
 
 
 @compiled
-def follow(ridge, start, dish, max_length, max_hidden, simple, path, strong):
+def follow(ridge, start, dish, max_length, max_hidden, path, strong):
     """Walk along the ridge from the tail to its end, along the way out that shows most of the thread.
 
     Args:
@@ -371,15 +355,15 @@ def follow(ridge, start, dish, max_length, max_hidden, simple, path, strong):
         dish: centre and the farthest the walk may go from it [px].
         max_length: of the walk, a little longer than the thread [px].
         max_hidden: of the thread below the needle, at most [px].
-        simple: see `ways_out`.
         path: filled; see `walk_on`.
         strong: filled; see `walk_on`.
 
     Returns:
-        The number of vertices, and how much thread they show [px]; see `worth`.
+        The number of vertices.
     """
     ways = np.empty((5, 6))
-    found = ways_out(ridge, start, max_hidden, simple, ways)
+    found = ways_out(ridge, start, max_hidden, ways)
+    path[0, :] = 0.0
     path[0, :2], strong[0] = start[:2], False
     best, best_value, enough = 1, 0.0, 0.9 * max_length  # so much thread needs no other way
     other, other_strong = np.empty_like(path), np.empty_like(strong)
@@ -392,4 +376,4 @@ def follow(ridge, start, dish, max_length, max_hidden, simple, path, strong):
             path[:count], strong[:count] = other[:count], other_strong[:count]
         if best_value > enough:
             break
-    return best, best_value
+    return best

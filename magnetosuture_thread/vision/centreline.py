@@ -1,4 +1,6 @@
-"""Crossings of a walk with other strands, and the way it takes there: the smoothest of all pairings of the strands.
+"""Follows the thread's centreline: a walk along its dark ridge that starts at the needle's tail.
+
+Crossings of a walk with other strands, and the way it takes there: the smoothest of all pairings of the strands.
 
 A thread's tangent and its curvature turn at random along it, by variances t and c for each length. A walk out of the
 crossing gives the direction and the curvature of each arm where it begins, with their covariance. With the length g of
@@ -30,8 +32,21 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.vision.images import runs, sampled, within
-from magnetosuture_thread.vision.thread.walk import STEP_PX, STRONGEST, Ridge, walk_on
+from magnetosuture_thread.vision.arc import MeasuredNeedle
+from magnetosuture_thread.vision.images import (
+    RIM_PX,
+    Gray,
+    Layer,
+    Picture,
+    SceneMask,
+    glare_mask,
+    middle,
+    runs,
+    sampled,
+    within,
+)
+from magnetosuture_thread.vision.template import BLOOM_PX, BLUR_PX, STEEPNESS, TAPER, THIN
+from magnetosuture_thread.vision.walk import STEP_PX, STRONGEST, Ridge, black_hat, follow, path_buffers, refine, walk_on
 
 RADIUS_PX, RING = 7.0, 48  # around a path's vertices, that belongs to a crossing; places on it that are looked at
 REACH = round(RADIUS_PX / STEP_PX)  # vertices
@@ -46,20 +61,8 @@ END_COST = 12.0 + 0.5 * math.log(2.0 * RADIUS_PX * 2.0 * math.pi * 0.2)  # of an
 
 Circle = tuple[float, float, float]  # u, v and radius [px]
 
-
-@dataclass(frozen=True)
-class Crossing:
-    """A place where a walk could have gone on along another strand.
-
-    Attributes:
-        first: vertex of the walk's path where it enters.
-        last: vertex where it leaves.
-        confidence: how probable the way is that was taken, 0 to 1.
-    """
-
-    first: int
-    last: int
-    confidence: float
+WALL_PX = 4.0  # before which the walk ends
+SHADE_PX = 10.0  # beside a needle, where its shadow lies
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,10 @@ class Arm:
         """Return where it begins, shape (2,) [px]."""
         return np.asarray(self.path[0, :2])
 
+    def covers(self, point: Points) -> bool:
+        """Say whether a point lies on it."""
+        return bool(((self.path[:, :2] - point) ** 2).sum(axis=1).min() < 2.5**2)
+
 
 def resolve_crossings(
     ridge: Ridge,
@@ -95,7 +102,7 @@ def resolve_crossings(
     path: NDArray[np.float64],
     strong: NDArray[np.bool_],
     count: int,
-) -> tuple[int, tuple[Crossing, ...]]:
+) -> tuple[int, list[tuple[int, float]]]:
     """Take the most probable way wherever other strands meet a path, and walk on from there.
 
     Strands meet where more than two of them cross a ring around the path's vertices. Where three arms meet, and soon
@@ -110,9 +117,10 @@ def resolve_crossings(
         count: vertices that there are.
 
     Returns:
-        The number of vertices, and the crossings in their order.
+        The number of vertices, and of each crossing the vertex where the path enters it and how probable the way is
+        that was taken, 0 to 1.
     """
-    crossings: list[Crossing] = []
+    crossings: list[tuple[int, float]] = []
     begin = 1
     for _ in range(16):
         places = _meetings(ridge, path[:count], begin)
@@ -136,28 +144,22 @@ def resolve_crossings(
         taken = arm_of(arms, path[high - 1 : beyond], leaving=True)
         chances = continuations(ridge, dish, (float(path[low, 5]), max_length), arms, entry)
         best = int(np.argmax(chances))
-        if best == entry:  # The thread ends here, or nothing that is seen goes on from it.
-            ends = taken < 0 and count <= high + 2 * REACH
-            crossings.append(
-                Crossing(low, high, float(chances[entry if ends else taken]) if ends or taken >= 0 else 0.0)
-            )
-            continue
-        if best != taken and not overrules:
-            crossings.append(Crossing(low, high, 0.0 if taken < 0 else float(chances[taken])))
-            continue
-        if best == taken:
-            crossings.append(Crossing(low, high, float(chances[best])))
+        if best in (entry, taken) or not overrules:
+            # Best as entry: the thread ends here, or nothing that is seen goes on from it.
+            ends = best == entry and taken < 0 and count <= high + 2 * REACH
+            taken = entry if ends else taken
+            crossings.append((low, float(chances[taken]) if taken >= 0 else 0.0))
             continue
         away = np.hypot(*(path[first : low + 1, :2] - arms[entry].start).T)
         count, begin = _turn(path, strong, first + int(np.argmin(away)) + 1, arms[entry], arms[best])
-        crossings.append(Crossing(low, begin, float(chances[best])))
+        crossings.append((low, float(chances[best])))
         begin += REACH
         longer = np.flatnonzero(path[:count, 5] > max_length)
         if len(longer):
             count = max(2, int(longer[0]))
             break
         count = walk_on(ridge, dish, max_length, path, strong, count)
-    return count, tuple(crossing for crossing in crossings if crossing.first < count)
+    return count, [each for each in crossings if each[0] < count]
 
 
 def _meetings(ridge: Ridge, path: NDArray[np.float64], begin: int) -> list[tuple[int, int]]:
@@ -249,9 +251,9 @@ def find_arms(ridge: Ridge, dish: Circle, part: NDArray[np.float64]) -> list[Arm
         score = np.minimum(along, STRONGEST * usual).mean(axis=0)
         score[ways @ outward < 0.0] = -np.inf
         arm = _arm(ridge, dish, start, float(turns[np.argmax(score)]), usual)
-        if arm is None or _stays(arm, part[:, :2]) or any(_lies_on(arm.start, other) for other in arms):
+        if arm is None or _stays(arm, part[:, :2]) or any(other.covers(arm.start) for other in arms):
             continue
-        arms = [other for other in arms if not _lies_on(other.start, arm)] + [arm]
+        arms = [other for other in arms if not arm.covers(other.start)] + [arm]
     return sorted(arms, key=lambda arm: -arm.strength)[:8]
 
 
@@ -289,13 +291,9 @@ def _peaks(values: NDArray[np.floating], bound: float) -> list[int]:
     return found
 
 
-def _lies_on(point: Points, arm: Arm) -> bool:
-    return bool(((arm.path[:, :2] - point) ** 2).sum(axis=1).min() < 2.5**2)
-
-
 def _arm(ridge: Ridge, dish: Circle, start: Points, angle: float, usual: float) -> Arm | None:
     """Walk along an arm, and measure it where it begins; None if it is too short."""
-    path, strong = np.zeros((int(ARM_PX / STEP_PX) + 3, 6)), np.ones(int(ARM_PX / STEP_PX) + 3, np.bool_)
+    path, strong = path_buffers(ARM_PX)
     path[0, :5] = start[0], start[1], angle, 0.0, usual
     count = walk_on(ridge, dish, ARM_PX, path, strong, 1)
     if count <= 4:
@@ -389,7 +387,7 @@ def _beyond(
     for number, arm in enumerate(arms):
         if number == entry:
             continue
-        path, strong = np.zeros((int(max_length) + 16, 6)), np.ones(int(max_length) + 16, np.bool_)
+        path, strong = path_buffers(max_length)
         path[: len(arm.path)] = arm.path
         count = walk_on(ridge, dish, max_length, path, strong, len(arm.path))
         lengths[number] = path[count - 1, 5]
@@ -461,3 +459,149 @@ def chances_of(costs: NDArray[np.float64], entry: int) -> NDArray[np.float64]:
         one, other = next(pair for pair in pairing if entry in pair)
         chances[other if one == entry else one] += weight
     return np.asarray(chances / chances.sum())
+
+
+def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_length: float) -> Points:
+    """Follow the thread from the needle's tail to its end.
+
+    The ridge strength is the black-hat transform of the darkest colour without the needle: how much darker a pixel is
+    than the brightest background within a few pixels. The walk leaves the tail along the arc that shows most of the
+    thread, below the needle where it must, and goes by steps along arcs that look some way ahead, a change of curvature
+    having a price: so it goes straight over gaps. At crossings the smoothest of all pairings of the strands that meet
+    decides. Where the needle or the lamp's reflection hides the thread, nothing counts for or against a way.
+
+    Args:
+        picture: the frame or a part of it.
+        gray: its darkest colour without the needle.
+        needle: the needle, in the picture's pixels.
+        max_length: the walk stops at this length [px].
+
+    Returns:
+        Vertices from the tail on, up to the first crossing where it is in doubt how the thread goes on, shape (m, 2)
+        [px]; m = 1 if no thread is visible.
+    """
+    wall = picture.wall
+    hidden = glare_mask(picture)
+    _cover_needle(hidden, needle)
+    inside = np.zeros_like(gray)
+    u, v, reach = (round(16.0 * value) for value in (*wall.centre, wall.radius - RIM_PX))
+    cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
+    # What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
+    gray = np.asarray(cv2.copyTo(gray, inside, picture.darkest.floor.copy()), dtype=np.uint8)
+    ridge = black_hat(gray, hidden, inside)
+    _clear_shade(ridge, picture, needle)
+    dish = (*wall.centre, wall.radius - WALL_PX)
+    path, strong = path_buffers(max_length)
+    tail, direction = needle.tail_px, needle.direction_px
+    start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
+    # Hidden by the needle and what is next to it.
+    count = follow(ridge, start, dish, max_length, needle.length_px + 12.0, path, strong)
+    count, crossings = resolve_crossings(ridge, dish, max_length, path, strong, count)
+    if picture.mask is not None:
+        above = cv2.subtract(ridge.strength, ridge.noise)
+        count = min(count, count_off_outline(path[:count, :2], above, picture.mask, ridge.faintest))
+    points = path[:count, :2].copy()
+    refine(ridge, points, strong[:count])
+    doubtful = [first for first, confidence in crossings if confidence < 0.9]
+    return points[: max(2, min(doubtful))] if doubtful else points
+
+
+def _clear_shade(ridge: Ridge, picture: Picture, needle: MeasuredNeedle) -> None:
+    """Take what is no stronger than the needle's shadow out of a ridge beside the needle."""
+    # A shadow has 12 % of steel's darkness.
+    shade = 0.12 * needle.contrast * middle(picture.darkest.floor[::4, ::4])
+    zone = np.zeros_like(ridge.strength)
+    _draw_axis(zone, needle, SHADE_PX, needle.length_px, needle.width_px + 2.0 * SHADE_PX)
+    cv2.bitwise_and(zone, cv2.compare(ridge.strength, shade, cv2.CMP_LT), zone)
+    cv2.copyTo(np.zeros_like(zone), zone, ridge.strength)
+
+
+def _cover_needle(hidden: Gray, needle: MeasuredNeedle) -> None:
+    """Mark where a needle hides the thread.
+
+    At the tail the mask begins 1.5 px inside of the needle, so that the walk can leave.
+    """
+    _draw_axis(hidden, needle, 1.5, needle.length_px + 3.0, needle.width_px + 3.0)
+
+
+def _draw_axis(mask: Gray, needle: MeasuredNeedle, first: float, last: float, width: float) -> None:
+    """Draw a part of a needle's axis into a mask, as wide as given [px]."""
+    at = np.round(needle.arc.at(np.linspace(first, last, 24)) * 16.0).astype(np.int32)
+    cv2.polylines(mask, [at], False, 255, max(1, round(width)), cv2.LINE_8, 4)
+
+
+def count_off_outline(points: Points, ridge: NDArray[np.uint8], mask: SceneMask, faintest: float) -> int:
+    """Return how many vertices of a walk show the thread, where it may have gone on along a bare outline.
+
+    A walk ends before it enters a shape. A ridge along an outline is the thread's or the shape's own edge. The last
+    vertices along an outline count only as long as their ridge is stronger than that of the same outline away from
+    the walk, or that one shows none.
+
+    Args:
+        points: vertices of the walk, shape (m, 2) [px].
+        ridge: ridge strength in grey levels, uint8.
+        mask: of the picture.
+        faintest: a strength that is no noise.
+    """
+    depths = mask.depths(points)
+    inside = depths > mask.tolerance_px
+    if inside.any():  # Whatever was followed from here on, it is no thread.
+        first = max(1, int(np.argmax(inside)))
+        points, depths = points[:first], depths[:first]
+    near = np.abs(depths) <= mask.band_px
+    run = len(near) if near.all() else int(np.argmin(near[::-1]))
+    if run < 5 or not len(mask.rim):  # vertices along an outline
+        return len(points)
+    rim = mask.rim[:, :2]
+    last = mask.rim[np.argmin(((rim - points[-1]) ** 2).sum(axis=1)), 2]
+    rim = rim[mask.rim[:, 2] == last]
+    apart = ((rim[:, None] - points[None, ::3]) ** 2).sum(axis=2).min(axis=1)
+    rows, columns = ridge.shape
+    reach = int(mask.band_px) + 1
+    bare = (apart > (2.0 * mask.band_px) ** 2) & (rim.min(axis=1) > reach)
+    bare &= (rim < (columns - 1 - reach, rows - 1 - reach)).all(axis=1)
+    if bare.sum() < 8:
+        return len(points)
+    usual = middle(_strongest(ridge, rim[bare], reach))
+    if usual < faintest:
+        return len(points)
+    # The thread ends where the sum of what speaks for it and against it is greatest: single strong pixels count little.
+    surplus = np.cumsum(np.minimum(_strongest(ridge, points[-run:], 1) / (1.3 * usual) - 1.0, 0.5))
+    shown = int(np.argmax(surplus)) + 1 if surplus.max() > 0.0 else 0
+    return max(1, len(points) - run + shown)
+
+
+def _strongest(ridge: NDArray[np.uint8], points: Points, reach: int) -> NDArray[np.uint8]:
+    """Return the strongest ridge in a square around each point, shape (m,)."""
+    step = np.arange(-reach, reach + 1)
+    at = np.round(points).astype(np.intp)
+    rows = np.clip(at[:, 1, None] + step, 0, ridge.shape[0] - 1)
+    columns = np.clip(at[:, 0, None] + step, 0, ridge.shape[1] - 1)
+    return np.asarray(ridge[rows[:, :, None], columns[:, None, :]].max(axis=(1, 2)), dtype=np.uint8)
+
+
+def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
+    """Return a layer's pixels in which a needle has the floor's brightness.
+
+        I' = min(I + F c share, F)
+
+    with the floor F, the needle's contrast c, and the share of each pixel that a drawn needle covers.
+    """
+    half, length = 0.5 * needle.width_px + BLOOM_PX, needle.length_px
+    near = np.zeros_like(layer.pixels)
+    # Up to two deviations of the blur beside the outline, light of the needle is mixed in.
+    _draw_axis(near, needle, 0.0, length, 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0))
+    u, v = cv2.findNonZero(near).reshape(-1, 2).T
+    s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
+    own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
+    share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)
+    share[share <= 0.01] = 0.0
+    floor, result = layer.floor[v, u], layer.pixels.copy()
+    light = result[v, u]
+    result[v, u] = np.maximum(light, np.minimum(light + floor * needle.contrast * share, floor).astype(np.uint8))
+    return result
+
+
+def _edge(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much of a blurred edge is covered at distances inside of it; see `template`."""
+    return np.asarray(1.0 / (1.0 + np.exp(-STEEPNESS * x)))

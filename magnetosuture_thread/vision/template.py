@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.vision.images import Layer, Wall, straighten_both, straightened
-from magnetosuture_thread.vision.needle.arc import Arc
+from magnetosuture_thread.vision.arc import Arc
+from magnetosuture_thread.vision.images import Layer, Picture
 
 AROUND_PX = 12.0  # around a dark thing, that is measured on
 GLARE = 0.07  # of the floor's brightness, that the lamp's reflection is brighter by
@@ -34,15 +34,11 @@ BESIDE_PX = 4.0  # beside and beyond the body, that is compared too
 STEP_PX = 0.75  # between samples across; along it is 1 px
 OTHER = 0.2  # of steel, at which dark beyond the drawn needle counts a quarter of steel that is missing
 BLOOM_PX = 0.22  # that shadow and lens let an edge seem to lie outside of where it is
-WIDTH_SLACK_PX, WIDTH_SLACK = 0.2, 0.03  # standard deviation of the body's width, and share of it
 MAX_STEP_PX = 1.5  # of a round
 FIRST_ROUNDS = 4  # that tell which of several fits is worth more
-PULL = 3.5  # times the variance by noise alone, as a thread beside the needle pulls all rows to one side
 DAMPING = 0.05  # of places along and aside, that of all others accordingly
 PARAMETERS = 6
-CORRELATED_ROWS = 3.0  # rows whose error is one and the same, by the lens' blur
-# What no fit's residual tells of: most likely for the errors over hundreds of simulated poses, needles and image sizes.
-TAIL_ERROR_PX, ASIDE_ERROR_PX, ANGLE_ERROR = 0.27, 0.1, math.radians(0.15)
+NEXT = np.uint64(1)  # Indices without a sign save compiled code the check for negative ones, which count from the end.
 REACH_PX, LEVEL_PX = 4.5, 2.0  # to both sides of the end; from where on, two deviations of the blur, its step is over
 EDGE_STEP_PX, SIDE_PX = 0.25, 0.5  # between samples along the axis, and between lines
 MAX_SHIFT_PX = 1.0  # from where the end is drawn; beyond, and where lines differ more, something hides it
@@ -113,35 +109,28 @@ class SteelMap:
         return slice(top, top + rows), slice(left, left + columns)
 
     @staticmethod
-    def around(points: np.ndarray, brightest: Layer, darkest: Layer, factor: int, wall: Wall) -> SteelMap:
-        """Return the map around some points.
-
-        Args:
-            points: of the dark thing, shape (m, 2) [px].
-            brightest: see `Picture`.
-            darkest: see there.
-            factor: see there.
-            wall: of the dish.
-        """
-        rows, columns = brightest.pixels.shape
+    def around(points: np.ndarray, picture: Picture) -> SteelMap:
+        """Return the map around the points of a dark thing, shape (m, 2) [px]."""
+        rows, columns = picture.shape
         left, top = np.maximum(points.min(axis=0) - AROUND_PX, 0.0).astype(int)
         right, bottom = np.minimum(points.max(axis=0) + AROUND_PX, (columns, rows)).astype(int)
         box = slice(top, bottom), slice(left, right)
-        dark = _darkness(brightest, box, factor, wall)
+        dark = _darkness(picture.brightest, box)
         u, v = np.round(points - (left, top)).astype(int).T
         own = dark[v.clip(0, len(dark) - 1), u.clip(0, dark.shape[1] - 1)]
         rank = round(0.9 * (len(own) - 1))
         depth = float(np.partition(own, rank)[rank])
         surely = _share(dark, depth)
-        perhaps = surely if darkest is brightest else _share(_darkness(darkest, box, factor, wall), depth)
+        perhaps = surely
+        if picture.darkest is not picture.brightest:
+            perhaps = _share(_darkness(picture.darkest, box), depth)
         light = np.asarray(cv2.blur(-dark, (3, 3)), dtype=np.float32)
         return SteelMap(surely, perhaps, dark, depth, light, (float(left), float(top)), (columns, rows))
 
 
-def _darkness(channel: Layer, box: tuple[slice, slice], factor: int, wall: Wall) -> NDArray[np.float32]:
+def _darkness(layer: Layer, box: tuple[slice, slice]) -> NDArray[np.float32]:
     """Return 1 - I / F of some rows and columns."""
-    floor = np.maximum(wall.floor(channel, factor, box), 1).astype(np.float32)
-    return np.asarray(1.0 - channel.pixels[box] / floor)
+    return np.asarray(1.0 - layer.pixels[box] / np.maximum(layer.floor[box], 1).astype(np.float32))
 
 
 def _share(dark: NDArray[np.float32], depth: float) -> NDArray[np.float32]:
@@ -177,11 +166,15 @@ class TemplateFit:
 
     def covariance(self) -> np.ndarray:
         """Return that of tail along and aside of the axis and of its angle [px, px, rad], shape (3, 3)."""
-        inverse = np.linalg.inv(self.normal) * PULL * CORRELATED_ROWS * self.cost / self.samples
+        # The lens' blur makes the errors of three rows one and the same; a thread beside the needle pulls all rows to
+        # one side, which is 3.5 times the variance by noise alone.
+        inverse = np.linalg.inv(self.normal) * 3.5 * 3.0 * self.cost / self.samples
         covariance = _at_tail(inverse, 0.5 * self.length)
         lengthwise = np.array([1.0, 0.0, self.arc.curvature])
-        covariance += np.diag([0.0, ASIDE_ERROR_PX**2, ANGLE_ERROR**2])
-        return covariance + TAIL_ERROR_PX**2 * np.outer(lengthwise, lengthwise)
+        # What no fit's residual tells of: 0.1 px aside, 0.15 degrees and 0.27 px along are most likely for the errors
+        # over hundreds of simulated poses, needles and sizes of images.
+        covariance += np.diag([0.0, 0.1**2, math.radians(0.15) ** 2])
+        return covariance + 0.27**2 * np.outer(lengthwise, lengthwise)
 
 
 def fit_template(
@@ -218,7 +211,8 @@ def fit_template(
     half = 0.5 * width
     state = np.array([guess.start[0], guess.start[1], guess.angle, guess.curvature, half + BLOOM_PX, start or length])
     normal = np.zeros((PARAMETERS, PARAMETERS))
-    deviations = 0.5 * (WIDTH_SLACK_PX + WIDTH_SLACK * width), 0.5 * tolerance * length
+    # Standard deviations: of the body's width 0.2 px and 3 % of it, half of that for half the width.
+    deviations = 0.5 * (0.2 + 0.03 * width), 0.5 * tolerance * length
     thin = 1.0 if rod else THIN
     cost, count = _fit(steel.surely, steel.perhaps, state, length, half, deviations, thin, rounds, hopeless, normal)
     arc, fitted = Arc(state[:2].copy(), float(state[2]), float(state[3])), float(state[5])
@@ -358,6 +352,50 @@ def _solve(normal, right, result):
 
 
 @compiled
+def straighten_both(one, other, start, first, aside, strip, other_strip):
+    """Fill two strips with two images along an arc at steps of a pixel; see `Arc.strip`.
+
+    The arc's direction is turned on from row to row, and both images are sampled at once: half the time.
+
+    Args:
+        one: shape (rows, columns).
+        other: of the same shape.
+        start: u, v, angle and curvature of the arc [px, px, rad, 1/px].
+        first: length along the arc of the first row [px].
+        aside: distances aside of it, shape (m,) [px].
+        strip: filled, shape (n, m).
+        other_strip: filled, of the same shape.
+    """
+    u, v, angle, curvature = start
+    rows, columns = one.shape
+    last_u, last_v = columns - 1.001, rows - 1.001
+    half = 0.5 * curvature * first
+    chord = first if abs(half) < 1e-9 else first * math.sin(half) / half
+    x, y = u + chord * math.cos(angle + half), v + chord * math.sin(angle + half)
+    ahead, down = math.cos(angle + 2.0 * half), math.sin(angle + 2.0 * half)
+    half = 0.5 * curvature
+    cosine, sine = math.cos(half), math.sin(half)
+    chord = 1.0 if abs(half) < 1e-9 else sine / half
+    for index in range(len(strip)):
+        for place in range(len(aside)):
+            at_u = min(max(x - aside[place] * down, 0.0), last_u)
+            at_v = min(max(y + aside[place] * ahead, 0.0), last_v)
+            column, row = np.uint64(int(at_u)), np.uint64(int(at_v))
+            right, below = at_u - column, at_v - row
+            left, above = 1.0 - right, 1.0 - below
+            upper = left * one[row, column] + right * one[row, column + NEXT]
+            lower = left * one[row + NEXT, column] + right * one[row + NEXT, column + NEXT]
+            strip[index, place] = above * upper + below * lower
+            upper = left * other[row, column] + right * other[row, column + NEXT]
+            lower = left * other[row + NEXT, column] + right * other[row + NEXT, column + NEXT]
+            other_strip[index, place] = above * upper + below * lower
+        # A chord of an arc is turned by half of the arc's turn, what follows it by the other half.
+        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
+        x, y = x + chord * ahead, y + chord * down
+        ahead, down = ahead * cosine - down * sine, down * cosine + ahead * sine
+
+
+@compiled
 def _fit(surely, perhaps, state, length, half, deviations, thin, rounds, hopeless, normal):
     """Fit; `state` (u, v, angle, curvature, half width, length) is changed, `normal` filled.
 
@@ -479,7 +517,7 @@ def tail_shift(steel: SteelMap, fit: TemplateFit) -> float | None:
         return None
     along = np.arange(-REACH_PX - MAX_SHIFT_PX, REACH_PX + MAX_SHIFT_PX + 0.5 * EDGE_STEP_PX, EDGE_STEP_PX)
     count = max(1, int(0.5 * fit.width / SIDE_PX))
-    dark = straightened(steel.dark, fit.arc.axis, along, SIDE_PX * np.arange(-count, count + 1))
+    dark = fit.arc.strip(steel.dark, along, SIDE_PX * np.arange(-count, count + 1))
     shift = float(_shift_of(along, dark, steel.depth))
     return None if math.isnan(shift) else shift
 

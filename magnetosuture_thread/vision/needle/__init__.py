@@ -1,1 +1,0 @@
-"""The needle in a camera frame."""

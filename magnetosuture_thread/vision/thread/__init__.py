@@ -1,1 +1,0 @@
-"""The thread in a camera frame."""
