@@ -36,7 +36,8 @@ def _decorator(**options: Any) -> _Decorator:
     Options are said of every function, as numba takes them over from whatever calls one first where they are not.
     Nobody takes the address of a function, and an entry for that takes as long to compile as the function itself.
     """
-    return cast(_Decorator, numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options))
+    decorator = cast(Any, numba.njit)  # the stubs do not know all options
+    return cast(_Decorator, decorator(error_model="numpy", no_cfunc_wrapper=True, **options))
 
 
 compiled = _decorator(cache=True, _nrt=True)

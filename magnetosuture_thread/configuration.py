@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -178,9 +178,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-@cache  # to read type hints takes longer than to check a value
-def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
-    """Return the fields of a configuration class."""
+def _read_fields(cls: type[Configuration]) -> tuple[ConfigurationField, ...]:
     hints, found = get_type_hints(cls), []
     for entry in fields(cast(Any, cls)):
         hint = hints[entry.name]
@@ -189,6 +187,11 @@ def configuration_fields(cls: type[Configuration]) -> tuple[ConfigurationField, 
         about = entry.metadata["quantity"]
         found.append(ConfigurationField(cls.GROUP, entry.name, kind, entry.default, about, entries))
     return tuple(found)
+
+
+# To read type hints takes longer than to check a value.
+configuration_fields = cast("Callable[[type[Configuration]], tuple[ConfigurationField, ...]]", cache(_read_fields))
+"""Return the fields of a configuration class."""
 
 
 def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C:

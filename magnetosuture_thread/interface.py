@@ -10,7 +10,7 @@ of the actuators.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum, StrEnum
+from enum import Enum
 
 NODES = ("vision_tracker", "thread_model", "coil_bridge")
 SCENE_SERVER = "scene_server"  # besides, where the scene changes while the others run
@@ -176,12 +176,14 @@ GROUND_TRUTH_PULL = Channel(
 EXECUTE_PROCEDURE = "execute_procedure"  # the needle planner's action, ExecuteProcedure of magnetosuture_msgs
 
 
-class Service(StrEnum):
+class Service(str, Enum):
     """Services: the name of each, its type, the node that offers it, and what it does."""
 
     type_name: str
     node: str
     about: str
+
+    __str__ = str.__str__
 
     def __new__(cls, name: str, type_name: str, node: str, about: str) -> Service:
         """Return a service, which is its name as a text."""

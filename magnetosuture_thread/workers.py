@@ -154,7 +154,11 @@ class WorkerPool(TaskRunner):
             yield from super().run(tasks, log, progress)
             return
         for index, task in enumerate(tasks):
-            result = self._work(task, log, lambda share, done=index: progress((done + share) / len(tasks)))
+
+            def advance(done: float, before: int = index) -> None:
+                progress((before + done) / len(tasks))
+
+            result = self._work(task, log, advance)
             progress((index + 1) / len(tasks))
             yield index, result
 

@@ -11,6 +11,7 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
 from magnetosuture_thread.resources import find_setup_file, share_directory
+from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
 
@@ -37,7 +38,9 @@ def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     rig.check_scene(setup.scene)
     for name in ("coil_angles", "coil_distance", "coil_radius"):
         assert getattr(rig, name) == getattr(coils, name)
-    body = rig.dynamics(setup.scene).needle
+    body = NeedleBody(
+        rig.needle_length, rig.needle_width, rig.needle_curvature, rig.needle_magnetisation, rig.viscosity
+    )
     assert coils.needle_moment == pytest.approx(body.pole * rig.needle_length, rel=0.01)
     assert coils.needle_turning_drag == pytest.approx(body.drag[2], rel=0.02)
     thread_drag = rig.thread_drag_along * rig.thread_length

@@ -117,7 +117,7 @@ def _join(path: str) -> None:
 
 
 def carry(
-    ends: tuple[int, int], inlet: int, set_carrier: Callable[[bool], None], answer: Callable[[str], None]
+    ends: tuple[int, int], inlet: int, set_carrier: Callable[[bool], object], answer: Callable[[str], None]
 ) -> None:
     """Take frames from each of two devices to the other until the commands end.
 

@@ -89,8 +89,8 @@ def _texture(random: np.random.Generator, x: Plane, y: Plane) -> Plane:
     side = 256
     rough = cv2.GaussianBlur(random.standard_normal((side, side)).astype(np.float32), (0, 0), 1.2)
     size = random.uniform(0.15, 0.5)
-    at = (np.mod(values / size * 8.0 + 1000.0, side - 2).astype(np.float32) for values in (x, y))
-    return np.asarray(cv2.remap(rough / float(rough.std()), *at, cv2.INTER_LINEAR), dtype=np.float32)
+    u, v = (np.mod(values / size * 8.0 + 1000.0, side - 2).astype(np.float32) for values in (x, y))
+    return np.asarray(cv2.remap(rough / float(rough.std()), u, v, cv2.INTER_LINEAR), dtype=np.float32)
 
 
 def _ring(away: Plane, radius: float) -> Plane:
@@ -103,7 +103,12 @@ def _step(away: Plane, radius: float, soft: float) -> Plane:
 
 
 def _draw_dish(
-    random: np.random.Generator, picture: Plane, camera: _Camera, at: NDArray[np.float64], floor: str, height: float
+    random: np.random.Generator,
+    picture: NDArray[np.float32],
+    camera: _Camera,
+    at: NDArray[np.float64],
+    floor: str,
+    height: float,
 ) -> None:
     """Draw a dish with its shadow, its floor, its wall, sometimes a lid, and the lamp's reflections."""
     x, y = (values - place for values, place in zip(camera.plane(0.0), at, strict=True))

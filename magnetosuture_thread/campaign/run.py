@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -378,5 +378,4 @@ class _Pilot:
 
     def _submit(self, task: Callable[[], BodyPath]) -> executor.PendingPath:
         due, path = self._now + 0.2, executor.plan_now(task)
-        pending: Any = SimpleNamespace(done=lambda: self._now >= due - 1e-9, result=path.result)
-        return pending
+        return cast(executor.PendingPath, SimpleNamespace(done=lambda: self._now >= due - 1e-9, result=path.result))

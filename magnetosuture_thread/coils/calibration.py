@@ -94,7 +94,7 @@ def read_calibration(path: Path) -> CoilCalibration:
         if coils[-1].name in [coil.name for coil in coils[:-1]]:
             expected = "a name of its own for each"
             raise ConfigurationError("coils", f"two of the name {coils[-1].name}", expected, source)
-    return CoilCalibration(*(content.get(key, "") for key in TEXT_KEYS), tuple(coils))
+    return CoilCalibration(coils=tuple(coils), **{key: content.get(key, "") for key in TEXT_KEYS})
 
 
 Array = NDArray[np.float64]

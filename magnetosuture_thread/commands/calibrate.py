@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from magnetosuture_thread import MATERIALS, ConfigurationError, InvalidInputError
 from magnetosuture_thread.calibration.parameters import choose_parameters
@@ -89,11 +89,16 @@ def run_calibrate(options: argparse.Namespace, terminal: command.Terminal) -> in
     return command.DONE if result.finished else 130  # as shells have it
 
 
+class FitSelection(BagSelection, total=False):
+    """What of the bags is read, and `picture`: of the fit and its residuals (.png); beside the output if None."""
+
+    picture: Path | None
+
+
 def calibrate_bags(
     bags: Sequence[Path],
     output: Path,
     *,
-    picture: Path | None = None,
     material: str = "",
     formulation: str = "",
     against: str = "seen",
@@ -102,7 +107,7 @@ def calibrate_bags(
     scheduler: str = "",
     log: Log = lambda line: None,
     progress: Progress = lambda share: None,
-    **selection: Unpack[BagSelection],
+    **selection: Unpack[FitSelection],
 ) -> CalibrationResult:
     """Fit a thread's parameters to bags, and write them as a file that `thread_model` loads, with a picture beside it.
 
@@ -112,7 +117,6 @@ def calibrate_bags(
     Args:
         bags: recorded runs of one thread.
         output: the YAML file to write.
-        picture: of the fit and its residuals, to draw (.png); beside the output if None.
         material: a name of `MATERIALS`, or the beginning of one; the setup's if empty.
         formulation: rod or paper; the setup's if empty.
         against: what predictions are compared with, `seen` (measured) or `truth`.
@@ -121,7 +125,7 @@ def calibrate_bags(
         scheduler: address of a Dask scheduler, whose workers replay the bags in place of those.
         log: called with a line for a person at the end of each stage.
         progress: called with the share done, 0 to 1.
-        selection: what of the bags is read.
+        selection: what of the bags is read, and `picture`.
 
     Raises:
         BagError: a bag cannot be used, or a file cannot be written.
@@ -130,6 +134,7 @@ def calibrate_bags(
     """
     from magnetosuture_thread.calibration.plot import draw_calibration  # late, as it imports matplotlib
 
+    picture = selection.pop("picture", None)
     reading = 0.15  # share of the time for reading the bags, and tracking their frames
     passages: list[RecordedRun] = []
     first: tuple[str, Setup, ThreadModelSettings] | None = None  # bag, its own setup, and where the fit starts
@@ -138,7 +143,7 @@ def calibrate_bags(
         def advance(share: float, index: int = index) -> None:
             progress(reading * (index + share) / len(bags))
 
-        with open_bag(path, log, **selection) as given:
+        with open_bag(path, log, **cast(BagSelection, selection)) as given:
             settings = thread_settings(given.setup, material, formulation)
             choose_parameters(settings.formulation, parameters)  # refuses wrong names before the bag is read
             own = _own_setup(given)

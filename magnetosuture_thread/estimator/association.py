@@ -371,4 +371,5 @@ def measured_points(
     columns = np.concatenate(found, axis=1)
     if not columns.size:
         return None, problems
-    return MeasuredPoints(*columns, np.ones(columns.shape[1]), end), problems
+    place, innovation, variance, share = columns
+    return MeasuredPoints(place, innovation, variance, share, np.ones(columns.shape[1]), end), problems

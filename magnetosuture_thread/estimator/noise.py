@@ -133,7 +133,7 @@ def weigh(points: MeasuredPoints, variance: Vector) -> WindowSums:
     information = points.weight * points.share
     precision = information / points.variance
     of_points = (precision, precision * points.innovation, precision * prior, information)
-    own, mean, known, independent = [np.bincount(window, each, WINDOWS) for each in of_points]
+    own, mean, known, independent = (np.asarray(np.bincount(window, each, WINDOWS), np.float64) for each in of_points)
     return WindowSums(mean / own, 1.0 / own, known / own, independent)
 
 
@@ -288,8 +288,8 @@ def take_correction(
     gained = np.bincount(low, precision * (1.0 - part), segments + 1)
     gained += np.bincount(low + 1, precision * part, segments + 1)
     across = np.einsum("ia,ia->i", normals, moved)
-    applied = np.bincount(window, precision * ((1.0 - part) * across[low] + part * across[low + 1]), WINDOWS)
-    applied /= np.maximum(np.bincount(window, precision, WINDOWS), 1e-300)
+    weighted = precision * ((1.0 - part) * across[low] + part * across[low + 1])
+    applied = np.bincount(window, weighted, WINDOWS) / np.maximum(np.bincount(window, precision, WINDOWS), 1e-300)
     left = np.zeros((2, segments + 1))
     left[0] = np.einsum("ia,iab,ib->i", normals, covariance, normals)
     left[1, 1:] = 1.0 / (1.0 / density[1:] + gained[1:])

@@ -314,7 +314,7 @@ class Consistency:
         windows = max(1, math.floor((last - first) / 4.95))
         width = max((last - first) / windows, 1e-3)
         index = np.minimum(np.floor((times - first) / width).astype(np.int64), windows - 1)
-        count = np.bincount(index, counts, windows)
+        count = np.bincount(index, counts, windows).astype(np.float64)
         count[count == 0.0] = np.nan
         means, (low, high) = np.bincount(index, squared * counts, windows) / count, mean_band(count)
         within = int(((low <= means) & (means <= high)).sum())

@@ -189,8 +189,8 @@ def draw_threads(
     """
     axes.imshow(frame[:, :, ::-1] if frame.ndim == 3 else frame, cmap="gray", vmin=0, vmax=255, aspect="equal")
     axes.set_axis_off()
-    to_pixels = Affine2D().scale(1e-3 / view.metres_per_pixel).rotate(view.rotation).scale(1.0, -1.0)
-    to_pixels = to_pixels.translate(*view.centre_px) + axes.transData
+    to_frame = Affine2D().scale(1e-3 / view.metres_per_pixel).rotate(view.rotation).scale(1.0, -1.0)
+    to_pixels = to_frame.translate(*view.centre_px) + axes.transData
     for obstacle in obstacles:
         if isinstance(obstacle, (Disc, Polygon)):
             axes.add_patch(shape_patch(obstacle, fill=False, edgecolor=INK, linewidth=0.9, transform=to_pixels))

@@ -179,7 +179,7 @@ def margins_of(message: Any) -> Margins:
     """
     row, names = np.asarray(message.barrier, dtype=np.intp), list(message.barrier_names)
     bound = getattr(message, "clearance_bound", ())  # older bags have none
-    columns = [
+    columns: list[Any] = [
         np.asarray(message.node, np.uint32),
         np.asarray(message.obstacle, np.int32),
         np.asarray(message.value, np.float64),

@@ -299,7 +299,7 @@ class CoilClient(_Client):
         super().__init__("coil_client", namespace)
 
     def _open(self, node: Node) -> None:
-        switches = {Service.ARM: SetBool, Service.EMERGENCY_STOP: Trigger, Service.RESET: Trigger}
+        switches: dict[str, Any] = {Service.ARM: SetBool, Service.EMERGENCY_STOP: Trigger, Service.RESET: Trigger}
         self._services = Services(node, {**switches, "coil_bridge/change_state": ChangeState})
         self._state = Latest(node, topics.BRIDGE_STATE)
         self._reports = Inbox(node, topics.DIAGNOSTICS, 10)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -97,13 +98,17 @@ def is_disarmed(page: Page) -> bool:
     return not page.graph["bridge"]["armed"]
 
 
+def _is_later(page: Page, time: float) -> bool:
+    return bool(page.graph["time"] > time)
+
+
 async def at_rest(page: Page) -> None:
     """Wait until the thread no longer draws the needle: by 50 um in half a second of the rig's time."""
-    moved = np.inf
+    moved = math.inf
     while moved > 5e-5:
         before, until = tail(page), page.graph["time"] + 0.5
-        await wait(page, lambda until=until: page.graph["time"] > until, "half a second")
-        moved = np.linalg.norm(tail(page) - before)
+        await wait(page, partial(_is_later, page, until), "half a second")
+        moved = math.dist(tail(page), before)
 
 
 async def jog(page: Page) -> None:

@@ -27,10 +27,11 @@ SCENE = "dish_35mm"
 BETWEEN = [f"/{topic.name}" for topic in (topics.NEEDLE_POSE, topics.THREAD_OBSERVATION, topics.MEASURED_THREAD)]
 
 
-def found(end: Any) -> bool:
-    """Return whether a publisher or subscription has found its other end."""
-    count = end.get_subscription_count if isinstance(end, Publisher) else end.get_publisher_count
-    return bool(count())
+def all_found(ends: list[Any]) -> bool:
+    """Return whether all publishers and subscriptions have found their other ends."""
+    return all(
+        end.get_subscription_count() if isinstance(end, Publisher) else end.get_publisher_count() for end in ends
+    )
 
 
 def together(graph: Graph, **parameters: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
@@ -83,7 +84,7 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
                     tracker, model = graph.add(VisionTrackerNode, scene=SCENE), graph.add(ThreadModelNode, scene=SCENE)
                     ends = [each for node in (tracker, model) for each in (*node.publishers, *node.subscriptions)]
                     between = [each for each in ends if each.topic_name in BETWEEN]
-                    graph.wait(lambda e=between: all(map(found, e)), "them to have found each other")
+                    graph.wait(partial(all_found, between), "them to have found each other")
                 else:
                     together(graph)
                 predicted, margins = answers(graph, frames)

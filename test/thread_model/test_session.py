@@ -327,7 +327,8 @@ def gated(first: int, last: int, session: ThreadSession, speed: float, x: float)
     for k in range(first, last):
         outcome = go(session, 1.0 + k / 30.0, x + speed * (k - first) / 30.0)
         assert outcome.margins is not None
-    return x + speed * (last - 1 - first) / 30.0, outcome.margins.friction
+        friction = outcome.margins.friction
+    return x + speed * (last - 1 - first) / 30.0, friction
 
 
 def test_friction_slows_a_needle_that_pulls_and_no_other_and_a_change_of_settings_keeps_the_motion():

@@ -365,7 +365,7 @@ class Board:
         if (duties := self._query(self._device.ReadPWMs)) != (0, 0):
             raise DeviceError(f"{self._name}: duties {duties[0]} and {duties[1]} instead of 0 and 0")
         for stored in self._stored:
-            self._exchange(stored.write, lambda values=stored.values: values, self._acknowledged)
+            self._exchange(stored.write, partial(tuple, stored.values), self._acknowledged)
         currents = [self._check_currents] * MAX_OVERCURRENTS
         checks: list[Callable[[], None]] = [partial(self._check_stored, stored) for stored in self._stored]
         for check in (*checks, self._check_status, *currents, self._check_voltage):
