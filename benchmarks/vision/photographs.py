@@ -104,7 +104,7 @@ def _step(away: Plane, radius: float, soft: float) -> Plane:
 
 def _draw_dish(
     random: np.random.Generator,
-    picture: NDArray[np.float32],
+    picture: NDArray[Any],
     camera: _Camera,
     at: NDArray[np.float64],
     floor: str,
