@@ -338,7 +338,7 @@ def half_segment_distances(points: Points, data: WorkspaceData, contacts: Contac
         data: `Workspace.data`.
         contacts: of these nodes with it.
     """
-    distance = np.array(contacts.distance)
+    distance: NDArray[np.float64] = contacts.distance.copy()
     for row in range(len(distance)):
         distance[row] = half_segment_distance(points, contacts.node[row], contacts.obstacle[row], distance[row], data)
     return distance
