@@ -23,7 +23,6 @@ from magnetosuture_thread.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, Budge
 
 C = TypeVar("C", bound="Configuration")
 
-MAX_MILLI = 1e6  # of a number; a greater one is no length in millimetres, and may be too great for a float
 
 # Parameters that rclpy declares for every node.
 ROS_PARAMETERS = frozenset({"qos_overrides", "start_type_description_service", "use_sim_time"})
@@ -69,7 +68,8 @@ class Quantity:
     def hint(self, value: Any) -> str:
         """Return a question for a length or a speed of which a thousandth would be accepted; empty for another."""
         wrong = [part for part in (value if isinstance(value, (list, tuple)) else [value]) if not self.within(part)]
-        scaled = all(_is_number(part) and abs(part) <= MAX_MILLI and self.within(1e-3 * part) for part in wrong)
+        # A number above 1e6 is no length in millimetres, and may be too great for a float.
+        scaled = all(_is_number(part) and abs(part) <= 1e6 and self.within(1e-3 * part) for part in wrong)
         asks = self.unit.split("/")[0] == "m" and wrong and scaled
         return f"; given in {'metres' if self.unit == 'm' else self.unit}?" if asks else ""
 

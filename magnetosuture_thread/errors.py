@@ -10,12 +10,10 @@ from magnetosuture_thread.texts import shortened
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
 
 
-OF_CLUSTER = ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath")  # modules of the extra
-
-
 def missing_module(error: ModuleNotFoundError) -> str:
     """Return what to do about a module that is not there: those of ROS, and of a cluster, come with an extra."""
-    if str(error.name).split(".")[0] in OF_CLUSTER:
+    # Modules of the extra `cluster`.
+    if str(error.name).split(".")[0] in ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath"):
         return f"{error}; clusters and bags by URL need the extra: pip install '.[cluster]'"
     return f"{error}; nodes and the live graph need ROS 2 Jazzy: docs/how_to/installation.md, or pip install '.[ros]'"
 

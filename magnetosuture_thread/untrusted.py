@@ -28,8 +28,6 @@ MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second; a usual
 MAX_BAG_PARSER_STEPS = 100_000  # of all definitions of a bag
 MAX_RECORD_BYTES = 1 << 22  # of a definition of a topic or type, or of another record that is parsed as a whole
 MAX_KEPT_BYTES = 1 << 25  # of all different definitions and metadata records of a small bag, as they are in memory
-_RECORD_BYTES = 500  # that one of them takes in memory whatever its length
-_ENTRY_BYTES = 150  # that each of its entries takes besides
 LONE_RECORD = 10  # records in a chunk, which are read in the time of one outside of chunks
 
 
@@ -71,7 +69,8 @@ class UnpackBudget:
         Raises:
             BudgetError: the files have more of them than they may.
         """
-        self._kept -= count + _RECORD_BYTES + _ENTRY_BYTES * entries
+        # In memory a record takes 500 bytes whatever its length, and 150 for each of its entries.
+        self._kept -= count + 500 + 150 * entries
         if self._kept < 0:
             raise BudgetError(f"holds definitions and metadata that take more than {self._max_kept} bytes of memory")
 

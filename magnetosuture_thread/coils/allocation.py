@@ -46,7 +46,6 @@ DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
 DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
 TORQUE_TIME = 1.0  # s; in which the thread's torque on the needle changes, as a thread is led around a turn
 GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
-MAX_CORRECTIONS = 4  # of the drift that the coils add to a velocity towards the wall
 MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 
 
@@ -502,7 +501,8 @@ class CertifiedAllocation:
 
         target, best, min_error, limiting = velocity, self._coils.zero(), math.inf, ""
         resting: Allocation | None = None  # against the disturbance alone
-        for _ in range(1 + MAX_CORRECTIONS):
+        # The drift that the coils add to a velocity towards the wall is corrected four times at the most.
+        for _ in range(1 + 4):
             found, bound = allocated(target)
             share, name = certified(found, disturbed)
             name = name or bound

@@ -555,6 +555,7 @@ class RecordedPredictions:
         channels = [interface.PREDICTED_THREAD] if there else []
         self._records = recording.records(channels, start=start, duration=duration)
         self._held: dict[int, RecordedMessage] = {}
+        self._latest = -1
 
     def of(self, stamp: int) -> Points | None:
         """Return the recorded prediction of a frame, shape (n + 1, 2) [m]; None if there is none.
@@ -562,11 +563,13 @@ class RecordedPredictions:
         Args:
             stamp: of the frame [ns], not before those asked for until now.
         """
-        while len(self._held) < 600 and max(self._held, default=-1) < stamp:
+        while self._latest < stamp and len(self._held) < 600:
             record = next(self._records, None)
             if record is None:
                 break
-            self._held[stamp_of(record)] = record
+            self._latest = max(self._latest, at := stamp_of(record))
+            if at >= stamp:  # those before were of frames that nobody asked for
+                self._held[at] = record
         found = self._held.get(stamp)
         self._held = {at: record for at, record in self._held.items() if at > stamp}
         if found is None:

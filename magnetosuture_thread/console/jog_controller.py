@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 Velocity = tuple[float, float]
 ZERO_VELOCITY: Velocity = (0.0, 0.0)
-CLIENT_TIMEOUT = 3.0  # [s] without a message, after which a page is gone; it acknowledges every state
 
 
 class ControlLease:
@@ -162,7 +161,8 @@ class JogController:
     """
 
     def __init__(self, publish: Callable[[Velocity], None], rate: float, timeout: float) -> None:
-        self.lease, self.switch = ControlLease(CLIENT_TIMEOUT), DeadManSwitch(timeout)
+        # A page acknowledges every state: after 3 s without a message it is gone.
+        self.lease, self.switch = ControlLease(3.0), DeadManSwitch(timeout)
         self._publish, self._period = publish, 1.0 / rate
         self._timer: asyncio.TimerHandle | None = None
         self._armed = False

@@ -41,7 +41,6 @@ Vector = NDArray[np.float64]
 
 AXES = (0, 1)
 MAX_SOLVES = 8  # of a correction
-MAX_REWEIGHTED = 3  # of them with new robust weights
 RESIDUAL_TOLERANCE = 1e-4  # of a correction's program; the constraints themselves are checked at its end point
 FREEDOM = 4.0  # degrees of freedom of Student's distribution of a point's error
 NEIGHBOURS = 2  # on each side of a point, that it is compared with
@@ -314,7 +313,8 @@ def correct(
         moved[:], about[:] = u, start + u
         buffers.multipliers[:segments] = multipliers[:segments]
         change = 0.0
-        if solves < MAX_REWEIGHTED:
+        # Three solutions get new robust weights.
+        if solves < 3:
             for p in range(len(residual)):
                 i = min(int(points.place[p]), segments - 1)
                 t = points.place[p] - i

@@ -38,8 +38,6 @@ from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation,
 Vector = NDArray[np.float64]
 
 ONE_SIDED_99 = 2.3263478740408408  # standard deviations
-INITIAL_ERROR = 0.2  # standard deviation of the free end of a thread whose shape nobody has seen, of the length
-LARGE_ERROR = 1.5  # segments; a piece that begins at the needle and lies farther off gives the shape itself
 LAID_DEVIATION = 5.0  # of the shape laid along a piece, in those of its points
 MIN_SHARED = 0.4  # of a point's variance, which the points of a window share and which lasts
 
@@ -255,7 +253,8 @@ class ThreadEstimator:
     def _errors_of(self, seen: float, variance: float) -> Points:
         """Return the errors of a shape that is known up to an arc length [D] with a variance [D^2]."""
         beyond = np.maximum(np.arange(self.thread.segments + 1.0) - seen, 0.0)
-        found = variance + (INITIAL_ERROR * beyond) ** 2
+        # The free end of a thread whose shape nobody has seen is off by 0.2 of its length (standard deviation).
+        found = variance + (0.2 * beyond) ** 2
         found[0] = 0.0
         return np.array([found, 2.0 * self._length * found])
 
@@ -357,7 +356,8 @@ class ThreadEstimator:
         so too. What the piece does not show goes on as it lay.
         """
         now, unit, segments = self._now, self._unit, self.thread.segments
-        if not piece.attached or (not now.unknown and piece.square < LARGE_ERROR**2):
+        # A piece that begins at the needle and lies more than 1.5 segments off gives the shape itself.
+        if not piece.attached or (not now.unknown and piece.square < 1.5**2):
             now.gross = 0
             return None
         now.gross += 1

@@ -35,9 +35,7 @@ NOISE_TIME = 1.0  # s; over which likelihoods of intensities are forgotten
 RATIO_TIME = 0.15  # s; over which the covariance of innovations is matched to them; a few frames of 16 windows
 LEARNING_PRIOR = 0.2  # s of measurements, that the scale to begin with is worth
 MIN_SCALE, MAX_SCALE = 0.25, 16.0
-MAX_SQUARE = 4.0  # normalised, of a frame's windows in the mean, that counts in the ratio
 SURE = 3.0  # standard deviations
-MIN_INTERVAL = 1e-3  # s; between measurements, in which noise can be at work
 SWITCHING = 1e-4  # share of the weights that every intensity gets anew each second: the noise may change at once
 
 
@@ -188,7 +186,8 @@ def learn(
     ratio, scale, both = noise.ratio, noise.scale, seen & np.isfinite(noise.last_mean)
     if seen.any():
         square = float((mean[seen] ** 2 / expected[seen]).mean())
-        ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square, MAX_SQUARE) - 1.0)))
+        # A frame's normalised square counts up to 4 in the ratio.
+        ratio *= float(np.exp(min(elapsed / RATIO_TIME, 1.0) * (min(square, 4.0) - 1.0)))
     if both.any():
         apart = (mean - noise.last_mean)[both] ** 2 / (camera + noise.last_variance)[both]
         # The scale is learned over 5 s.
@@ -196,7 +195,8 @@ def learn(
         scale += share * (float(np.minimum(apart, MAX_SCALE).mean()) - scale)
         scale = min(max(scale, MIN_SCALE), MAX_SCALE)
     error, variance, likelihood, intensity = learn_intensity(noise, mean, own, elapsed)
-    interval, settled = max(elapsed, MIN_INTERVAL), noise.learned_for >= NOISE_TIME
+    # Noise is at work for 1 ms at the least.
+    interval, settled = max(elapsed, 1e-3), noise.learned_for >= NOISE_TIME
     raised = raised_intensity(error, variance, likelihood, intensity, seen, interval, settled)
     nodes = errors.shape[1]
     extra = at_nodes(np.maximum(noise.intensity, raised), nodes) - at_nodes(noise.intensity, nodes)

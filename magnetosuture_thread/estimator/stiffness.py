@@ -54,7 +54,6 @@ DIFFERENCE = 1e-3 * DEVIATION  # in difference quotients
 MAX_CHANGE = 0.5 * DEVIATION  # by a frame: beyond, the derivative says little
 SLOW_TIME = 10.0  # s; T, over which the stiffness may change
 BLOCK_TIME = 2.0  # s; of the blocks of scores
-STUDENT_95 = 2.262  # of 2 T / BLOCK_TIME - 1 degrees of freedom: so many blocks count, the older ones for less
 CHAIN = 5e-4  # of the length: how wrong camera, tracker and model may be alike all the time, as in `calibrate`
 
 
@@ -264,6 +263,7 @@ class StiffnessLearner:
         ratio = max(state.dispersion[0] / max(state.dispersion[1], 1e-300), 1.0)
         square, effect = state.effect
         chain = CHAIN * self._given.length * effect / (square or 1.0)
-        half = min(STUDENT_95 * math.sqrt(ratio / state.information) + chain, NORMAL_95 * DEVIATION)
+        # Student's t at 95 % of 2 T / BLOCK_TIME - 1 = 9 degrees of freedom, as older blocks count for less.
+        half = min(2.262 * math.sqrt(ratio / state.information) + chain, NORMAL_95 * DEVIATION)
         value, low, high = map(math.exp, (state.x, max(state.x - half, self._low), min(state.x + half, self._high)))
         return (SlowParameter(STIFFNESS_OVER_DRAG, "m^4/s", value, low, high, state.excited),)

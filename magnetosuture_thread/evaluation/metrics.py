@@ -145,8 +145,12 @@ def prediction_error_percent(vertices: Points, curve: Points, length: float) -> 
 
     Source: reference set, "How a prediction is scored". Deviation: none where the curve is whole.
     """
+    if len(vertices) < 2:
+        return math.nan
     targets, known = target_points(curve, length, len(vertices) - 1)
-    return float(np.nanmean(node_errors(vertices, targets, length))) if known >= MIN_KNOWN_SHARE * length else math.nan
+    if known < MIN_KNOWN_SHARE * length:
+        return math.nan
+    return float(node_errors(vertices, targets, length)[np.isfinite(targets[:, 0])].mean())
 
 
 @dataclass(frozen=True)
@@ -543,7 +547,10 @@ class RunMetrics:
             frame.errors[target] = math.nan
             for kind, vertices in threads.items() if known >= MIN_KNOWN_SHARE * self._length else ():
                 errors, column = node_errors(vertices, points, self._length), f"{KINDS[kind]}error_{target}"
-                row[column], row[f"max_node_{column}"] = float(np.nanmean(errors)), float(np.nanmax(errors))
+                there = errors[np.isfinite(points[:, 0])]
+                if not np.isfinite(there).all():
+                    continue  # a prediction with a node that is nowhere
+                row[column], row[f"max_node_{column}"] = float(there.mean()), float(there.max())
                 self._maps[kind, target].add(time, errors)
                 self._worst[kind, target].add(WorstFrame(time, row[column], frame, kind))
                 frame.errors[target] = row[f"error_{target}"]

@@ -418,7 +418,7 @@ class ProcedureReport:
     """What the planner reports of a procedure.
 
     Attributes:
-        state: ready, running, paused, done or failed.
+        state: planned, running, paused, done or failed; unknown where there is none.
         reason: why it is paused or has failed; empty else.
         goals_met: how many goals are met.
         progress: completed share of the present goal's path, 0 to 1.
@@ -430,6 +430,11 @@ class ProcedureReport:
     goals_met: int
     progress: float = 0.0
     clearance: float = math.nan
+
+
+def _state_name(state: int) -> str:
+    name = constant_name(ProcedureState, state, "STATE_")
+    return {"ready": "planned", "idle": "unknown"}.get(name, name)
 
 
 class ProcedureClient(_Client):
@@ -475,13 +480,12 @@ class ProcedureClient(_Client):
     def _on_feedback(self, message: Any) -> None:
         status = message.feedback.status
         figures = status.goals_met, status.progress, status.clearance
-        self.status = ProcedureReport(constant_name(status, status.state, "STATE_"), status.reason, *figures)
+        self.status = ProcedureReport(_state_name(status.state), status.reason, *figures)
 
     def _on_result(self, ended: Future) -> None:
         result = ended.result().result
         if self.status is not None or result.state == ProcedureState.STATE_DONE:
-            state = constant_name(ProcedureState, result.state, "STATE_")
-            self.result = ProcedureReport(state, result.reason, result.goals_met)
+            self.result = ProcedureReport(_state_name(result.state), result.reason, result.goals_met)
         else:
             self.refusal, self._send_at = result.reason, time.monotonic() + 2.0  # s; then it is sent again
 

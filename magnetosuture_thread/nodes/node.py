@@ -567,9 +567,11 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
                 raise MagnetosutureError(result.reason)
 
     def _release_all(self) -> None:
-        self.release()
-        for entity in tuple(self._held):
-            self.give_back(entity)
+        try:
+            self.release()
+        finally:
+            for entity in tuple(self._held):
+                self.give_back(entity)
 
     def _leave(self) -> None:
         super().destroy_node()

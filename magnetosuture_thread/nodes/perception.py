@@ -15,14 +15,13 @@ from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 
 
 def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
-    """Return the two nodes, of which the model takes poses and observations from the tracker.
+    """Return the two nodes, so that the model hears the tracker; by topics only where these have other names.
 
     Args:
         options: for both nodes of rclpy.
 
     Raises:
-        MagnetosutureError: one of them cannot be made, both have one name, or the model would hear other topics than
-            the tracker's; none is left.
+        MagnetosutureError: one of them cannot be made, or both have one name; none is left.
     """
     tracker = VisionTrackerNode(**options)
     try:
@@ -30,18 +29,13 @@ def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:
     except BaseException:
         tracker.destroy_node()
         raise
-    problem = ""
     if tracker.get_name() == (name := model.get_name()):
-        problem = f"two nodes cannot both be named {name}: rename each, as by -r vision_tracker:__node:=NAME"
-    for topic in (topics.NEEDLE_POSE, topics.THREAD_OBSERVATION):
-        published, heard = (node.resolve_topic_name(topic.name) for node in (tracker, model))
-        if published != heard:
-            problem = (
-                f"thread_model would hear {heard}, and not {published}: run the two nodes as programs of their own"
-            )
-    if problem:
         tracker.destroy_node()
         model.destroy_node()
-        raise GraphError(problem)
-    tracker.follower = model.on_tracked
+        raise GraphError(f"two nodes cannot both be named {name}: rename each, as by -r vision_tracker:__node:=NAME")
+    shared = (topics.NEEDLE_POSE.name, topics.THREAD_OBSERVATION.name)
+    if all(tracker.resolve_topic_name(name) == model.resolve_topic_name(name) for name in shared):
+        tracker.follower = model.on_tracked
+    else:
+        model.listen()
     return tracker, model

@@ -20,6 +20,8 @@ from magnetosuture_thread.nodes.run import raise_priority
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"
 
+_LIBC = ctypes.CDLL(None)  # loaded here, and not between fork and exec
+
 # What could lead a graph out of this machine or to another graph.
 LEADS_ELSEWHERE = (
     "CYCLONEDDS_URI",
@@ -194,4 +196,4 @@ class NodeProcesses:
 
 def _end_with_parent() -> None:
     """Ask Linux to interrupt this process when its parent dies."""
-    ctypes.CDLL(None).prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
+    _LIBC.prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG

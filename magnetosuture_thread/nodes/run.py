@@ -17,7 +17,7 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -188,6 +188,8 @@ def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | 
         gc.freeze()
         ending.spin(executor, nodes)
         _finish(nodes)
+    except ExternalShutdownException:  # something else in this process has shut the context down
+        return 0
     except Exception as error:
         # rclpy raises several kinds, some private, for a broken file or parameter.
         cannot_start = not nodes and (isinstance(error, ValueError) or not rclpy.ok())
@@ -206,6 +208,8 @@ def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | 
 
 def _finish(nodes: tuple[Node, ...]) -> None:
     """Let nodes publish their final messages, and give the middleware the time to deliver them."""
+    if not rclpy.ok():
+        return
     for node in nodes:
         if isinstance(node, GuardedNode):
             node.finish()

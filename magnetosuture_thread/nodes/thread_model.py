@@ -80,13 +80,22 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
         self._markers = self.held(topics.THREAD_MARKERS.publisher(self))
         self._last_margins = 0  # stamp of those that were published [ns]
         if self._listens:
-            observation, measured = self.on_observation_message, self.on_measured_thread_message
-            self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
-            self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
-            self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
+            self._subscribe()
         where = f"{len(scene.shapes)} shapes in a dish" if scene is not None else "no scene yet"
         thread = f"{settings.segments} segments of {settings.material}"
         self.get_logger().info(f"ready: {thread}, {where}, {settings.formulation} by {settings.solver}")
+
+    def listen(self) -> None:
+        """Take needle poses, and what is seen of the thread, by topics from now on."""
+        self._listens = True
+        if self.settings is not None:
+            self._subscribe()
+
+    def _subscribe(self) -> None:
+        observation, measured = self.on_observation_message, self.on_measured_thread_message
+        self.held(topics.THREAD_OBSERVATION.subscribe(self, self.while_active(observation), raw=True))
+        self.held(topics.MEASURED_THREAD.subscribe(self, self.while_active(measured), raw=True))
+        self.held(topics.NEEDLE_POSE.subscribe(self, self.while_active(self.on_pose)))
 
     def activate(self) -> None:
         """Wait for a needle pose."""
@@ -397,12 +406,12 @@ class ThreadForecasts:
         """Return the forecaster of the settings and the scene in force; None without a scene."""
         settings, scene = self._session.settings, self._session.scene
         if self._made is None or self._made[0] is not settings or self._made[1] is not scene:
-            self._made, self._last, forecaster = None, None, None
+            self._made, self._last = (settings, scene, None), None  # also where this fails: once is enough
             if scene is not None:
                 forecaster = make_forecaster(settings, scene)
                 forecaster.warm_up()
                 prepare_paths()
-            self._made = settings, scene, forecaster
+                self._made = settings, scene, forecaster
         return self._made[2]
 
 

@@ -28,7 +28,6 @@ from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.workers import Log, Progress
 
-TESTS = ("petri_35mm_polyamide", "petri_150mm_silk")
 SHOWN = 4  # instants of each run
 
 
@@ -55,7 +54,7 @@ class BehaviorRun:
 
 def thread_behavior(
     output: Path,
-    scenarios: Sequence[str] = TESTS,
+    scenarios: Sequence[str] = ("petri_35mm_polyamide", "petri_150mm_silk"),
     *,
     log: Log = lambda text: None,
     progress: Progress = lambda share: None,

@@ -30,7 +30,6 @@ from magnetosuture_thread.geometry.polyline import Points
 
 ROUNDING = 1e-13
 """What a point that is at its bound may get nearer in one hold, so that rounding does not keep it from sliding [m]."""
-INSIDE = 1e-12
 """A point this near to a polygon, or inside of it, goes by the side that it has to leave by [m]."""
 WALL, NOTHING = -1, -2
 """In the place of a shape's index."""
@@ -213,7 +212,7 @@ def _polygon_time(needle: PosedNeedle, i: int, s: int, vx: float, vy: float, ome
     scene, keep = needle.data.scene, needle.data.keep
     x, y, distance = needle.points[i, 0], needle.points[i, 1], needle.distances[i, s]
     best, polygon = limit, s - len(scene.discs)
-    if distance <= INSIDE:
+    if distance <= 1e-12:
         gx, gy = needle.normal[i, s, 0], needle.normal[i, s, 1]
         depth = max(-distance, 0.0)
         a, b = gx * vx + gy * vy, -gx * vy + gy * vx

@@ -120,8 +120,6 @@ def substitute(axes: Axes, band: Table, x: Vector) -> None:
 
 
 MAX_WEIGHT = 1e7  # w_max over the scale of P: the least compliance that is exact at once
-MAX_LINE_SEARCHES = 50
-MAX_STALLS = 3  # Newton steps without a gain: rounding allows for no more
 ROUNDING_RESIDUAL = 1e-6  # scaled imbalance that is a solution where rounding allows for no less
 STATUS = (
     "solved",
@@ -304,7 +302,7 @@ def search(
     """
     lower, upper, compliance, limit = program.lower, program.upper, program.compliance, program.limit
     low, high, part = 0.0, 1.0, 1.0
-    for _ in range(MAX_LINE_SEARCHES):
+    for _ in range(50):
         value, slope = start + part * (end - start), end - start
         for r in range(len(lower)):
             change = after[r] - before[r]
@@ -473,7 +471,8 @@ def solve(program: ChainProgram, u: Points, multipliers: Vector, buffers: Solver
         least = min(least, worst)
         if worst <= tolerance * size and gap <= tolerance:
             return SOLVED, iteration
-        if stalled > MAX_STALLS:
+        # After three Newton steps without a gain rounding allows for no more.
+        if stalled > 3:
             return SOLVED if max(worst / size, gap) <= ROUNDING_RESIDUAL else STALLED, iteration
         if worst <= tolerance * size:
             _copy(multipliers, 1.0, rows, centre)

@@ -13,8 +13,6 @@ from magnetosuture_thread.thread.margins import FrictionState
 from magnetosuture_thread.thread.mechanics import RodProperties
 from magnetosuture_thread.thread.program import BEFORE, SPAN, START, VELOCITIES, RodBuffers, Table, Vector
 
-SLIDING_TOLERANCE = 1e-6  # of a friction's limit
-
 
 @dataclass(frozen=True, eq=False)
 class ThreadForces:
@@ -58,7 +56,8 @@ class ThreadForces:
     @property
     def friction_states(self) -> tuple[FrictionState, ...]:
         """Of each node: free of friction, stuck, or sliding."""
-        slides, sticks = self.friction_use >= 1.0 - SLIDING_TOLERANCE, self.friction_use > 0.0
+        # A node slides where its friction is within 1e-6 of its limit.
+        slides, sticks = self.friction_use >= 1.0 - 1e-6, self.friction_use > 0.0
         return tuple(
             FrictionState.SLIDING if slide else FrictionState.STUCK if stick else FrictionState.FREE
             for slide, stick in zip(slides.tolist(), sticks.tolist(), strict=True)

@@ -33,7 +33,6 @@ DISH_MARGIN = 0.02  # m; a long needle that reaches over the wall, and what a ca
 LENGTH_TOLERANCE = 0.1  # of the thread's length; as a thread is cut by hand, and a line drawn along it
 START_DEPTH = 1e-4  # m; of a measured line within a shape, by errors of camera and scene
 MAX_STEP_LENGTH = 0.5  # segments; of a prescribed node in a sub-step
-MAX_CROWDED_HALVINGS = 2  # of a sub-step in which a thread that touches itself does not converge
 MOTION_TIME = 4e-3  # s; shorter, what the pose's noise bends counts for more, and longer, the thread has gone on
 MAX_HALVINGS = 5  # of a sub-step in which the thread would pass through itself
 
@@ -352,7 +351,8 @@ class ThreadPredictor:
         Raises:
             SolverError: it would be so in the shortest of them, or see `step`.
         """
-        done, crowded = None, self.formulation.touches_itself and halvings < MAX_CROWDED_HALVINGS
+        # A sub-step in which a thread that touches itself does not converge is halved twice at the most.
+        done, crowded = None, self.formulation.touches_itself and halvings < 2
         try:
             done = self.formulation.step(state, drive(part), duration)
         except SolverError:

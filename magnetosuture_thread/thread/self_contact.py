@@ -15,7 +15,6 @@ from magnetosuture_thread.thread.material import Thread
 
 REACH = 0.5  # segments; what is farther from touching than this has no row
 TIGHTEST_TURN = 0.5 * math.pi  # diameters of arc between places of a thread that can touch: half a turn on itself
-ROWS_PER_NODE = 32  # for which there is room
 
 
 @compiled
@@ -161,7 +160,8 @@ class SelfContact(RowBarrier):
         if not thread.diameter > 0.0:
             raise ConfigurationError("thread.diameter", thread.diameter, "above 0 m where the thread touches itself")
         self._diameter, self._segment = thread.diameter, thread.segment_length
-        count = ROWS_PER_NODE * (thread.segments + 1)
+        # There is room for 32 rows a node.
+        count = 32 * (thread.segments + 1)
         self._buffers = np.zeros((count, 3), dtype=np.int64), np.zeros((count, 3, 2)), np.zeros(count)
 
     def rows(self, positions: Points) -> BarrierRows:

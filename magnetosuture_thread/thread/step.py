@@ -32,7 +32,6 @@ from magnetosuture_thread.thread.program import (
     residuals_of,
 )
 
-ROW_REACH = 1.0  # segments; what is solid and farther from a node than this has no row in the program
 DISTANCE_TOLERANCE = 1e-7  # m; an added row that is met but for this much of its nodes' way holds
 UNMET_COMPLIANCE = 1e-7  # compliance of a hard row that has to be met from outside; something else may hold against it
 
@@ -291,7 +290,8 @@ class Formulation(ABC):
     ) -> None:
         nodes, self.dimension = thread.segments + 1, workspace.dimension
         self._thread, self._margin_workspace, self._solver, self._tolerance = thread, workspace, solver, tolerance
-        self._radius, reach = 0.5 * thread.diameter, ROW_REACH * thread.segment_length
+        # What is solid and farther from a node than a segment has no row in the program.
+        self._radius, reach = 0.5 * thread.diameter, thread.segment_length
         friction = (workspace.friction, workspace.wall_friction) if self.has_friction else ((), 0.0)
         self.workspace = Workspace(workspace.shapes, reach, self.dimension, workspace.wall_radius, *friction)
         self.added = AddedBarriers(barriers, thread.segment_length)

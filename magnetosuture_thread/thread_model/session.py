@@ -34,7 +34,6 @@ ACCELERATION = 1.5e-3  # m/s per root of a second; random walk of the velocity, 
 TURNING = 0.2  # rad/s per root of a second; the same of the rate of turning
 MAX_SPEED, MAX_TURNING = 0.01, 3.0  # m/s, rad/s; standard deviations of a velocity of which nothing is known
 MANEUVER = 16.0  # normalized square of three innovations, of which a motion without a change of mind exceeds 0.1 %
-MAX_POSE_INTERVAL = 0.2  # s; between poses farther apart nothing is known of the motion
 UNKNOWN_MOTION = np.diag((MAX_SPEED**2, MAX_SPEED**2, MAX_TURNING**2))
 NOISE_RATES = np.array((ACCELERATION, ACCELERATION, TURNING)) ** 2
 
@@ -169,7 +168,8 @@ class NeedleMotionFilter:
         measured = np.array([*pose.tail, math.atan2(pose.heading[1], pose.heading[0])])
         variances = np.diag((place**2, place**2, angle**2))
         state, before = self._state, self._covariance
-        if not known or interval > MAX_POSE_INTERVAL:
+        # Between poses more than 0.2 s apart nothing is known of the motion.
+        if not known or interval > 0.2:
             state[:3], state[3:] = measured, 0.0
             before[:] = 0.0
             before[:3, :3], before[3:, 3:] = variances, UNKNOWN_MOTION

@@ -137,3 +137,9 @@ def test_the_map_stays_small_and_keeps_the_greatest_errors(frames: int):
     assert found.shape[1] == len(times) <= 8
     assert found.max(axis=1).tolist() == values.max(axis=0).tolist()
     assert lengths[-1] == 0.019
+
+
+@pytest.mark.parametrize("nodes", [np.array([[0.0, 0.0], [0.01, np.nan], [0.02, 0.0]]), np.zeros((1, 2))])
+def test_a_prediction_with_a_node_that_is_nowhere_has_no_error(nodes: np.ndarray):
+    curve = np.column_stack([np.linspace(0.0, 0.02, 50), np.zeros(50)])
+    assert np.isnan(prediction_error_percent(nodes, curve, 0.02))

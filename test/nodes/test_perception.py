@@ -96,3 +96,13 @@ def test_together_they_say_the_same_as_apart_to_the_last_bit(frames):
     apart, joined = said
     assert len(apart[0]) == FRAMES - 2
     assert apart == joined
+
+
+def test_a_model_that_is_remapped_hears_the_topic_of_its_new_name():
+    with reserved_domain() as domain, own_context(domain) as context:
+        graph, other = Graph(context, domain), "thread_model:needle/measured_cp:=other/measured_cp"
+        made = perception(context=context, cli_args=["--ros-args", "-r", other, "-p", f"scene:={SCENE}"])
+        graph.nodes.extend(made)
+        heard = {entry.topic_name for entry in made[1].subscriptions}
+        graph.close()
+    assert {"/other/measured_cp", "/thread/observation"} <= heard

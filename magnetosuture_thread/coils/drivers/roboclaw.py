@@ -38,7 +38,6 @@ DUTY_TOLERANCE = 164  # by which a board may round a non-zero duty: 0.5 % of the
 MAX_MISMATCHES, MAX_OVERCURRENTS = 2, 3  # consecutive answers that are a fault; the first may be a lost packet
 # Consecutive measurements of a missing current: a fifth of a second and more at 200 Hz, so that neither a change of
 # the current nor the coil's L / R looks like a broken wire.
-MAX_SHORTFALLS = 12
 
 # Errors in the boards' manual that the manufacturer's library lacks.
 DRIVER_FAULTS = {0x0040: "Motor 1 Driver Fault", 0x0080: "Motor 2 Driver Fault"}
@@ -457,7 +456,7 @@ class Board:
         expected = np.array(self._written) / FULL_DUTY * self.voltage / self._resistances
         for channel, (measured, commanded) in enumerate(zip(self.currents, self._commanded, strict=True)):
             coil = 2 * self.number + channel
-            if not self._is_repeated(f"coil {coil}", is_short(float(expected[channel]), measured), MAX_SHORTFALLS):
+            if not self._is_repeated(f"coil {coil}", is_short(float(expected[channel]), measured), 12):
                 self._coil_warnings[channel] = ""
             elif not self._coil_warnings[channel]:  # keeps the first text, which would change with every answer
                 self._coil_warnings[channel] = f"coil {coil}: {measured:.2f} A measured, {commanded:.2f} A commanded"

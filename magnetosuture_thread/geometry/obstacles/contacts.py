@@ -219,7 +219,6 @@ def _check(name: str, shape: Obstacle, dimension: int) -> None:
 
 TOLERANCE = 1e-7
 """By how much a distance may be given too short; it is never too long but for rounding [m]."""
-_MAX_BISECTIONS = 500  # of a half segment that is inside; what is left then has its lower bound
 
 
 @compiled_inline
@@ -252,7 +251,8 @@ def _deepest(ax: float, ay: float, bx: float, by: float, polygon: int, data: Wor
         bound = 0.5 * (before.signed + after.signed - (high - low) * length)
         for k in (before.edge, after.edge):
             bound = max(bound, -max(_from_edge(px, py, k, edges), _from_edge(qx, qy, k, edges)))
-        if bound >= best - TOLERANCE or halvings >= _MAX_BISECTIONS:
+        # After 500 bisections what is left of a half segment inside has its lower bound.
+        if bound >= best - TOLERANCE or halvings >= 500:
             lowest = min(lowest, bound)
             continue
         middle, halvings = 0.5 * (low + high), halvings + 1

@@ -1,10 +1,9 @@
-"""Tasks on processes of this machine and on a Dask cluster: the same results, and what is lost with a worker."""
+"""Jobs on a Dask cluster: the same results to the last bit, and what is lost with a worker."""
 
 from __future__ import annotations
 
 import importlib
 import json
-import multiprocessing
 import os
 import socket
 import subprocess
@@ -17,28 +16,26 @@ from typing import cast
 
 import pytest
 
-from magnetosuture_thread import cli, workers
+from magnetosuture_thread import cli
 from magnetosuture_thread.commands.evaluate import evaluate_bags
-from magnetosuture_thread.errors import BagError, ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.evaluation.tables import TIMES
-from magnetosuture_thread.workers import ONE_THREAD, Work, WorkerDiedError, WorkerPool, make_runner
+from magnetosuture_thread.workers import Work, WorkerDiedError, cluster, make_runner
 
 SOURCE = """
 import os
 from pathlib import Path
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.workers import ONE_THREAD
 
 def work(task, log, progress):
     log(f"task {task}")
     if task == "fatal":
         os._exit(9)
     if task == "wrong":
-        raise BagError("a.mcap", "is no mcap file")
+        raise ValueError("a task that cannot be done")
     if isinstance(task, Path) and not task.exists():
         task.touch()  # so that only the first try ends its worker
         os._exit(9)
-    return str(task), os.getpid(), [os.environ.get(name) for name in ONE_THREAD]
+    return str(task), os.getpid()
 """
 ENDED_WORKERS = 5  # one by the task that ends its first worker, two by each of two tries of a fatal one
 
@@ -49,10 +46,12 @@ def cluster_of(workers: int, folder: Path) -> Iterator[str]:
 
     Nothing starts a worker again: Dask's nannies may fail at that where another one ends meanwhile.
     """
+    (folder / "work_of_tests.py").write_text(SOURCE)
     paths = filter(None, [str(folder), os.environ.get("PYTHONPATH")])
     once = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
     environment = {**os.environ, **once, "PYTHONPATH": os.pathsep.join(paths)}
     with (folder / "dask.log").open("wb") as log, ExitStack() as stack:
+        stack.enter_context(pytest.MonkeyPatch.context()).syspath_prepend(str(folder))
 
         def start(name: str, *options: str) -> subprocess.Popen[bytes]:
             command = [sys.executable, "-m", f"distributed.cli.{name}", *options, "--no-dashboard"]
@@ -76,12 +75,8 @@ def cluster_of(workers: int, folder: Path) -> Iterator[str]:
         yield address
 
 
-@pytest.fixture
-def work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Work:
-    """Return the function of `SOURCE`, of a module that workers find too."""
-    (tmp_path / "work_of_tests.py").write_text(SOURCE)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "work_of_tests", raising=False)
+def work() -> Work:
+    """Return the function of `SOURCE`, by the name that workers find it by."""
     return cast(Work, importlib.import_module("work_of_tests").work)
 
 
@@ -92,45 +87,21 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield address
 
 
-@pytest.mark.parametrize("kind", ["processes", "cluster"])
-def test_tasks_are_done_by_workers_and_one_that_loses_its_worker_is_repeated(kind: str, work: Work, tmp_path: Path):
+def test_tasks_are_done_on_the_workers_and_one_that_loses_its_worker_is_repeated(tmp_path: Path):
     lines: list[str] = []
     shares: list[float] = []
-    tasks, before = [1, 2, tmp_path / "begun", 4], dict(os.environ)
-    with ExitStack() as stack:
-        there = stack.enter_context(cluster_of(ENDED_WORKERS + 1, tmp_path)) if kind == "cluster" else ""
-        runner = stack.enter_context(make_runner(work, 2, there))
+    tasks = [1, 2, tmp_path / "begun", 4]
+    with cluster_of(ENDED_WORKERS + 1, tmp_path) as address, make_runner(work(), 1, address) as runner:
         results = dict(runner.run(tasks, lines.append, shares.append))
         assert [results[index][0] for index in range(4)] == [str(task) for task in tasks]
-        assert os.getpid() not in {process for _, process, _ in results.values()}
+        assert os.getpid() not in {process for _, process in results.values()}
         assert sorted(lines) == sorted(f"task {task}" for task in tasks)
         assert shares == [0.25, 0.5, 0.75, 1.0]
-        with pytest.raises(BagError, match=r"^a\.mcap: is no mcap file$") as raised:
+        with pytest.raises(ValueError, match="a task that cannot be done"):
             list(runner.run([1, "wrong"]))
-        assert (raised.value.path, raised.value.problem) == ("a.mcap", "is no mcap file")
         fatal = dict(runner.run(["fatal", 5]))
     assert isinstance(fatal[0], WorkerDiedError)
     assert fatal[1][0] == "5"
-    assert kind == "cluster" or all(threads == ["1"] * len(ONE_THREAD) for _, _, threads in results.values())
-    assert dict(os.environ) == before
-
-
-@pytest.mark.parametrize("workers", [1, 3])
-def test_what_ends_the_call_ends_the_processes(work: Work, workers: int):
-    def interrupt(text: str) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), WorkerPool(work, workers) as pool:
-        list(pool.run([1, 2, 4], log=interrupt))
-    assert not multiprocessing.active_children()
-
-
-def test_processes_serve_again_and_one_task_needs_none(work: Work):
-    with WorkerPool(work, 2) as pool:
-        first, second = dict(pool.run([1, 2])), dict(pool.run([4, 5]))
-        assert {process for _, process, _ in second.values()} <= {process for _, process, _ in first.values()}
-        ((index, result),) = pool.run([2])
-    assert (index, *result[:2]) == (0, "2", os.getpid())
 
 
 def test_bags_are_evaluated_alike(scheduler: str, short_bag: Path, tmp_path: Path):
@@ -146,8 +117,8 @@ def test_bags_are_evaluated_alike(scheduler: str, short_bag: Path, tmp_path: Pat
     assert names[0] == names[1]
 
 
-def test_a_worker_that_has_other_software_later_is_refused_too(work: Work, tmp_path: Path):
-    with cluster_of(1, tmp_path) as address, make_runner(work, 1, address) as runner:
+def test_a_worker_that_has_other_software_later_is_refused_too(tmp_path: Path):
+    with cluster_of(1, tmp_path) as address, make_runner(work(), 1, address) as runner:
         # On the path of the workers, before the NumPy that is there, as if it had been replaced.
         (tmp_path / "numpy-0.9.dist-info").mkdir()
         (tmp_path / "numpy-0.9.dist-info" / "METADATA").write_text("Name: numpy\nVersion: 0.9\n")
@@ -161,7 +132,7 @@ def test_an_absent_scheduler_gives_one_line(capfd: pytest.CaptureFixture[str], t
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     options = ["--output", str(tmp_path / "out"), "--scheduler", address]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workers, "CONNECT_TIMEOUT", 0.2)
+        patch.setattr(cluster, "CONNECT_TIMEOUT", 0.2)
         assert cli.main(["evaluate", str(short_bag), *options]) == 2
     assert "the address of a running Dask scheduler" in capfd.readouterr().err
     assert not (tmp_path / "out").exists()
