@@ -253,17 +253,18 @@ def use_ros_numbers(loader: type[Any]) -> None:
 use_ros_numbers(_RosLoader)
 
 
-def _load(text: str) -> Any:
-    check_yaml(text)
+def _load(text: str, *, plain: bool = False) -> Any:
+    check_yaml(text, plain=plain)
     return yaml.load(text, _RosLoader)
 
 
-def read_yaml(path: Path, what: str) -> Any:
+def read_yaml(path: Path, what: str, *, plain: bool = False) -> Any:
     """Return the content of a YAML file, read as ROS does: 1e-5 is a number, nothing is a date, keys are unique.
 
     Args:
         path: the file.
         what: it is, for the error.
+        plain: whether tags, and numbers that ROS takes for octal and the like, are refused.
 
     Raises:
         ConfigurationError: the file cannot be read, is not regular or too large, or is no plain YAML.
@@ -273,16 +274,17 @@ def read_yaml(path: Path, what: str) -> Any:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "not text"
         raise ConfigurationError(what, reason, "a readable YAML file", str(path)) from None
-    return read_yaml_text(text, what, str(path))
+    return read_yaml_text(text, what, str(path), plain=plain)
 
 
-def read_yaml_text(text: str, what: str, source: str = "") -> Any:
+def read_yaml_text(text: str, what: str, source: str = "", *, plain: bool = False) -> Any:
     """Return the content of a text as `read_yaml` does that of a file.
 
     Args:
         text: of at most `MAX_TEXT_BYTES` characters.
         what: it is, for the error.
         source: file that it is from, for the error.
+        plain: as of `read_yaml`.
 
     Raises:
         ConfigurationError: it is too large, or no plain YAML.
@@ -290,7 +292,7 @@ def read_yaml_text(text: str, what: str, source: str = "") -> Any:
     if len(text) > MAX_TEXT_BYTES:
         raise ConfigurationError(what, f"{len(text)} characters", f"at most {MAX_TEXT_BYTES}", source)
     try:
-        return _load(text)
+        return _load(text, plain=plain)
     except BudgetError as error:
         raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", source) from None
     except yaml.YAMLError as error:

@@ -7,6 +7,7 @@ each such file within 5 s and 300 MB.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
@@ -28,6 +29,10 @@ MAX_PARSER_STEPS = 40_000  # of a message definition's parser: a second; a usual
 MAX_BAG_PARSER_STEPS = 100_000  # of all definitions of a bag
 MAX_RECORD_BYTES = 1 << 22  # of a definition of a topic or type, or of another record that is parsed as a whole
 MAX_KEPT_BYTES = 1 << 25  # of all different definitions and metadata records of a small bag, as they are in memory
+# Numbers of YAML 1.1 that are not written in decimal digits alone: binary, octal, hexadecimal, in sixties, spaced by _.
+_NOT_DECIMAL = re.compile(
+    r"[-+]?(?:0b[01_]+|0[0-7_]+|0x[0-9a-fA-F_]+|[1-9][0-9]*_[0-9_:]*|[1-9][0-9]*(?::[0-5]?[0-9])+)"
+)
 LONE_RECORD = 10  # records in a chunk, which are read in the time of one outside of chunks
 
 
@@ -100,12 +105,13 @@ class ParserBudget:
             raise BudgetError(f"a definition past the {MAX_BAG_PARSER_STEPS} steps in which those of a bag are parsed")
 
 
-def check_yaml(text: str, *, max_aliases: int = 0) -> None:
+def check_yaml(text: str, *, max_aliases: int = 0, plain: bool = False) -> None:
     """Refuse a YAML text that becomes much larger when it is read, or that nests too deep.
 
     Args:
         text: whatever was given.
         max_aliases: that are accepted; each may double what is read.
+        plain: whether tags, and numbers that are not written in decimal digits, are refused too.
 
     Raises:
         BudgetError: with the line.
@@ -122,6 +128,12 @@ def check_yaml(text: str, *, max_aliases: int = 0) -> None:
         if isinstance(event, yaml.AliasEvent) or (not max_aliases and getattr(event, "anchor", None) is not None):
             aliases += 1
             problem = "an anchor or alias (& or *)" if aliases > max_aliases else problem
+        if plain and getattr(event, "tag", None) not in (None, "!"):
+            problem = "a tag (!)"
+        elif (
+            plain and isinstance(event, yaml.ScalarEvent) and event.implicit[0] and _NOT_DECIMAL.fullmatch(event.value)
+        ):
+            problem = f"{event.value[:40]}, which is no decimal number"
         if count > MAX_YAML_EVENTS:
             problem = f"more than {MAX_YAML_EVENTS} values"
         if problem:

@@ -7,7 +7,7 @@ that agrees with the messages. In a file with any other damage it is not used.
 
 Where a record or chunk is corrupt, the scan continues at the record behind it, or at the next chunk with a correct
 checksum if that comes first. The package `mcap` parses the records, but accepts short reads and trailing bytes. Here a
-record must be as long as its header says, which is how a corrupt header is noticed.
+record must be as long as its header and the lengths within it say, which is how a corrupt one is noticed.
 
 Source: the MCAP specification, https://mcap.dev/spec.
 """
@@ -33,7 +33,7 @@ from typing import Any, BinaryIO, NamedTuple
 import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
 from magnetosuture_thread.bags.storage import (
@@ -82,6 +82,17 @@ class CorruptRecordError(Exception):
     """Bytes that are no valid record; the text gives the reason."""
 
 
+class _WholeStream(ReadDataStream):
+    """A stream that raises where there is less than is read."""
+
+    def read(self, length: int) -> bytes:
+        """Return so many bytes."""
+        data = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data
+
+
 def parse_record(opcode: int, body: bytes) -> Any:
     """Return a record of the package `mcap`, or None where its content is not needed.
 
@@ -92,7 +103,7 @@ def parse_record(opcode: int, body: bytes) -> Any:
         return None
     _check_length(opcode, len(body))
     kind = getattr(mcap_records, Opcode(opcode).name.title().replace("_", ""))  # ChunkIndex of CHUNK_INDEX
-    stream = ReadDataStream(BytesIO(body))
+    stream = _WholeStream(BytesIO(body))
     try:
         record = kind.read(stream)
     except (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError):
@@ -306,6 +317,7 @@ class McapSummary:
         definitions: channels and their schemas.
         chunks: the chunk index, as blocks that have not been read.
         metadata: offset and length of the metadata records.
+        lengths: of all that the summary lists, a chunk's message indexes included, by offset [bytes].
         statistics: counts and times of all messages, if present.
     """
 
@@ -315,6 +327,7 @@ class McapSummary:
     definitions: list[Definition] = field(default_factory=list)
     chunks: list[Block] = field(default_factory=list)
     metadata: list[tuple[int, int]] = field(default_factory=list)
+    lengths: dict[int, int] = field(default_factory=dict)
     statistics: mcap_records.Statistics | None = None
 
 
@@ -373,8 +386,11 @@ def _parse_summary(data: bytes, summary: McapSummary, budget: UnpackBudget) -> N
                 counts=array("I", [number for channel in record.message_index_offsets for number in (channel, 0)]),
             )
             summary.chunks.append(block)
-        elif opcode == Opcode.METADATA_INDEX:
-            summary.metadata.append((record.offset, record.length))
+            summary.lengths[record.chunk_start_offset] = record.chunk_length + record.message_index_length
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            summary.lengths[record.offset] = record.length
+            if opcode == Opcode.METADATA_INDEX:
+                summary.metadata.append((record.offset, record.length))
         elif opcode == Opcode.STATISTICS:
             summary.statistics = record
 
@@ -796,19 +812,24 @@ def _match_chunks(scan: ScanResult, trusted: McapSummary | None) -> tuple[list[B
     """Return the blocks that belong to a file, those that do not, and the chunks of its index that are missing.
 
     A chunk is known by its lengths and times, wherever it is. Without an index, one that is present twice counts once:
-    a recorder does not write the same messages with the same times again, but a copy of a part of a file does.
+    a recorder does not write the same messages with the same times again, but a copy of a part of a file does. There
+    its checksum counts too: nothing says that chunks of the same lengths and times are the same.
     """
     index = trusted.chunks if trusted is not None else []
     if not index and scan.data_verified:
         return scan.blocks, [], []
-    expected = Counter(map(_identity, index)) if index else Counter({_identity(block): 1 for block in scan.blocks})
+
+    def key(block: Block) -> tuple[int | None, ...]:
+        return _identity(block) if index else (block.crc, *_identity(block))
+
+    expected = Counter(map(key, index)) if index else Counter({key(block): 1 for block in scan.blocks})
     own, spare, missing = list[Block](), list[Block](), list[Block]()
     for block in scan.blocks:
-        expected[_identity(block)] -= block.is_chunk
-        (own if expected[_identity(block)] >= 0 or not block.is_chunk else spare).append(block)
+        expected[key(block)] -= block.is_chunk
+        (own if expected[key(block)] >= 0 or not block.is_chunk else spare).append(block)
     for block in index:
-        if expected[_identity(block)] > 0:
-            expected[_identity(block)] -= 1
+        if expected[key(block)] > 0:
+            expected[key(block)] -= 1
             missing.append(block)
     return own, spare, missing
 
@@ -871,8 +892,9 @@ def _contradiction(summary: McapSummary, blocks: list[Block], counts: Counter[in
 def read_index(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> ScanResult | None:
     """Return what a file holds by its summary, as a scan would; None where that cannot be told, so that it needs one.
 
-    It can be told where the summary has a correct checksum, an index of all chunks, and counts of all channels. The
-    first chunk must have a checksum; of one writer all chunks have one, or none.
+    It can be told where the summary has a correct checksum and counts of all channels, and covers the file: between the
+    chunks, metadata and attachments that it lists there is nothing but definitions that it repeats. The first chunk
+    must have a checksum; of one writer all chunks have one, or none.
 
     Args:
         stream: the file.
@@ -880,7 +902,7 @@ def read_index(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> 
         budget: of the bag.
 
     Raises:
-        BudgetError: it holds more metadata than a file of its size may.
+        BudgetError: it holds more records or metadata than a file of its size may.
     """
     chunks, statistics = summary.chunks, summary.statistics
     if not (summary.trusted and chunks and all(0 <= block.length <= MAX_BLOCK_BYTES for block in chunks)):
@@ -896,6 +918,8 @@ def read_index(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> 
     if magic != MAGIC or not any(stream.read(_CHUNK_CRC.stop)[_CHUNK_CRC]):
         return None
     scan = ScanResult(chunks, summary.definitions, attachments=statistics.attachment_count, index=counts)
+    if not _is_covered(stream, summary, budget):
+        return None
     try:
         for offset, length in summary.metadata:
             stream.seek(offset + RECORD_HEADER.size)
@@ -905,3 +929,24 @@ def read_index(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> 
     except CorruptRecordError:
         return None
     return scan
+
+
+def _is_covered(stream: BinaryIO, summary: McapSummary, budget: UnpackBudget) -> bool:
+    """Return whether all records that may hold data are in the summary."""
+    position = len(MAGIC)
+    while position < summary.start:
+        budget.spend(0, LONE_RECORD)
+        if position in summary.lengths:
+            position += max(RECORD_HEADER.size, summary.lengths[position])
+            continue
+        stream.seek(position)
+        head = stream.read(RECORD_HEADER.size)
+        if len(head) < RECORD_HEADER.size:
+            return False
+        opcode, length = RECORD_HEADER.unpack(head)
+        position += RECORD_HEADER.size + length
+        if opcode == Opcode.DATA_END:
+            return bool(position == summary.start)
+        if opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
+            return False
+    return False

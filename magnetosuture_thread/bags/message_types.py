@@ -11,7 +11,9 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import make_typesdict
+from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
+from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
 from magnetosuture_thread.bags.storage import MessageDefinition
@@ -54,8 +56,8 @@ class MessageDecoder:
     """Decodes messages of one type.
 
     Args:
-        definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that is no
-            valid .msg text.
+        definition: of the type in the bag. Ours is used where the bag has none, an equivalent one, or one that
+            cannot be parsed.
         budget: of the bag.
 
     Attributes:
@@ -133,7 +135,7 @@ class DecoderCache:
         return self._decoders[definition]
 
 
-class _BoundedParser(MSGParser):
+class _Bounded(Parser):
     """A parser that ends after a number of steps: some texts make it try every way to read them."""
 
     budget: ParserBudget
@@ -149,6 +151,17 @@ class _BoundedParser(MSGParser):
         return super().regex(pos, pattern, flags)
 
 
+class _BoundedMsgParser(_Bounded, MSGParser):
+    """Parser of .msg files."""
+
+
+class _BoundedIdlParser(_Bounded, IDLParser):
+    """Parser of .idl files, without operators in constants: those of ROS have none, and a shift may be huge."""
+
+    def _binop(self, pos: int, left: Any, op: str, right: Any) -> Any:
+        return Failure(pos, "", {"a constant without an operator"})
+
+
 def _parsed_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
     """Return the types of a definition; none where it cannot be parsed, or uses types without definition.
 
@@ -159,13 +172,17 @@ def _parsed_types(definition: MessageDefinition, budget: ParserBudget) -> Types:
     """
     name, text = definition.type_name, definition.text
     ours = typestore().fielddefs
-    if definition.encoding != "ros2msg" or (not text.strip() and name in ours):
+    if definition.encoding not in ("ros2msg", "ros2idl") or (not text.strip() and name in ours):
         return {}
     if len(text) > MAX_DEFINITION_CHARS:
         raise BudgetError(f"a definition of {len(text)} characters; at most {MAX_DEFINITION_CHARS} are read")
     budget.begin()
     try:
-        parser = _BoundedParser(f"MSG: {name}\n{text}")
+        parser: _Bounded
+        if definition.encoding == "ros2msg":
+            parser = _BoundedMsgParser(f"MSG: {name}\n{text}")
+        else:
+            parser = _BoundedIdlParser(text)
         parser.budget = budget
         own = dict(make_typesdict(parser.specification()))
     except BudgetError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -45,6 +44,10 @@ _SQLITE_MAGIC = b"SQLite format 3\0"
 _LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
 _MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
+_COLUMNS = {
+    "topics": ("id", "name", "type", "serialization_format"),
+    "messages": ("id", "topic_id", "timestamp", "data"),
+}
 # sqlite3 does not enforce column types, so that a row may hold anything.
 _IS_VALID = (
     "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND timestamp >= 0 AND typeof(data) = 'blob'"
@@ -107,11 +110,14 @@ class SqliteFile:
 
     def _check_tables(self, database: sqlite3.Connection) -> None:
         """Refuse a database whose tables are not those of rosbag2, but views or columns that compute what they hold."""
-        for table in ("topics", "messages"):
-            query = "SELECT type, sql FROM sqlite_master WHERE name = ?"
-            found = database.execute(query, (table,)).fetchone() or ("", "")
-            if found[0] != "table" or re.search(r"\b(as|virtual)\b", str(found[1]), re.IGNORECASE):
+        for table, columns in _COLUMNS.items():
+            query = "SELECT type, rootpage > 0 FROM sqlite_master WHERE name = ?"  # a virtual table has no page
+            if database.execute(query, (table,)).fetchall() != [("table", 1)]:
                 raise BagError(self.path, f"has no plain table {table}, which the database of a bag has")
+            hidden = {row[1]: row[6] for row in database.execute(f"PRAGMA table_xinfo({table})")}
+            missing = next((name for name in columns if hidden.get(name) != 0), None)
+            if missing is not None:
+                raise BagError(self.path, f"has no column {missing} in its table {table}, or one that is computed")
 
     def _count_messages(self, database: sqlite3.Connection) -> None:
         lost = longest = 0
@@ -130,7 +136,8 @@ class SqliteFile:
         self.start, self.end = min(times, default=0), max(times, default=0)
 
     def _damaged(self, problem: str) -> BagError:
-        return BagError(self.path, f"is damaged ({problem}), and has no checksums (sqlite3): nothing of it is used")
+        words = " ".join(problem.split())
+        return BagError(self.path, f"is damaged ({words}), and has no checksums (sqlite3): nothing of it is used")
 
     def messages(self, connections: Collection[int], start: int, end: int) -> Iterator[StoredMessage]:
         """Yield the messages of some connections from `start` to `end` [ns], both included, by time.

@@ -323,6 +323,8 @@ def _marker_poses(message: Any) -> list[list[float]]:
         raise UnfitError("a marker that is no line strip being added")
     own = np.array(_pose(message.pose.position, message.pose.orientation))
     place, turn = own[:3], own[3:] if own[3:].any() else np.array(UPRIGHT)  # RViz takes zeros for no rotation
+    if not np.isfinite(place).all():
+        raise UnfitError("a place that is not finite")
     points = np.array([[point.x, point.y, point.z] for point in message.points]).reshape(-1, 3)
     return [[*point, *UPRIGHT] for point in _rotations(turn[None]).apply(points) + place]
 
@@ -363,11 +365,12 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
         UnfitError: it holds no such thing.
         struct.error: its stamp is out of range.
     """
-    rotation = np.eye(3) if matrix is None else matrix[:3, :3]
     if type_name == TWIST:
         twist = getattr(message, "twist", message)
         vectors = np.array([[each.x, each.y, each.z] for each in (twist.linear, twist.angular)])
-        return pack("header float64[6]", stamp, vectors @ rotation.T)
+        if matrix is not None:  # else inf would make nan of its neighbours
+            vectors = vectors @ matrix[:3, :3].T
+        return pack("header float64[6]", stamp, vectors)
     kind = message.__msgtype__
     if type_name == PATH:
         poses = _moved(_PATHS[kind](message), matrix)
@@ -376,9 +379,11 @@ def converted(message: Any, type_name: str, stamp: int, matrix: Matrix | None) -
     (pose,) = _moved(_POSES[kind](message), matrix)
     if type_name == POSE:
         return pack("header float64[7]", stamp, pose)
-    both = np.kron(np.eye(2), rotation)
     covariance = np.reshape(getattr(getattr(message, "pose", None), "covariance", np.zeros(36)), (6, 6))
-    return pack("header float64[7] float64[36]", stamp, pose, both @ covariance @ both.T)
+    if matrix is not None:
+        both = np.kron(np.eye(2), matrix[:3, :3])
+        covariance = both @ covariance @ both.T
+    return pack("header float64[7] float64[36]", stamp, pose, covariance)
 
 
 def _moved(poses: list[list[float]], matrix: Matrix | None) -> Matrix:

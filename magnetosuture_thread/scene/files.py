@@ -18,6 +18,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -31,7 +32,7 @@ from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.resources import find_scene_file
-from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape
+from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape, is_number
 from magnetosuture_thread.scene.shapes import (
     DISH_FIELDS,
     dish_from_mapping,
@@ -62,14 +63,25 @@ def read_scene(name: str) -> Scene:
     path = find_scene_file(name)
     source = str(path)
     if path.suffix not in GEOJSON_ENDINGS:
-        return scene_from_mapping(read_yaml(path, "scene file"), source)
+        return scene_from_mapping(read_yaml(path, "scene file", plain=True), source)
     try:
-        return scene_from_geojson(json.loads(read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")), source)
+        text = read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig")
+        return scene_from_geojson(json.loads(text, object_pairs_hook=_once), source)
     except OSError as error:
         problem = error.strerror or str(error)
         raise ConfigurationError("scene file", problem, "a readable GeoJSON file", source) from None
     except (ValueError, RecursionError) as error:  # no text, no JSON, a number of thousands of digits, lists too deep
         raise ConfigurationError("scene file", str(error), "valid JSON", source) from None
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a mapping of JSON, each of whose names is given once."""
+    mapping: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in mapping:
+            raise ValueError(f"{name} is given twice")
+        mapping[name] = value
+    return mapping
 
 
 def write_scene(scene: Scene, path: Path) -> None:
@@ -82,15 +94,15 @@ def write_scene(scene: Scene, path: Path) -> None:
         text = json.dumps(scene_to_geojson(scene), indent=1, allow_nan=False) + "\n"
     else:
         text = yaml.safe_dump(scene_to_mapping(scene), sort_keys=False, default_flow_style=None, width=120)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
     problem = output_problem(path)
-    try:
-        if not problem:
+    if not problem:
+        partial = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
             partial.write_text(text, encoding="utf-8")
             partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        problem = error.strerror or str(error)
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            problem = error.strerror or str(error)
     if problem:
         raise ConfigurationError("scene file", problem, "a file that can be written", str(path))
 
@@ -150,7 +162,8 @@ def scene_from_geojson(content: Any, source: str = "") -> Scene:
         if properties.get("kind") == DISH:
             dishes.append(_dish(properties, solid, source))
         elif isinstance(name := properties.get("name"), str):
-            shapes += _shapes(name, properties, solid, source)
+            # One too many is refused below; 40,000 would take 15 s to make.
+            shapes += islice(_shapes(name, properties, solid, source), MAX_SHAPES + 1 - len(shapes))
         else:
             raise ConfigurationError(f"{where}.properties.name", name, "a name", source)
     if len(dishes) != 1:
@@ -170,14 +183,21 @@ def _checked_feature(where: str, feature: Any, source: str) -> tuple[Mapping[str
         if given not in PROPERTIES and close:  # a spelling error; others may belong to any program
             expectation = f"no such property: {close[0]}?"
             raise ConfigurationError(f"{where}.properties.{given}", properties[given], expectation, source)
+    solid = None
     try:
-        solid = shapely.force_2d(shapely.geometry.shape(feature.get("geometry")))
+        if _holds_numbers(feature["geometry"]["coordinates"]):
+            solid = shapely.force_2d(shapely.geometry.shape(feature["geometry"]))
     except Exception:  # shapely raises whatever the content makes it stumble over.
-        solid = None
+        pass
     if solid is None or solid.is_empty or solid.geom_type not in ("Point", "Polygon", "MultiPolygon"):
         expectation = "a Point, Polygon or MultiPolygon"
         raise ConfigurationError(f"{where}.geometry", feature.get("geometry"), expectation, source)
     return properties, solid
+
+
+def _holds_numbers(coordinates: Any) -> bool:
+    """Return whether coordinates are numbers throughout: shapely takes texts and booleans for numbers too."""
+    return all(map(_holds_numbers, coordinates)) if is_list(coordinates) else is_number(coordinates)
 
 
 def _dish(properties: Mapping[str, Any], solid: shapely.Geometry, source: str) -> Dish:
@@ -274,7 +294,7 @@ class SceneEditor:
 def _parse_shape(name: str, text: str) -> SceneShape:
     _require_length("name", name, MAX_NAME_CHARS)
     _require_length("shape", text, MAX_SHAPE_CHARS)
-    return shape_from_mapping(name, read_yaml_text(text, "shape"))
+    return shape_from_mapping(name, read_yaml_text(text, "shape", plain=True))
 
 
 def _require_length(field: str, text: str, max_chars: int) -> None:

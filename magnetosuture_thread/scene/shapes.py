@@ -67,7 +67,7 @@ def _read_field(name: str, field: str, value: Any) -> Any:
         return tuple(_ring(f"{name}[{index}]", ring) for index, ring in enumerate(value))
     low, high, unit = 0.0 if field == "inset" else MIN_RADIUS, MAX_COORDINATE, "m"
     if field.endswith("angle"):
-        low, high, unit = -2.0 * math.pi, 4.0 * math.pi, "rad"
+        low, high, unit = -2.0 * math.pi, (2.0 if field == "angle" else 4.0) * math.pi, "rad"
     if not is_number(value) or not low <= value <= high:
         raise ConfigurationError(name, value, f"a number from {low:g} to {high:g} {unit}")
     return float(value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import struct
 from contextlib import closing
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 import zstandard
 from rosbags.rosbag2 import Reader, StoragePlugin
 
-from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.message_types import DecoderCache, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
@@ -159,6 +160,26 @@ def test_the_bags_own_definitions_are_taken(tmp_path: Path):
     thing, old, text = (record.decode() for record in Bag(tmp_path / "bag").records())
     assert (thing.header.frame_id, thing.number) == ("dis", 7)
     assert (old.size, old.data, text.data) == (5, "a", "b")
+
+
+POINT = "geometry_msgs/msg/Point"
+
+
+@pytest.mark.parametrize(
+    ("fields", "is_ours"),
+    [("double x; double y; double z;", True), ("float y; float x; float z; double w;", False)],
+)
+def test_definitions_in_idl_are_taken(fields: str, is_ours: bool):
+    """Ours is not used in the place of one that differs."""
+    text = f"module geometry_msgs {{ module msg {{ struct Point {{ {fields} }}; }}; }};"
+    decoder = DecoderCache().decoder_of(MessageDefinition(POINT, "ros2idl", text))
+    assert decoder.is_ours == is_ours
+    if is_ours:
+        point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3d", 1.0, 2.0, 3.0))
+    else:
+        point = decoder.decode("/point", b"\0\1\0\0" + struct.pack("<3f4xd", 2.0, 1.0, 3.0, 4.0))
+        assert point.w == 4.0
+    assert (point.x, point.y, point.z) == (1.0, 2.0, 3.0)
 
 
 @pytest.mark.parametrize(

@@ -149,9 +149,14 @@ def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
     assert max(seconds.values()) < MAX_SECONDS, seconds
 
 
+IDL = "module nav_msgs { module msg { struct Path { %s }; }; };"
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
+        (IDL % "string x[300000000];", "more than 4000 fields"),
+        (IDL % "".join(f"long a{n};" for n in range(10_000)), "steps to parse"),
         ("geometry_msgs/Point[300000000] x\n", "more than 4000 fields"),
         ("int8 x\n" + "#" * 300_000, "300007 characters"),
         ("".join(f"int32 a{n}\n" for n in range(15_000)), "steps to parse"),
@@ -159,10 +164,15 @@ def test_no_bomb_takes_more_than_it_may(tmp_path: Path):
     ],
 )
 def test_a_definition_past_its_budget_says_so_when_a_message_is_decoded(text: str, problem: str):
-    decoder = DecoderCache().decoder_of(MessageDefinition(PATH, "ros2msg", text))
+    encoding = "ros2idl" if text.startswith("module") else "ros2msg"
+    decoder = DecoderCache().decoder_of(MessageDefinition(PATH, encoding, text))
     assert not decoder.is_ours
     with pytest.raises(BagError, match=problem):
         decoder.decode("/path", b"\0\1\0\0")
+
+
+def test_a_shift_in_a_constant_of_idl_is_not_computed():
+    assert DecoderCache().decoder_of(MessageDefinition(PATH, "ros2idl", IDL % "double x[1 << 40000000000];")).is_ours
 
 
 def test_metadata_past_its_budget_is_not_used_and_said(tmp_path: Path):

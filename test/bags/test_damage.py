@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import struct
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from mcap.writer import CompressionType
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.errors import BagError
-from test.bags.bags import STRING, Message, chunks_of, read, texts, write_many_chunks, write_mcap
+from test.bags.bags import SECOND, STRING, Message, cdr, chunks_of, read, texts, write_many_chunks, write_mcap
 
 Untouched = Callable[[int, int], bool]
 
@@ -209,3 +210,32 @@ def test_a_message_index_that_becomes_a_message_is_not_passed_on(tmp_path: Path)
     bag = Bag(path)
     assert sorted(read(bag)) == sorted(messages)
     assert bag.damage is not None
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_whose_records_are_shorter_than_it_says_is_corrupt(tmp_path: Path, compression: CompressionType):
+    path = write_mcap(tmp_path / "long.mcap", texts(300), {"/text": STRING}, compression=compression)
+    data = bytearray(path.read_bytes())
+    start, _, messages = list(chunks_of(path))[2]
+    name = 0 if compression is CompressionType.NONE else len(compression.name)
+    at = start + 9 + 32 + name  # of the length of its records
+    data[at : at + 8] = struct.pack("<Q", struct.unpack_from("<Q", data, at)[0] + 1000)
+    path.write_bytes(data)
+    damage = Bag(path).damage
+    assert damage is not None
+    assert damage.messages == len(messages)
+
+
+@pytest.mark.parametrize("kind", ["truncated", "no checksums"])
+def test_without_an_index_chunks_that_differ_only_in_their_content_are_no_copies(tmp_path: Path, kind: str):
+    messages = [("/text", SECOND, cdr(STRING, letter)) for letter in "abcd"]
+    path = write_mcap(
+        tmp_path / "alike.mcap", messages, {"/text": STRING}, chunk_size=1, enable_crcs=kind != "no checksums"
+    )
+    chunks = list(chunks_of(path))
+    assert len(chunks) == 4
+    if kind == "truncated":
+        path.write_bytes(path.read_bytes()[: chunks[-1][1]])
+    bag = Bag(path)
+    assert sorted(read(bag)) == messages
+    assert (bag.damage is None) == (kind == "no checksums")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,30 @@ def test_covariances_and_velocities_turn_too(tmp_path: Path):
     assert np.allclose(np.diag(found.pose.covariance.reshape(6, 6)), [2, 1, 3, 5, 4, 6])
     turned = only(Recording(bag), NEEDLE_COMMAND).twist
     assert np.allclose([turned.linear.x, turned.linear.y, turned.angular.y], [0, -1, -1])
+
+
+def test_what_is_infinite_spoils_nothing_beside_it(tmp_path: Path):
+    """An infinite variance is an unknown one."""
+    variances = np.diag([math.inf, 2.0, 3.0, 4.0, 5.0, 6.0])
+    held = make(COVARIANT, pose(), variances.ravel())
+    vectors = [make("geometry_msgs/msg/Vector3", x, 2.0, 3.0) for x in (math.inf, 1.0)]
+    bag = bag_of(
+        tmp_path,
+        (NEEDLE_POSE.recorded, filled("nav_msgs/msg/Odometry", pose=held)),
+        (NEEDLE_COMMAND.recorded, make("geometry_msgs/msg/Twist", *vectors)),
+    )
+    assert np.array_equal(only(Recording(bag), NEEDLE_POSE).pose.covariance.reshape(6, 6), variances)
+    twist = only(Recording(bag), NEEDLE_COMMAND).twist
+    assert [twist.linear.x, twist.linear.y, twist.linear.z, twist.angular.x] == [math.inf, 2.0, 3.0, 1.0]
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_marker_at_no_finite_place_is_refused_and_counted(tmp_path: Path, value: float):
+    astray = marker()
+    astray.pose.position.y = value
+    recording = Recording(bag_of(tmp_path, (MEASURED_THREAD.recorded, astray)))
+    assert list(recording.records([MEASURED_THREAD])) == []
+    assert recording.refused == {"/thread/measured: a place that is not finite": 1}
 
 
 @pytest.mark.parametrize("frame", ["camera_link", ""])

@@ -119,6 +119,44 @@ def test_a_database_with_a_row_that_cannot_be_is_refused(tmp_path: Path, change:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(
+    ("table", "problem"),
+    [
+        ("TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB /* as virtual */)", ""),
+        ("TABLE messages(topic_id INT, timestamp INT, data BLOB)", "has no column id in its table messages"),
+        (
+            "TABLE messages(id INT, topic_id INT, timestamp INT, d BLOB, data BLOB GENERATED ALWAYS AS (d) STORED)",
+            "has no column data in its table messages, or one that is computed",
+        ),
+        ("VIEW messages AS SELECT * FROM old", "has no plain table messages"),
+        ("VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)", "has no plain table messages"),
+    ],
+)
+def test_only_plain_tables_of_a_database_are_read(tmp_path: Path, table: str, problem: str):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(9), {"/text": STRING})
+    with closing(sqlite3.connect(folder / "bag.db3")) as database:
+        database.execute("ALTER TABLE messages RENAME TO old")
+        database.execute(f"CREATE {table}")
+        if not problem:
+            database.execute("INSERT INTO messages SELECT id, topic_id, timestamp, data FROM old")
+        database.commit()
+    if problem:
+        with pytest.raises(BagError, match=problem):
+            Bag(folder)
+    else:
+        assert read(Bag(folder)) == texts(9)
+
+
+def test_damage_of_a_database_is_told_in_one_line(tmp_path: Path):
+    folder = write_rosbag(tmp_path / "bag", StoragePlugin.SQLITE3, texts(500), {"/text": STRING})
+    data = bytearray((folder / "bag.db3").read_bytes())
+    data[-4096:] = b"\xff" * 4096
+    (folder / "bag.db3").write_bytes(data)
+    with pytest.raises(BagError, match="is damaged") as caught:
+        Bag(folder)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_message_that_cannot_be_unpacked_is_counted_and_all_else_is_kept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import threading
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -193,7 +195,18 @@ def test_a_file_of_a_bag_that_cannot_be_fetched_is_no_damage(tmp_path: Path, mon
         Bag(parse_location("memory://run"))
 
 
-@pytest.mark.parametrize("kind", ["truncated", "no checksums", "no chunks", "whole"])
+def with_message(data: bytes) -> bytes:
+    """Return an mcap file with a message more behind its last chunk, which its summary does not count."""
+    content = cdr(STRING, "outside of chunks")
+    message = struct.pack("<BQHIQQ", 5, 22 + len(content), 1, 0, SECOND, SECOND) + content
+    start, offsets, _ = struct.unpack_from("<QQI", data, len(data) - 28)
+    before = start - 13  # where the record at the end of the data begins
+    summary = data[start:-28] + struct.pack("<QQ", start + len(message), offsets + len(message))
+    end = summary + struct.pack("<I", zlib.crc32(summary)) + data[-8:]
+    return data[:before] + message + data[before:start] + end
+
+
+@pytest.mark.parametrize("kind", ["truncated", "no checksums", "no chunks", "a message more", "whole"])
 def test_a_file_by_url_is_read_as_a_local_one(tmp_path: Path, kind: str):
     path = tmp_path / "x.mcap"
     writers: dict[str, dict[str, Any]] = {"no checksums": {"enable_crcs": False}, "no chunks": {"use_chunking": False}}
@@ -202,6 +215,10 @@ def test_a_file_by_url_is_read_as_a_local_one(tmp_path: Path, kind: str):
     if kind == "truncated":
         data = data[: len(data) // 2]
         path.write_bytes(data)
+    if kind == "a message more":
+        data = with_message(data)
+        path.write_bytes(data)
+        assert Bag(path).damage is not None
     local, far = Bag(path), Bag(in_memory(data, "x.mcap"))
     assert read(far) == read(local)
     assert (far.counts, far.unchecked) == (local.counts, local.unchecked)

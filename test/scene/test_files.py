@@ -62,7 +62,15 @@ BAD = [
     (f"{DISH}shapes: {{a: 1, a: 2}}", "scene file: got 'a is given twice in line 2', expected valid YAML"),
     ("dish: \x07", "scene file: got '"),
     ("a: &a [*a]", "scene file: got 'an anchor or alias (& or *) in line 1', expected plain YAML"),
-    ("dish: !!python/object/apply:os.system [ls]", 'scene file: got "could not determine a constructor'),
+    ("dish: !!python/object/apply:os.system [ls]", "scene file: got 'a tag (!) in line 1', expected plain YAML"),
+    (
+        f"{DISH}shapes: {{a: {{disc: {{center: !!binary AAA=, radius: 0.001}}}}}}",
+        "scene file: got 'a tag (!) in line 2'",
+    ),
+    *[
+        (f"{DISH}shapes: {{a: {{capsule: {{radius: {number}}}}}}}", f"scene file: got '{number}, which is no decimal")
+        for number in ("010", "0x1F", "-0b11", "1_000", "1:30")
+    ],
     ("[" * 100_000, "scene file: got 'lists and mappings 21 deep in line 1', expected plain YAML, at most 20 deep"),
 ]
 
@@ -76,6 +84,20 @@ def test_a_bad_file_is_refused_in_one_line_that_names_it(tmp_path: Path, text: s
     assert str(caught.value).startswith(f"{path}: {words}")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500 + len(str(path))
+
+
+def test_what_only_looks_like_another_number_is_a_name_or_a_number(tmp_path: Path):
+    (tmp_path / "a.yaml").write_text(
+        f"{DISH}shapes: {{0bad: {{disc: {{center: [0, 0.0], radius: 0.001}}}}, '010': "
+        "{disc: {center: [+1e-2, -0], radius: .001}}}\n"
+    )
+    assert [shape.name for shape in read_scene(str(tmp_path / "a.yaml")).shapes] == ["0bad", "010"]
+
+
+@pytest.mark.parametrize("name", [".", "", "..", "/"])
+def test_a_scene_is_not_written_in_the_place_of_a_folder(name: str):
+    with pytest.raises(ConfigurationError, match="is a folder; expected a new file"):
+        write_scene(every_shape(), Path(name))
 
 
 def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):

@@ -15,6 +15,8 @@ from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.scene import Dish, read_scene
 from magnetosuture_thread.scene.files import scene_from_geojson, scene_to_geojson
+from magnetosuture_thread.scene.scene import MAX_SHAPES
+from magnetosuture_thread.scene.shapes import shape_from_mapping
 from test.scene.scenes import every_shape
 
 SQUARE = [[0.0, 0.0], [0.01, 0.0], [0.01, 0.01], [0.0, 0.01], [0.0, 0.0]]
@@ -123,6 +125,14 @@ BAD: list[tuple[Any, str]] = [
     (collection(feature({"type": "LineString"}, name="a")), "features[0].geometry: got {'type': 'LineString'}, "),
     (collection(feature({"type": "MultiPolygon", "coordinates": []}, name="a")), "features[0].geometry: got {"),
     (collection(feature(polygon("abc"), name="a")), "features[0].geometry: got {"),
+    *[
+        (
+            collection(feature(polygon([[part, 0.0], *SQUARE[1:4], [part, 0.0]]), name="a")),
+            "features[0].geometry: got {",
+        )
+        for part in ("0.0", True, None, 10**400, math.inf)
+    ],
+    (collection(feature({"type": "Point", "coordinates": ["0", "0"]}, name="a", radius=0.001)), "features[0].geometry"),
     (collection(feature(polygon([[10.2, 47.1]] * 4), name="a")), "a.polygon.outline[0]: got [10.2, 47.1], expected"),
     (collection(feature(polygon(SQUARE), name="a", kind="bone")), "a.kind: got 'bone', expected one of tissue"),
     (
@@ -141,6 +151,7 @@ BAD: list[tuple[Any, str]] = [
 ]
 NO_JSON = [
     ("", "scene file: got 'Expecting value: line 1 column 1 (char 0)', expected valid JSON"),
+    ('{"type": 1, "type": "FeatureCollection"}', "scene file: got 'type is given twice', expected valid JSON"),
     ("9" * 5000, "scene file: got 'Exceeds the limit"),
     ("[" * 100_000, "scene file: got 'maximum recursion depth exceeded"),
     ('{"type": "FeatureCollection", "features": ' + "[" * 500 + "]" * 500 + "}", "features[0]: got [[[["),
@@ -158,3 +169,18 @@ def test_bad_geojson_is_refused_in_one_line_that_names_file_feature_and_field(tm
     assert str(caught.value).startswith(f"{path}: {words}")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500 + len(str(path))
+
+
+@pytest.mark.parametrize(("features", "parts"), [(1, 5000), (100, 50)])
+def test_no_more_parts_are_made_than_a_scene_may_have(monkeypatch: pytest.MonkeyPatch, features: int, parts: int):
+    made = []
+
+    def count(name: str, *others: Any) -> Any:
+        made.append(name)
+        return shape_from_mapping(name, *others)
+
+    monkeypatch.setattr("magnetosuture_thread.scene.files.shape_from_mapping", count)
+    several = {"type": "MultiPolygon", "coordinates": [[SQUARE]] * parts}
+    with pytest.raises(ConfigurationError, match="shapes: got '201 shapes', expected at most 200"):
+        scene_from_geojson(collection(*[feature(several, name=f"a{index}") for index in range(features)]))
+    assert len(made) == MAX_SHAPES + 1

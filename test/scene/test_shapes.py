@@ -136,6 +136,7 @@ BAD: list[tuple[Any, str]] = [
     ({"annular_sector": {**SECTOR, "inset": 0.0006}}, "post.annular_sector.inset: got 0.0006, expected less than half"),
     ({"capsule": {"start": [0, 0], "end": [0, 0], "radius": 0.001}}, "post.capsule.end: got [0.0, 0.0], expected an"),
     ({"rectangle": PLATE, "corner_radius": 0.001}, "post.corner_radius: got 0.001, expected at most 0.49 of the sh"),
+    ({"rectangle": {**PLATE, "angle": 6.3}}, "post.rectangle.angle: got 6.3, expected a number from -6.28319 to 6.28"),
     ({"polygon": {"outline": SQUARE[:2]}}, "post.polygon.outline: got [[0.0, 0.0], [0.01, 0.0]], expected at least 3"),
     ({"polygon": {"outline": [[0, 0], [1, 1], [1, 0], [0, 1]]}}, "post.polygon.outline: got 'Self-intersection"),
     ({"polygon": {"outline": [[0, 0], [0.1, 0.1], [0.2, 0.2]]}}, "post.polygon.outline: got 'zero area'"),
