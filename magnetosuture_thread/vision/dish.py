@@ -684,8 +684,17 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
         (u, v, radius, _), _, ring = fitted
         if ring is not None and ring[3] >= SHARE_OF_RAYS * RAYS and math.dist(ring[:2], (u, v)) < AGREEMENT_PX:
             u, v = ring[:2]
+        elif _is_saturated(gray, (u, v), radius):  # Then the edge lies where the light makes it seem to.
+            continue
         return DishView((u, v), 0.5 * diameter / radius)
     return None
+
+
+def _is_saturated(gray: Gray, centre: tuple[float, float], radius: float) -> bool:
+    """Say whether the floor near the rim is as bright as the image can show."""
+    points, _ = Ellipse(centre, 0.93 * radius, 0.93 * radius, 0.0).points(64)
+    columns, rows = np.clip(np.rint(points).astype(int), 0, np.array(gray.shape[::-1]) - 1).T
+    return float(np.mean(gray[rows, columns] >= 253)) > 0.15
 
 
 def _fit_rim(gray: Gray, guess: tuple[float, float, float]) -> tuple[Circle, Points, Circle | None] | None:
