@@ -610,7 +610,9 @@ def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
     near = np.zeros_like(layer.pixels)
     # Up to two deviations of the blur beside the outline, light of the needle is mixed in.
     _draw_axis(near, needle, 0.0, length, 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0))
-    u, v = cv2.findNonZero(near).reshape(-1, 2).T
+    left, top, width, height = cv2.boundingRect(near)
+    v, u = np.nonzero(near[top : top + height, left : left + width])
+    u, v = u + left, v + top
     s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
     own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
     share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)
