@@ -42,9 +42,10 @@ class Arc:
         half = 0.5 * self.curvature * s
         middle, turned = self.angle + half, self.angle + 2.0 * half
         chord = 2.0 / self.curvature * np.sin(half) if abs(self.curvature) > 1e-12 else s
-        u = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
-        v = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
-        return np.stack([u, v], axis=-1)
+        points = np.empty((*s.shape, 2))
+        points[..., 0] = self.start[0] + chord * np.cos(middle) - aside * np.sin(turned)
+        points[..., 1] = self.start[1] + chord * np.sin(middle) + aside * np.cos(turned)
+        return points
 
     def strip(self, image: np.ndarray, along: np.ndarray, aside: np.ndarray) -> np.ndarray:
         """Return an image at n lengths along the arc and m distances aside of it, shape (n, m)."""

@@ -46,7 +46,17 @@ from magnetosuture_thread.vision.images import (
     within,
 )
 from magnetosuture_thread.vision.template import BLOOM_PX, BLUR_PX, STEEPNESS, TAPER, THIN
-from magnetosuture_thread.vision.walk import STEP_PX, STRONGEST, Ridge, black_hat, follow, path_buffers, refine, walk_on
+from magnetosuture_thread.vision.walk import (
+    STEP_PX,
+    STRONGEST,
+    Ridge,
+    black_hat,
+    follow,
+    path_buffers,
+    refine,
+    walk_on,
+    worth,
+)
 
 RADIUS_PX, RING = 7.0, 48  # around a path's vertices, that belongs to a crossing; places on it that are looked at
 REACH = round(RADIUS_PX / STEP_PX)  # vertices
@@ -468,7 +478,8 @@ def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_le
     than the brightest background within a few pixels. The walk leaves the tail along the arc that shows most of the
     thread, below the needle where it must, and goes by steps along arcs that look some way ahead, a change of curvature
     having a price: so it goes straight over gaps. At crossings the smoothest of all pairings of the strands that meet
-    decides. Where the needle or the lamp's reflection hides the thread, nothing counts for or against a way.
+    decides. Where the needle or the lamp's reflection hides the thread, nothing counts for or against a way. Where that
+    shows little, a thread wider than the transform's window is looked for at half the size.
 
     Args:
         picture: the frame or a part of it.
@@ -488,14 +499,22 @@ def find_centreline(picture: Picture, gray: Gray, needle: MeasuredNeedle, max_le
     cv2.circle(inside, (u, v), reach, 255, -1, cv2.LINE_8, 4)
     # What is measured beside the wall takes its ground from both sides, and must not go on into the rim.
     gray = np.asarray(cv2.copyTo(gray, inside, picture.darkest.floor.copy()), dtype=np.uint8)
-    ridge = black_hat(gray, hidden, inside)
-    _clear_shade(ridge, picture, needle)
     dish = (*wall.centre, wall.radius - WALL_PX)
-    path, strong = path_buffers(max_length)
     tail, direction = needle.tail_px, needle.direction_px
     start = np.array([tail[0], tail[1], math.atan2(direction[1], direction[0])])
-    # Hidden by the needle and what is next to it.
-    count = follow(ridge, start, dish, max_length, needle.length_px + 12.0, path, strong)
+
+    def walked(*, wide: bool) -> tuple[Ridge, NDArray[np.float64], NDArray[np.bool_], int, float]:
+        """Return a ridge, the path along it, where it is visible, its vertices and how much thread they show."""
+        ridge = black_hat(gray, hidden, inside, wide=wide)
+        _clear_shade(ridge, picture, needle)
+        path, strong = path_buffers(max_length)
+        # Hidden by the needle and what is next to it.
+        count = follow(ridge, start, dish, max_length, needle.length_px + 12.0, path, strong)
+        return ridge, path, strong, count, worth(path, strong, count)
+
+    ridge, path, strong, count, shown = walked(wide=False)
+    if shown < 0.5 * max_length and (other := walked(wide=True))[-1] > shown + 0.4 * max_length:
+        ridge, path, strong, count, _ = other
     count, crossings = resolve_crossings(ridge, dish, max_length, path, strong, count)
     if picture.mask is not None:
         above = cv2.subtract(ridge.strength, ridge.noise)
@@ -591,7 +610,9 @@ def without_needle(layer: Layer, needle: MeasuredNeedle) -> Gray:
     near = np.zeros_like(layer.pixels)
     # Up to two deviations of the blur beside the outline, light of the needle is mixed in.
     _draw_axis(near, needle, 0.0, length, 2.0 * math.ceil(half + 2.0 * BLUR_PX + 1.0))
-    u, v = cv2.findNonZero(near).reshape(-1, 2).T
+    left, top, width, height = cv2.boundingRect(near)
+    v, u = np.nonzero(near[top : top + height, left : left + width])
+    u, v = u + left, v + top
     s, d = needle.arc.coordinates(np.column_stack([u, v]).astype(float))
     own = half * (1.0 - (1.0 - THIN) * np.clip((s - (1.0 - TAPER) * length) / (TAPER * length), 0.0, 1.0))
     share = (_edge(own - d) - _edge(-own - d)) * _edge(s) * _edge(length - s)

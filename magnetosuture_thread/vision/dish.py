@@ -25,6 +25,7 @@ BINS = 72  # directions
 ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
 MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
+INNER_RADIUS = 0.82  # of the best supported ellipse, that the wall's inner edge has at least
 NORMALS, FINE_REACH = 180, 0.03  # along which the edge is measured; how far, of the radius
 
 RAYS, RIM_RAYS = 180, 72  # along which the rim is looked for, and of the quick check
@@ -115,7 +116,8 @@ def find_ellipse(image: np.ndarray) -> Ellipse | None:
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
     is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
     with the most votes, random samples of five edges give ellipses, and the one is kept that edges in the most
-    directions agree on, within a share of its radius. In the full image the edge is measured along its normals.
+    directions agree on, within a share of its radius. Of the edges of a wall and a lid the innermost is taken that is
+    about as well supported. In the full image the edge is measured along its normals.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3), uint8.
@@ -136,8 +138,8 @@ def find_ellipse(image: np.ndarray) -> Ellipse | None:
         found += [each for way in range(4) for each in _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)]
     if not found:
         return None
-    _, _, best = max(found, key=lambda each: each[0])
-    return _refined(image, best.scaled(image.shape[1] / small.shape[1]))
+    _, share, best = max(found, key=lambda each: each[0])
+    return _refined(image, _innermost(edges, best, share).scaled(image.shape[1] / small.shape[1]))
 
 
 def edge_along(gray: Gray, at: Ellipse, reach: float = FINE_REACH) -> Points:
@@ -273,7 +275,7 @@ def _around(edges: _Edges, moved: _Edges, centre: Points, back: np.ndarray) -> l
         if ellipse is None:
             continue
         share, seen = _support(edges, ellipse)
-        if seen >= 0.5 and share >= 0.6 + 0.5 * (1.0 - seen):  # Of a short arc chance is more.
+        if seen >= 0.5 and share >= _needed(seen):
             score = share * math.sqrt(seen) * (ellipse.major / min(edges.shape)) ** 0.25
             found.append((score, share, ellipse))
     return found
@@ -297,14 +299,43 @@ def _support(edges: _Edges, ellipse: Ellipse) -> tuple[float, float]:
     return float((marks & inside).sum() / inside.sum()), float(inside.mean())
 
 
+def _needed(seen: float) -> float:
+    """Return the support that an ellipse needs of which a share lies in the frame: of a short arc chance is more."""
+    return 0.6 + 0.5 * (1.0 - seen)
+
+
+def _innermost(edges: _Edges, best: Ellipse, support: float) -> Ellipse:
+    """Return the innermost of the edges within the best, whose support is given, that are about as well supported.
+
+    Wall and lid are at different heights: seen by a tilted camera their edges are not concentric.
+    """
+    inner, enough = best, 0.85 * support
+    for _ in range(4):  # edges of wall and lid
+        at, facing = edges.radii(inner)
+        away = np.hypot(*at.T)
+        outer = 1.0 - max(1.5 * AGREEMENT, 2.0 / inner.major)
+        least = INNER_RADIUS * best.major / inner.major
+        near = facing & (away > least) & (away < 1.0 + INNER_RADIUS - least)
+        near &= (away < outer) | (away > 2.0 - outer)  # not those of the one that is known
+        points = _through(at[near], max(0.8 / inner.major, AGREEMENT))
+        found = _fitted(inner.at(points)) if points is not None else None
+        if found is None or not INNER_RADIUS * best.major < found.major < 0.99 * inner.major:
+            break
+        share, seen = _support(edges, found)
+        if share < max(enough, _needed(seen)):
+            break
+        inner = found
+    return inner
+
+
 def _through(offsets: Points, tolerance: float) -> Points | None:
     """Return points of the ellipse near a centre that edges in the most directions agree on, by random samples of five.
 
         r(t) = c_0 + c_1 cos t + c_2 sin t + c_3 cos 2t + c_4 sin 2t
 
     Args:
-        offsets: of the edges from the centre, shape (m, 2) [px].
-        tolerance: between an edge and the ellipse [px].
+        offsets: of the edges from the centre, shape (m, 2).
+        tolerance: between an edge and the ellipse, in their unit.
 
     Returns:
         Offsets of `BINS` points from the centre, shape (BINS, 2); None where no edges agree.
@@ -653,8 +684,17 @@ def find_dish(gray: np.ndarray, diameter: float) -> DishView | None:
         (u, v, radius, _), _, ring = fitted
         if ring is not None and ring[3] >= SHARE_OF_RAYS * RAYS and math.dist(ring[:2], (u, v)) < AGREEMENT_PX:
             u, v = ring[:2]
+        elif _is_saturated(gray, (u, v), radius):  # Then the edge lies where the light makes it seem to.
+            continue
         return DishView((u, v), 0.5 * diameter / radius)
     return None
+
+
+def _is_saturated(gray: Gray, centre: tuple[float, float], radius: float) -> bool:
+    """Say whether the floor near the rim is as bright as the image can show."""
+    points, _ = Ellipse(centre, 0.93 * radius, 0.93 * radius, 0.0).points(64)
+    columns, rows = np.clip(np.rint(points).astype(int), 0, np.array(gray.shape[::-1]) - 1).T
+    return float(np.mean(gray[rows, columns] >= 253)) > 0.15
 
 
 def _fit_rim(gray: Gray, guess: tuple[float, float, float]) -> tuple[Circle, Points, Circle | None] | None:

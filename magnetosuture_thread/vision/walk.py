@@ -39,7 +39,7 @@ class Ridge(NamedTuple):
     faintest: float
 
 
-def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray) -> Ridge:
+def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray, *, wide: bool) -> Ridge:
     """Return how much darker an image is than the brightest background within a few pixels.
 
     An edge has no black-hat, so that shadows, covers and the rim are no thread.
@@ -48,9 +48,15 @@ def black_hat(gray: np.ndarray, hidden: np.ndarray, inside: np.ndarray) -> Ridge
         gray: shape (rows, columns), uint8.
         hidden: where nothing can be seen, not 0 there, of the same shape, uint8.
         inside: the dish, whose noise is measured, not 0 there, of the same shape, uint8.
+        wide: whether to look at half the size, for what is wider than a few pixels.
     """
+    size = gray.shape[1::-1]
+    if wide:
+        gray = cv2.resize(gray, (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     strength = cv2.morphologyEx(smoothed(gray), cv2.MORPH_BLACKHAT, kernel)
+    if wide:  # A plateau has no middle: smoothed, it has.
+        strength = cv2.resize(cv2.GaussianBlur(strength, (0, 0), 1.5), size, interpolation=cv2.INTER_LINEAR)
     some = strength[::5, ::5][inside[::5, ::5] > 0]
     noise = middle(some) if some.size else 0.0
     return Ridge(strength, hidden, noise, max(3.0, 3.0 * noise))

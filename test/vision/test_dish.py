@@ -76,3 +76,12 @@ def test_a_bright_rim_around_a_bright_floor_is_no_dark_field():
     assert find_dish(255 - clear, 0.035) is not None  # its negative looks like a dish
     found = see_dish(clear, VisionTrackerSettings(), 0.035)
     assert found is None or not found.dark_field
+
+
+def test_the_edge_of_an_overexposed_floor_gives_no_scale():
+    step = np.full((480, 640), 120, np.uint8)
+    cv2.circle(step, (322, 238), 200, 255, -1, cv2.LINE_AA)
+    assert find_dish(step, 0.035) is None
+    found = find_dish(np.minimum(step, 240), 0.035)
+    assert found is not None
+    assert found.metres_per_pixel == pytest.approx(0.0175 / 200.0, rel=6e-3)

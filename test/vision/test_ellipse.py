@@ -57,6 +57,15 @@ def test_an_ellipse_is_measured_to_a_part_of_a_pixel_whichever_side_is_brighter(
     assert found.minor == pytest.approx(given.minor, abs=0.5)
 
 
+@pytest.mark.parametrize("ratio", [0.93, 0.85])
+def test_of_the_edges_of_a_wall_and_a_lid_the_inner_one_is_the_dish(ratio: float):
+    lid, wall = (Ellipse((330.3, 238.6), radius, ratio * radius, 0.5 * math.pi) for radius in (195.0, 176.0))
+    frame = drawn(lid, (640, 480), 160, 120) + drawn(wall, (640, 480), 40, 0)
+    found = see_dish(frame, VisionTrackerSettings(), 0.035)
+    assert found is not None
+    assert found.view.metres_per_pixel == pytest.approx(0.0175 / 176.0, rel=0.01)
+
+
 def test_a_given_scale_that_differs_from_the_dish_by_up_to_a_tenth_gives_way_and_is_warned_of():
     frame = render(Pose(np.zeros(2), 0.3))
     for share, remark in ((1.02, False), (1.07, True), (0.94, True)):

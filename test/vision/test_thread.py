@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -28,19 +29,21 @@ SCALE = 8e-5
 DRAWN_VIEW = DishView((320.0, 240.0), SCALE)
 
 
-def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 140) -> np.ndarray:
-    """Return a bright image with a needle and a dark line."""
+def drawn(points: np.ndarray, width: int = 1, noise: float = 2.0, level: int = 140, needle: int = 5) -> np.ndarray:
+    """Return a bright image with a needle of a width and a dark line."""
     image = np.full((480, 640), 225, np.uint8)
     cv2.polylines(image, [np.round(points * 16).astype(np.int32)], False, level, width, cv2.LINE_AA, 4)
-    cv2.line(image, (300, 240), (387, 240), 50, 5)
+    cv2.line(image, (300, 240), (387, 240), 50, needle)
     rough = np.random.default_rng(0).normal(0.0, noise, image.shape)
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.8) + rough, 0, 255).astype(np.uint8)
 
 
-def walk(image: np.ndarray, max_length: float = 400.0, reach: float = 230.0) -> np.ndarray:
+def walk(
+    image: np.ndarray, max_length: float = 400.0, reach: float = 230.0, needle: MeasuredNeedle = NEEDLE
+) -> np.ndarray:
     """Follow the thread."""
     picture = prepare(image, DRAWN_VIEW, (reach + WALL_PX) * SCALE)
-    return find_centreline(picture, without_needle(picture.darkest, NEEDLE), NEEDLE, max_length)
+    return find_centreline(picture, without_needle(picture.darkest, needle), needle, max_length)
 
 
 def wave(length: float = 150.0) -> np.ndarray:
@@ -70,6 +73,16 @@ def test_it_follows_the_line_to_its_end_and_no_farther(noise: float, level: int)
     assert share > 0.97
     assert np.linalg.norm(found[-1] - wave()[-1]) < 6.0
     np.testing.assert_array_equal(found[0], NEEDLE.tail_px)
+
+
+@pytest.mark.parametrize("width", [3, 6, 8, 10])
+@pytest.mark.parametrize("level", [140, 80])
+def test_a_thread_wider_than_the_needle_is_followed_to_its_end(width: int, level: int):
+    image = drawn(wave(), width=width, level=level, needle=7)
+    found = walk(image, max_length=1.05 * arc_lengths(wave())[-1], needle=replace(NEEDLE, width_px=7.0))
+    mean, share = line_error(found, wave())
+    assert mean < 0.8
+    assert share > 0.97
 
 
 def test_it_stops_at_the_longest_length_and_at_the_wall():
