@@ -27,6 +27,7 @@ from magnetosuture_thread.setups import Setup
 MAX_TIME = 600.0  # s; of a run
 # What a run must keep to succeed, besides its goals.
 KEEP_OUT_TOLERANCE = 5e-6  # m
+PENETRATION_TOLERANCE = 1e-6  # m
 MAX_REST = 3.0  # s
 MAX_TIME_RATIO = 1.5
 
@@ -139,7 +140,7 @@ class RunFigures:
         strong = f"a tension {1e3 * tension:.3g} mN above the limit of its goal"
         checks = (
             ("min_needle_clearance_m", clearance < allowed, near),
-            ("max_thread_penetration_m", deep > 1e-6, within),  # m
+            ("max_thread_penetration_m", deep > PENETRATION_TOLERANCE, within),
             ("longest_rest_s", rest > MAX_REST, f"a rest of {rest:.1f} s ({MAX_REST:g} allowed)"),
             ("max_tension_n", tension > 0.0, strong),
             ("max_friction_nodes", friction > 0, f"{friction} more nodes under friction than its goal allows"),
