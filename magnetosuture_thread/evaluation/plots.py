@@ -85,17 +85,18 @@ def draw_summary(path: Path, photo: Photo, chosen: FrameResult, at: float, summa
     found = "frames tracked" if summary.source == "camera" else "recorded poses taken"
     title = f"{Path(summary.bag).name}, setup {summary.setup}: {summary.tracked} of {summary.frames} {found}"
     if summary.simulated:
-        title += f"; simulated: {summary.simulated}"
+        title += f"\nsimulated: {summary.simulated}"
     words = (
-        f"frame at {at:.2f} s, where the prediction is farthest from the measured thread. Wide: measured; magenta: "
+        f"frame at {at:.2f} s, where the prediction is farthest from the measured thread\nwide: measured; magenta: "
         "predicted; teal: estimated; dashed: ground truth; nodes: red at an obstacle to green 1 mm away"
     )
-    figure = Figure(figsize=(14.0, 7.6), dpi=110, facecolor="white")
+    figure = Figure(figsize=(14.0, 7.9), dpi=110, facecolor="white")
     nearest = int(np.argmin(chosen.clearance)) if np.isfinite(chosen.clearance).any() else len(chosen.vertices) - 1
-    _draw_dish_and_close_up(figure, photo, chosen, chosen.vertices[nearest], 2e-3, height=0.9)
+    _draw_dish_and_close_up(figure, photo, chosen, chosen.vertices[nearest], 2e-3, height=0.86)
     # With names from outside, and no mathematics in them.
-    figure.text(0.01, 0.96, printable(title), fontsize=12, color=INK, parse_math=False)
-    figure.text(0.01, 0.92, words, fontsize=9.5, color=INK)
+    lines = "\n".join(printable(line) for line in title.split("\n"))
+    figure.text(0.01, 0.985, lines, fontsize=12, color=INK, parse_math=False, va="top")
+    figure.text(0.01, 0.925, words, fontsize=9.5, color=INK, va="top")
     figure.savefig(path)
 
 
