@@ -18,6 +18,7 @@ import rclpy
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -191,8 +192,11 @@ def run(make: Callable[[], Node | tuple[Node, ...]], arguments: Sequence[str] | 
     except ExternalShutdownException:  # something else in this process has shut the context down
         return 0
     except Exception as error:
+        is_shut_down = not rclpy.ok()
+        if nodes and is_shut_down and isinstance(error, rclpy_implementation.RCLError):
+            return 0  # a callback was still at work when the context was shut down
         # rclpy raises several kinds, some private, for a broken file or parameter.
-        cannot_start = not nodes and (isinstance(error, ValueError) or not rclpy.ok())
+        cannot_start = not nodes and (isinstance(error, ValueError) or is_shut_down)
         if not (cannot_start or isinstance(error, (MagnetosutureError, ParameterException))):
             raise
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
