@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.campaign.loop import ClosedLoop, LoopFrame, LoopRecorder, Vector
+from magnetosuture_thread.campaign.truth import GoalTruth
 from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
@@ -20,6 +21,7 @@ from magnetosuture_thread.planning import executor
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
+from magnetosuture_thread.planning.verdict import centre_of, winding
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.setups import Setup
@@ -216,7 +218,7 @@ class RunExtremes:
         found.max_tension_excess_n = max(found.max_tension_excess_n, frame.tension - limits.tension)
         found.max_friction_excess = max(found.max_friction_excess, nodes - limits.friction_nodes)
         if self._wrap is not None:
-            swept = math.degrees(self._planner.swept_by(self._wrap.around, frame.thread))
+            swept = math.degrees(winding(frame.thread, centre_of(self._scene, self._wrap.around)))
             found.wrap_degrees = max(found.wrap_degrees, abs(swept))
         # Not wrapped at a half turn, over which noise would be a turn of the needle.
         self._angle += math.remainder(angle - self._angle, 2.0 * math.pi)
@@ -247,9 +249,9 @@ class RunResult:
 
     Attributes:
         seed: of the run.
-        success: whether all goals were reached, and all limits held.
+        success: whether all goals were reached, in truth too, and all limits held.
         reason: why not; empty if so.
-        reached: whether all goals were reached.
+        reached: whether all goals were reached, as far as the nodes know.
         goals_met: how many were.
         figures: of the run.
         simulated_s: simulated time that the run took, with the time before the procedure began.
@@ -318,7 +320,7 @@ def run_procedure(
     loop = ClosedLoop(setup, rig, pilot.compute_command, variation.seed, camera=camera, **truth)
     wraps = [goal for goal in procedure.goals if isinstance(goal, Wrap)]
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
-    figures = extremes.figures
+    figures, truth_of_goals = extremes.figures, GoalTruth(procedure, setup.scene)
     began, planned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
     reason = f"not done after {MAX_TIME:g} s"
     try:
@@ -328,6 +330,9 @@ def run_procedure(
                 continue
             running, path = execution.state is executor.ProcedureState.RUNNING, execution.path
             extremes.update(frame, running, execution.goal, None if path is None else path.middles)
+            middle, _ = planner.pose(frame.tail, np.array([math.cos(frame.heading), math.sin(frame.heading)]))
+            met = execution.goal if execution.state is not executor.ProcedureState.DONE else len(procedure.goals)
+            truth_of_goals.update(met, middle, frame.tail, frame.thread)
             if math.isnan(began) and running:
                 began, planned = frame.time, _planned_time(execution, frame)
             ahead = max(0.0, execution.travel - before)
@@ -341,7 +346,11 @@ def run_procedure(
     figures.time_s = rig.time - began if math.isfinite(began) else rig.time
     figures.ideal_time_s = planned * (weighted / way if way > 0.0 else 1.0)
     reached = execution.state is executor.ProcedureState.DONE
-    reasons = [*filter(None, [reason]), *figures.beyond_limits(setup.coils.keep_out).values()]
+    reasons = [
+        *filter(None, [reason]),
+        *truth_of_goals.failures(reached),
+        *figures.beyond_limits(setup.coils.keep_out).values(),
+    ]
     met = len(procedure.goals) if reached else execution.goal
     last, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
     words = "; ".join(reasons)
@@ -352,7 +361,8 @@ def _planned_time(execution: executor.ProcedureExecutor, frame: LoopFrame) -> fl
     """Return the time of the paths from here to the end at their goals' speeds [s]; 0, and end it, without a way."""
     heading = np.array([math.cos(frame.heading), math.sin(frame.heading)])
     try:
-        paths = execution.planner.plan_all(execution.procedure, *execution.planner.pose(frame.tail, heading))
+        pose = execution.planner.pose(frame.tail, heading)
+        paths = execution.planner.plan_all(execution.procedure, *pose, frame.condition.vertices)
     except PlanningError as error:
         execution.abort(str(error))
         return 0.0
@@ -360,9 +370,9 @@ def _planned_time(execution: executor.ProcedureExecutor, frame: LoopFrame) -> fl
 
 
 class _Pilot:
-    """Executes a procedure as the needle planner does: paths are ready 0.2 s after they are asked for.
+    """Executes a procedure as the needle planner does: paths are ready as long after they are asked for as that takes.
 
-    Planning takes 0.01 s in the open, 0.5 s through a gap and around a shape.
+    The time is counted by the states of the lattice that are looked at, so that a run is the same on any machine.
     """
 
     def __init__(self, procedure: Procedure, planner: NeedlePlanner) -> None:
@@ -377,5 +387,8 @@ class _Pilot:
         return self.executor.update(stamp, tail, heading, thread)
 
     def _submit(self, task: Callable[[], BodyPath]) -> executor.PendingPath:
-        due, path = self._now + 0.2, executor.plan_now(task)
+        before = self.executor.planner.looked
+        path = executor.plan_now(task)
+        # A core of a laptop looks at 500,000 states a second.
+        due = self._now + (self.executor.planner.looked - before) / 5e5
         return cast(executor.PendingPath, SimpleNamespace(done=lambda: self._now >= due - 1e-9, result=path.result))

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, chain
-from magnetosuture_thread.planning.procedure import Goal, GoTo, Procedure, Tighten, Withdraw, Wrap
+from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, place_of
+from magnetosuture_thread.planning.procedure import Goal, GoTo, PassThrough, Procedure, Tighten, Withdraw, Wrap
 from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
+from magnetosuture_thread.planning.verdict import GoalJudge, centre_of, winding
 
 Vector = NDArray[np.float64]
 
@@ -100,11 +101,9 @@ class Pursuit:
     Attributes:
         replans: new paths without progress since.
         detours: new paths without less to go than before.
-        misses: paths that ended off the goal's place.
+        misses: paths at whose end the goal was not met.
         left: minimum of the way to go so far [m].
         aim: from the goal's place to where its path is to end, shape (2,) [m].
-        swept: of a wrap so far [rad].
-        bearing: of the needle about the wrap's shape at the last pose [rad]; NaN before.
     """
 
     replans: int = 0
@@ -112,8 +111,6 @@ class Pursuit:
     misses: int = 0
     left: float = math.inf
     aim: Vector = field(default_factory=lambda: np.zeros(2))
-    swept: float = 0.0
-    bearing: float = math.nan
 
 
 class ProcedureExecutor:
@@ -123,9 +120,11 @@ class ProcedureExecutor:
     known well enough to go on, the needle is kept where it is: at a zero command the coils are off, and the thread
     pulls it away. A needle that is stalled while it is commanded (`RestDetector`) backs off, and its goal is
     planned anew; one that is off its path by more than `OFF_PATH` too. A path that ends off the place of its goal, as a
-    turn throws the needle aside, is followed by one that ends as far to the other side. After `MAX_REPLANS`,
-    `MAX_DETOURS` or `MAX_MISSES` the goal is given up, and the needle rests; so is a procedure that has waited too long
-    for the thread. A pause for the thread ends by itself once that is known again; one by `pause` lasts until `start`.
+    turn throws the needle aside, is followed by one that ends as far to the other side. Whether the needle has passed a
+    gap, and whether the thread winds about a shape, is judged by both as they are known (`GoalJudge`), not by the path.
+    After `MAX_REPLANS`, `MAX_DETOURS` or `MAX_MISSES` the goal is given up, and the needle rests; so is a procedure
+    that has waited too long for the thread. A pause for the thread ends by itself once that is known again; one by
+    `pause` lasts until `start`.
     Pure: time comes in with the poses.
 
     Args:
@@ -163,7 +162,17 @@ class ProcedureExecutor:
         self._speed = math.inf
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
+        self._handover = math.inf  # way on the present path, at which that of the next goal begins [m]
         self._waits_since = 0.0  # for the thread, since this stamp [s]
+        self._judge: GoalJudge | None = None
+        self._thread: Points | None = None  # as it was known last
+
+    @property
+    def judge(self) -> GoalJudge:
+        """What judges the goals."""
+        if self._judge is None:
+            self._judge = GoalJudge(self.procedure, self.planner.scene)
+        return self._judge
 
     @property
     def is_commanding(self) -> bool:
@@ -215,9 +224,10 @@ class ProcedureExecutor:
         self.planner = planner
         self._drop_path()
         self._holder = None
-        self.pursuit = replace(self.pursuit, left=math.inf, aim=np.zeros(2), bearing=math.nan)
+        self.pursuit = replace(self.pursuit, left=math.inf, aim=np.zeros(2))
         try:
-            planner.check(self.procedure)
+            planner.check(self.procedure, self.goal)
+            self._judge = self.judge.in_scene(planner.scene)
         except MagnetosutureError as error:
             self.abort(str(error))
 
@@ -233,8 +243,9 @@ class ProcedureExecutor:
         middle, angle = self._pose(tail, heading)
         self._begin = middle if self._begin is None else self._begin
         self._heed(stamp, thread)
+        self._thread = thread.vertices
         if self.state in (ProcedureState.RUNNING, ProcedureState.PAUSED):
-            self._sweep(middle)  # also by hand: else a wrap that was unwound in a pause would count
+            self.judge.update(middle, thread.vertices)  # also by hand: a wrap may be unwound in a pause
         if self.state is not ProcedureState.RUNNING:
             self._rest = RestDetector()
             if self.path is not None and self.resumes and thread.may_hold:
@@ -276,15 +287,27 @@ class ProcedureExecutor:
     def _pursue(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector | None:
         """Return the command on the path; None where that has ended, and the next one begins with the next pose."""
         goal = self.procedure.goals[self.goal]
-        is_met = isinstance(goal, Tighten) and self._is_tight(goal, thread)
-        if isinstance(goal, Wrap):
-            # The last 0.02 rad of a wrap may be left.
-            is_met = abs(goal.swept) - self.pursuit.swept * math.copysign(1.0, goal.swept) < 0.02
-        if is_met:
-            self._next_goal()
-            return None
+        on_the_way = self.path is not None and self._reached + 1 < len(self.path.ends)
+        is_met = self._is_tight(goal, thread) if isinstance(goal, Tighten) else self.judge.is_met
         assert self._tracker is not None
         assert self.path is not None
+        is_last = self.goal + 1 == len(self.procedure.goals)
+        # A thread may be wound or tight long before the end of the path, as its free end moves too.
+        is_far = self.path.ends[self._reached] > self.travel + 2.0 * PROGRESS
+        if is_met and is_far and (isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last)):
+            self._next_goal()
+            return None
+        if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
+            self._plan_ahead(goal)
+        elif self._pending is not None and self.travel >= self._handover:
+            if not self.judge.is_met:
+                self._pending = None
+            else:
+                self._begin_goal(self.goal + 1)
+                self._tracker = None
+                if not self._plan(middle, angle):
+                    return None
+                return self._pursue(stamp, middle, angle, thread)
         if self._tracker.travel > PROGRESS:
             self.pursuit.replans = 0
         if (left := self.path.length - self._tracker.travel) < self.pursuit.left - PROGRESS:
@@ -294,13 +317,18 @@ class ProcedureExecutor:
         if command.done:
             self._at_end(goal, middle)
             return None
-        if self._reached + 1 < len(self.path.ends) and command.travel >= self.path.ends[self._reached]:
+        if on_the_way and is_met and command.travel >= self.path.ends[self._reached]:
             self._begin_goal(self.goal + 1)
             self._reached += 1
+        elif on_the_way and command.travel > self.path.ends[self._reached] + 0.5 * PROGRESS:
+            self._miss(goal, middle)
+            return None
         commanded = bool(command.velocity.any())
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
-            self._replan(stamp, command.velocity if rests else np.zeros(2))
+            beside = self.planner.beside(middle, angle)
+            pulled = " with motion_compensation of the coil bridge off" if thread.drift == 0.0 else ""
+            self._replan(stamp, command.velocity if rests else np.zeros(2), f"{beside}{pulled}")
             return None
         return command.velocity
 
@@ -308,17 +336,30 @@ class ProcedureExecutor:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
         if isinstance(goal, Tighten):
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
-        elif isinstance(goal, GoTo | Withdraw) and math.dist(middle, self._place(goal)) > goal.tolerance:
-            self._miss(goal, self._place(goal) - middle)
+            return
+        assert self._begin is not None
+        if isinstance(goal, GoTo | Withdraw):
+            is_met = math.dist(middle, place_of(goal, self._begin)) <= goal.tolerance
         else:
+            is_met = self.judge.is_met
+        if is_met:
             self._next_goal()
+        else:
+            self._miss(goal, middle)
 
-    def _miss(self, goal: GoTo | Withdraw, off: Vector) -> None:
-        """Plan anew, to the other side of a goal's place, from which the needle has ended off."""
+    def _miss(self, goal: Goal, middle: Vector) -> None:
+        """Plan a goal anew that is not met at the end of its path; one of a place to the other side of that."""
         self.pursuit.misses += 1
+        off = np.zeros(2)
+        assert self._begin is not None
+        if isinstance(goal, GoTo | Withdraw):
+            off = place_of(goal, self._begin) - middle
         if self.pursuit.misses > MAX_MISSES:
-            by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
-            self.abort(f"goal {self.goal + 1} is given up: the needle misses its place {by}, however it is planned")
+            missing = self.judge.missing(self.goal) if isinstance(goal, PassThrough | Wrap) else ""
+            if isinstance(goal, GoTo | Withdraw):
+                by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
+                missing = f"the needle misses its place {by}"
+            self.abort(f"goal {self.goal + 1} is given up: {missing}, however it is planned")
             return
         assert self.path is not None
         aim, leeway = self.pursuit.aim + off, 0.5 * float(self.path.leeway[-1])  # a place that is off by less is free
@@ -328,15 +369,8 @@ class ProcedureExecutor:
     def _plan(self, middle: Vector, angle: float) -> bool:
         """Plan from a pose, or go on with that; return whether there is a path to track."""
         if self._pending is None:
-            goals = chain(self.procedure, self.goal)
-            assert self._begin is not None
-            left = goals[0].swept - self.pursuit.swept if isinstance(goals[0], Wrap) else None
-            limits = self.procedure.limits[self.goal]
-            if isinstance(goal := goals[0], GoTo | Withdraw):  # the last of its chain
-                x, y = (self._place(goal) + self.pursuit.aim).tolist()
-                goals = (replace(goal, position=(x, y)) if isinstance(goal, GoTo) else replace(goal, to=(x, y)),)
-            task = partial(self.planner.plan, goals, limits, middle, angle, self._begin.copy(), left)
-            self._pending = self._submit(task)
+            self._ask_for_path(self.goal, middle, angle)
+        assert self._pending is not None
         if not self._pending.done():
             return False
         pending, self._pending = self._pending, None
@@ -344,9 +378,24 @@ class ProcedureExecutor:
         self._tracker, self._reached = PathTracker(self.path, self.planner.coil_angles), 0
         return True
 
-    def _place(self, goal: GoTo | Withdraw) -> Vector:
-        """Return the place of a goal [m]."""
-        return np.array(goal.position if isinstance(goal, GoTo) else goal.to or self._begin)
+    def _plan_ahead(self, goal: Wrap) -> None:
+        """Plan the next goal while the needle goes on, where a wrap will be met before the end of its path.
+
+        A needle that waits for its path close to a coil's axis is pulled aside.
+        """
+        assert self.path is not None
+        self._handover = self.travel + PROGRESS
+        ways = np.linspace(self.travel, self._handover, 5)
+        poses = np.array([[*middle, angle] for middle, angle in map(self.path.at, ways)])
+        swept = winding(self.planner.led(np.empty((0, 2)), poses), centre_of(self.planner.scene, goal.around))
+        if self.judge.left_to_wind <= math.copysign(1.0, goal.swept) * swept:
+            self._ask_for_path(self.goal + 1, *self.path.at(self._handover))
+
+    def _ask_for_path(self, goal: int, middle: Vector, angle: float) -> None:
+        assert self._begin is not None
+        at = self.procedure, goal, middle, angle, self._begin.copy(), self._thread
+        known = (self.judge.crossed, self.pursuit.aim) if goal == self.goal else ()
+        self._pending = self._submit(partial(self.planner.plan, *at, *known))
 
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
@@ -361,27 +410,31 @@ class ProcedureExecutor:
         at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
         return self._holder.compute_command(*at, hold=True).velocity
 
-    def _replan(self, stamp: float, stopped: Vector) -> None:
+    def _replan(self, stamp: float, stopped: Vector, where: str) -> None:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
         self.pursuit.replans += 1
         self.pursuit.detours += 1
         if self.pursuit.replans > MAX_REPLANS or self.pursuit.detours > MAX_DETOURS:
-            self.abort(f"goal {self.goal + 1} is given up: the needle rests however it is planned")
+            what = "rests" if stopped.any() else "is off its path"
+            self.abort(f"goal {self.goal + 1} is given up: the needle {what}{where}, however it is planned")
             return
         self._drop_path()
         if stopped.any():
             self._back_off, self._back_off_until = -stopped, stamp + BACK_OFF_TIME
 
     def _next_goal(self) -> None:
-        """Plan the next goal from the next pose; or be done."""
+        """Plan the next goal from the next pose; or be done, unless the thread has slipped off a shape."""
         self._drop_path()
-        if self.goal + 1 == len(self.procedure.goals):
-            self.state = ProcedureState.DONE
-        else:
+        if self.goal + 1 < len(self.procedure.goals):
             self._begin_goal(self.goal + 1)
+        elif lost := self.judge.lost_wrap():
+            self.abort(lost)
+        else:
+            self.state = ProcedureState.DONE
 
     def _begin_goal(self, goal: int) -> None:
         self.goal, self.pursuit = goal, Pursuit()
+        self.judge.begin(goal)
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:
         """Return the speed at which tension and friction stay within the goal's limits [m/s]."""
@@ -400,16 +453,6 @@ class ProcedureExecutor:
             return True
         found = thread.vertices
         return found is not None and self.planner.thread_clearance(goal.around, found) <= goal.clearance
-
-    def _sweep(self, middle: Vector) -> None:
-        """Add up the angle that the needle sweeps about the shape of a wrap."""
-        goal = self.procedure.goals[self.goal]
-        if not isinstance(goal, Wrap):
-            return
-        bearing = self.planner.bearing(goal.around, middle)
-        if math.isfinite(self.pursuit.bearing):
-            self.pursuit.swept += math.remainder(bearing - self.pursuit.bearing, 2.0 * math.pi)
-        self.pursuit.bearing = bearing
 
     def _pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
         middle, angle = self.planner.pose(tail, heading)

@@ -2,7 +2,8 @@
 
 The needle is driven along its chord and turned about the chord's middle (`NeedleKinematics`), so a way is a sequence of
 straight drives, ahead or back, and of turns on the spot. The lattice has the middles on a square grid and 32 directions
-to other points of it. Where a way is to lead around a shape, the angle swept about that shape is a further coordinate.
+to other points of it. How often the way has crossed the line across a gap, or one from a shape to the wall, is a
+further coordinate: ways that differ in it go round the shapes differently.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from magnetosuture_thread.scene import Scene
 
 CELLS = 400  # of the clearance map across the dish
 STRIDE = 2  # of the clearance map's grid between two points of the lattice
-MAX_STATES = 20_000_000  # to look at
 NEAR_COST = 3.0  # of a way at the required clearance, more than at the preferred one
 _QUARTER = np.array([(1, 0), (3, 1), (2, 1), (3, 2), (1, 1), (2, 3), (1, 2), (1, 3)])
 _TURNS = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))
@@ -107,23 +107,52 @@ def body_clearance(x: float, y: float, angle: float, body: Points, near: Clearan
 
 
 class LatticeGoal(NamedTuple):
-    """Where a way may end.
+    """Where a way may end, and what it must have crossed by then.
 
     Attributes:
         allowed: at which points of the lattice the way may be, shape (m, m), rows along y.
         places: at which points of the lattice it may end, shape (m, m), rows along y.
         headings: which of the directions, shape (32,).
-        swept: angle that must have been swept about `centre`, positive counterclockwise [rad]; 0 for any.
-        centre: of the shape that the way leads around, shape (2,) [m].
+        cuts: lines that the way crosses, x and y of both ends, shape (k, 4) [m].
+        crossings: how often it must have crossed them, from their right to their left, less the other way round.
+        lag: how far behind the middle of the chord the point is that crosses them [m].
+        kept: lines that the middle crosses from left to right only where there is no other way, shape (k, 4) [m].
         target: a place that the goal is near, for the heuristic; NaN where there is none, shape (2,) [m].
     """
 
     allowed: NDArray[np.bool_]
     places: NDArray[np.bool_]
     headings: NDArray[np.bool_]
-    swept: float
-    centre: NDArray[np.float64]
+    cuts: NDArray[np.float64]
+    crossings: int
+    lag: float
+    kept: NDArray[np.float64]
     target: NDArray[np.float64]
+
+
+@compiled
+def count_crossings(cuts: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float) -> int:
+    """Return how often a step crosses lines from their right to their left, less the other way round.
+
+    Args:
+        cuts: x and y of both ends of each line, shape (k, 4) [m].
+        x: of the step's start [m].
+        y: of the same [m].
+        to_x: of its end [m].
+        to_y: of the same [m].
+    """
+    count = 0
+    for k in range(len(cuts)):
+        ax, ay = cuts[k, 0], cuts[k, 1]
+        ux, uy = cuts[k, 2] - ax, cuts[k, 3] - ay
+        before, after = ux * (y - ay) - uy * (x - ax), ux * (to_y - ay) - uy * (to_x - ax)
+        if (before >= 0.0) == (after >= 0.0):
+            continue
+        share = before / (before - after)
+        along = ux * (x + share * (to_x - x) - ax) + uy * (y + share * (to_y - y) - ay)
+        if 0.0 <= along <= ux * ux + uy * uy:
+            count += 1 if after >= 0.0 else -1
+    return count
 
 
 def turn_of(angles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,8 +199,8 @@ def search_lattice(
     preferred: float,
     goal: LatticeGoal,
     near: ClearanceMap,
-) -> NDArray[np.float64]:
-    """Return the cheapest way from a point of the lattice to the goal: x, y and direction of each state.
+) -> tuple[NDArray[np.float64], int]:
+    """Return the cheapest way from a point of the lattice to the goal, and how many states were looked at.
 
     The cost is the way of the tip, times `NEAR_COST` where the body is as close as it may be, falling to 1 where it is
     at the preferred clearance.
@@ -186,27 +215,24 @@ def search_lattice(
         near: distances from wall and shapes.
 
     Returns:
-        Shape (k, 3): x, y [m] and direction [rad]; empty where there is no way, or none was found
-        within `MAX_STATES`.
+        Of each state on the way x, y [m] and direction [rad], shape (k, 3); empty where there is no way, or none was
+        found among 20 million. And the number.
     """
     moves, directions = MOVES, DIRECTIONS
     count, size, step = len(directions), len(goal.places), STRIDE * near.step
-    sheets = math.ceil(abs(goal.swept) / (2.0 * math.pi)) + 2 if goal.swept != 0.0 else 1
+    sheets = goal.crossings + 2 if len(goal.cuts) > 0 else 1  # of net crossings, from -1 on
     cells = size * size * count
     cost = np.full(cells * sheets, np.inf, np.float32)
     parent = np.full(cells * sheets, -1, np.int32)
     done = np.zeros(cells * sheets, np.bool_)
     clear = np.full(cells, np.nan, np.float32)
-    sense = 1.0 if goal.swept >= 0.0 else -1.0
     guided = not math.isnan(goal.target[0])
 
-    x0, y0 = near.origin + step * start[0], near.origin + step * start[1]
-    begin = math.atan2(y0 - goal.centre[1], x0 - goal.centre[0])
     first = (start[1] * size + start[0]) * count + start[2] + (cells if sheets > 1 else 0)
     cost[first] = 0.0
     heap = [(0.0, first)]
     looked, last = 0, -1
-    while len(heap) > 0 and looked < MAX_STATES:
+    while len(heap) > 0 and looked < 20_000_000:  # which takes a minute at most
         _, state = heapq.heappop(heap)
         if done[state]:
             continue
@@ -216,13 +242,10 @@ def search_lattice(
         direction, place = cell % count, cell // count
         i, j = place % size, place // size
         x, y = near.origin + step * i, near.origin + step * j
-        angle = math.atan2(y - goal.centre[1], x - goal.centre[0])
-        ahead = (sense * (angle - begin)) % (2.0 * math.pi)  # of the start, on sheet 0 from 0 to 2 pi
-        if goal.places[j, i] and goal.headings[direction]:
-            swept = ahead + 2.0 * math.pi * (sheet - 1 if sheets > 1 else 0)
-            if goal.swept == 0.0 or swept >= abs(goal.swept) - 1e-9:
-                last = state
-                break
+        c, s = math.cos(directions[direction]), math.sin(directions[direction])
+        if goal.places[j, i] and goal.headings[direction] and (sheets == 1 or sheet - 1 >= goal.crossings):
+            last = state
+            break
         for choice in range(4):
             ni, nj, nd, nsheet = i, j, direction, sheet
             if choice < 2:
@@ -246,30 +269,31 @@ def search_lattice(
             room = clear[key]
             if room < required:
                 continue
-            if sheets > 1 and choice < 2:
-                there = math.atan2(ny - goal.centre[1], nx - goal.centre[0])
-                way = (there - angle + math.pi) % (2.0 * math.pi) - math.pi
-                later = (sense * (there - begin)) % (2.0 * math.pi)
-                turns = (ahead + sense * way - later) / (2.0 * math.pi)
-                nsheet = sheet + round(turns)
+            if sheets > 1:
+                nc, ns = math.cos(directions[nd]), math.sin(directions[nd])
+                behind = (x - goal.lag * c, y - goal.lag * s, nx - goal.lag * nc, ny - goal.lag * ns)
+                nsheet = sheet + count_crossings(goal.cuts, *behind)
                 if nsheet < 0 or nsheet >= sheets:
                     continue
+            undone = choice < 2 and len(goal.kept) > 0 and count_crossings(goal.kept, x, y, nx, ny) < 0
             following = nsheet * cells + key
-            onward = cost[state] + length * _nearness(room, required, preferred)
+            # A way that undoes what was done costs 1 m more: longer than any other way in a dish.
+            known = cost[state] + (1.0 if undone else 0.0)
+            onward = known + length * _nearness(room, required, preferred)
             if choice < 2 and onward < cost[following]:
                 # Most ways are no better than one that is known, whatever is halfway.
                 halfway = body_clearance(0.5 * (x + nx), 0.5 * (y + ny), directions[nd], body, near)
                 if halfway < required:
                     continue
-                onward = cost[state] + length * _nearness(min(room, halfway), required, preferred)
+                onward = known + length * _nearness(min(room, halfway), required, preferred)
             if onward < cost[following]:
                 cost[following] = onward
                 parent[following] = state
                 rest = math.hypot(nx - goal.target[0], ny - goal.target[1]) if guided else 0.0
                 heapq.heappush(heap, (float(onward) + rest, following))
     if last < 0:
-        return np.empty((0, 3))
-    return _way_to(last, parent, size, near.origin, step, directions)
+        return np.empty((0, 3)), looked
+    return _way_to(last, parent, size, near.origin, step, directions), looked
 
 
 SPACING = 1.0e-4  # m; of the tip's way between two poses
@@ -329,29 +353,29 @@ def smooth_path(
     """Return the path through the states of the lattice, its corners rounded as far as the clearance allows.
 
     Args:
-        states: x, y [m] and direction [rad] of each, shape (k, 3); the first and the last stay.
-        ends: index of the state at which each goal is reached, shape (g,).
+        states: x, y [m] and direction [rad] of each, shape (k, 3); the first and those of the goals stay.
+        ends: index of the state at which each goal is reached, shape (g,), rising; the last is that of the last state.
         lever: half of the needle's chord [m].
         body: points of the needle's axis, see `body_clearance`.
         required: clearance of the body [m].
         margin: how much more than that is kept on the path [m].
         near: distances from wall and shapes.
     """
-    coarse = BodyPath(states[:, :2], np.unwrap(states[:, 2]), lever, np.zeros(len(states)), np.zeros(0))
-    count = max(2, math.ceil(coarse.length / SPACING) + 1)
-    at = np.linspace(0.0, coarse.length, count)
-    dense = np.column_stack(
-        [
-            *(np.interp(at, coarse.travel, column) for column in coarse.middles.T),
-            np.interp(at, coarse.travel, coarse.angles),
-        ]
-    )
-    _relax(dense, body, required + margin, required + margin + PREFERRED, near)
-    dense = _filtered(dense, body, required + margin, near)
-    leeway = np.array([body_clearance(x, y, angle, body, near) for x, y, angle in dense]) - required
-    smooth = BodyPath(dense[:, :2].copy(), dense[:, 2].copy(), lever, np.maximum(leeway, 0.0), np.zeros(0))
-    # The poses of a goal have moved with the smoothing, but are still those with the same numbers.
-    return replace(smooth, ends=np.interp(coarse.travel[ends], at, smooth.travel))
+    poses, reached, first = [states[:1]], [], 0
+    states = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
+    for end in ends.tolist():
+        part = states[first : end + 1]
+        coarse = BodyPath(part[:, :2], part[:, 2], lever, np.zeros(len(part)), np.zeros(0))
+        at = np.linspace(0.0, coarse.length, max(2, math.ceil(coarse.length / SPACING) + 1))
+        dense = np.column_stack([np.interp(at, coarse.travel, column) for column in part.T])
+        _relax(dense, body, required + margin, required + margin + PREFERRED, near)
+        poses.append(_filtered(dense, body, required + margin, near)[1:])
+        reached.append(sum(map(len, poses)) - 1)
+        first = end
+    found = np.vstack(poses)
+    leeway = np.array([body_clearance(x, y, angle, body, near) for x, y, angle in found]) - required
+    smooth = BodyPath(found[:, :2].copy(), found[:, 2].copy(), lever, np.maximum(leeway, 0.0), np.zeros(0))
+    return replace(smooth, ends=smooth.travel[reached])
 
 
 def turning_points(middles: Points, angles: NDArray[np.float64], lever: float) -> list[tuple[int, float]]:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
 from magnetosuture_thread.geometry.needle_arc import needle_points
-from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
@@ -39,12 +39,14 @@ from magnetosuture_thread.planning.procedure import (
     Withdraw,
     Wrap,
 )
+from magnetosuture_thread.planning.verdict import centre_of, gap_lines, lines_of_pass, solid_of, winding
 from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import Scene, SceneShape
+from magnetosuture_thread.scene import WALL_NAME, Scene
 
 Vector = NDArray[np.float64]
 
 MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
+WRAP_LEAD = 0.1  # rad; that the needle goes on after a wrap, as the thread follows it
 PLACE_SHARE, PLACE_STEPS = 0.7, 0.75  # of a goal's tolerance, and of the lattice: how far from its place a way may end
 
 
@@ -61,21 +63,6 @@ class PlanningError(MagnetosutureError):
         self.goal = goal
 
 
-@dataclass(frozen=True, eq=False)
-class Gap:
-    """The narrowest place between two shapes.
-
-    Attributes:
-        centre: midway between them, shape (2,) [m].
-        along: unit vector that it is passed along, shape (2,).
-        width: between the shapes [m].
-    """
-
-    centre: Vector
-    along: Vector
-    width: float
-
-
 class NeedlePlanner:
     """Plans paths of the needle's body through a scene.
 
@@ -85,6 +72,9 @@ class NeedlePlanner:
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
         coil_angles: direction of each coil from the dish's centre [rad], for `PathTracker`.
+
+    Attributes:
+        looked: states of the lattice that were looked at so far.
 
     Raises:
         ConfigurationError: the needle has no room in the dish.
@@ -113,6 +103,7 @@ class NeedlePlanner:
         self.body = np.ascontiguousarray((axis - self.lever * along) @ turn.T)
         self._step = STRIDE * self.near.step
         self._size = CELLS // STRIDE + 1
+        self.looked = 0
         self._ways: dict[tuple[object, ...], Points] = {}  # found, by what was searched
 
     def pose(self, tail: Vector, heading: Vector) -> tuple[Vector, float]:
@@ -120,50 +111,66 @@ class NeedlePlanner:
         along = self.needle.chord_direction(heading)
         return tail + self.lever * along, math.atan2(float(along[1]), float(along[0]))
 
-    def check(self, procedure: Procedure) -> None:
+    def check(self, procedure: Procedure, first: int = 0) -> None:
         """Refuse what can be seen to be impossible without planning.
 
+        Args:
+            procedure: its goals.
+            first: index of the goal from which on they are still to be reached.
+
         Raises:
-            ConfigurationError: a name is not of the scene, a place is not free, a gap is too narrow or not there, the
-                thread is too short for wraps that follow each other, or a tension is over the goal's own limit.
+            ConfigurationError: a name is not of the scene, a place is not free, a gap is blocked, too narrow or not
+                there, the thread is too short for all wraps, a wrap undoes one before, there is nothing to tighten, or
+                a tension is over the goal's own limit.
         """
-        _check_procedure(procedure, self)
+        _check_procedure(procedure, self, first)
 
     def plan(
         self,
-        goals: Sequence[Goal],
-        limits: ProcedureLimits,
+        procedure: Procedure,
+        first: int,
         middle: Vector,
         angle: float,
         start: Vector,
-        swept: float | None = None,
+        thread: Points | None = None,
+        crossed: int = 0,
+        aim: Vector | None = None,
     ) -> BodyPath:
-        """Return a path from a pose through goals, one after the other.
+        """Return a path from a pose through the goals of a `chain`.
 
         Args:
-            goals: to reach.
-            limits: on the way.
+            procedure: whose goals they are.
+            first: index of the first of them.
             middle: of the chord, shape (2,) [m]; see `pose`.
             angle: of the chord [rad].
             start: where the procedure began, shape (2,) [m].
-            swept: what is left to sweep of the first goal, a wrap [rad]; all of it if None.
+            thread: the tail first, shape (n + 1, 2) [m]; one that winds about nothing if None.
+            crossed: how often the needle has passed the gap of the first goal since that began.
+            aim: from the place of the first goal to where the path is to end, shape (2,) [m].
 
         Raises:
             PlanningError: there is no way to one of them.
         """
+        goals, limits = chain(procedure, first), procedure.limits[first]
+        if isinstance(goal := goals[0], GoTo | Withdraw) and aim is not None:  # the last of its chain
+            x, y = (place_of(goal, start) + aim).tolist()
+            goals = (replace(goal, position=(x, y)) if isinstance(goal, GoTo) else replace(goal, to=(x, y)),)
         required = max(self.keep_out, limits.clearance)
-        targets = [self._lattice_goal(goal, start, None if index else swept) for index, goal in enumerate(goals)]
         for margin in MARGINS:
             states, ends, at = np.empty((0, 3)), [], self._nearest_free(middle, angle, required + margin)
-            for target in targets:
+            lies = np.empty((0, 2)) if thread is None else thread
+            for index, goal in enumerate(goals, first):
                 if at is None:
                     break
-                found = self._search(target, required + margin, at)
+                found = self._way(
+                    procedure, index, goal, start, at, lies, crossed if index == first else 0, required + margin
+                )
                 if not len(found):
                     at = None
                     break
                 states = np.vstack([states, found])
                 ends.append(len(states))
+                lies = self.led(lies, found)
                 at = self._state_of(found[-1])
             if at is not None and (last := self._end_of(goals[-1], start, states[-1], required + margin)) is not None:
                 states = np.vstack([states, last])
@@ -176,6 +183,17 @@ class NeedlePlanner:
         where, kept = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm", f"{1e3 * required:.3g} mm around it"
         raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}, with {kept}", len(ends))
 
+    def led(self, thread: Points, poses: Points) -> Points:
+        """Return where a thread lies after the needle has led it: along the tail's way, and then where it lay before.
+
+        Args:
+            thread: before, the tail first, shape (n, 2) [m].
+            poses: x, y [m] and angle [rad] of the needle's chord on the way, shape (k, 3).
+        """
+        tails = poses[:, :2] - self.lever * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+        line = np.vstack([tails[::-1], thread])
+        return line[: int(np.searchsorted(arc_lengths(line), self.thread_length)) + 1]
+
     def standing_path(self, middle: Vector, angle: float, limits: ProcedureLimits) -> BodyPath:
         """Return a path of one pose, in which the needle stays, with the leeway that it has there."""
         near = body_clearance(float(middle[0]), float(middle[1]), angle, self.body, self.near)
@@ -183,8 +201,16 @@ class NeedlePlanner:
         twice = np.tile(middle, (2, 1)), np.full(2, angle)
         return BodyPath(*twice, self.lever, np.full(2, leeway), np.zeros(1))
 
-    def plan_all(self, procedure: Procedure, middle: Vector, angle: float) -> tuple[BodyPath, ...]:
+    def plan_all(
+        self, procedure: Procedure, middle: Vector, angle: float, thread: Points | None = None
+    ) -> tuple[BodyPath, ...]:
         """Return the paths that a procedure will take, each through the goals of one `chain`.
+
+        Args:
+            procedure: whose goals they are.
+            middle: of the needle's chord now, shape (2,) [m]; see `pose`.
+            angle: of the chord [rad].
+            thread: the tail first, shape (n + 1, 2) [m]; one that winds about nothing if None.
 
         Raises:
             ConfigurationError: see `check`.
@@ -193,68 +219,34 @@ class NeedlePlanner:
         self.check(procedure)
         start = middle
         paths: list[BodyPath] = []
-        for index, goals in chains(procedure):
+        for index, _ in chains(procedure):
             try:
-                paths.append(self.plan(goals, procedure.limits[index], middle, angle, start))
+                path = self.plan(procedure, index, middle, angle, start, thread)
             except PlanningError as error:
                 raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
-            middle, angle = paths[-1].middles[-1], float(paths[-1].angles[-1])
+            poses = np.column_stack([path.middles, path.angles])
+            thread = self.led(np.empty((0, 2)) if thread is None else thread, poses)
+            middle, angle = path.middles[-1], float(path.angles[-1])
+            paths.append(path)
         return tuple(paths)
 
-    def gaps(self, goal: PassThrough) -> list[Gap]:
-        """Return the gaps between the two shapes that are passed along the goal's direction."""
-        wanted = np.array(goal.direction) / math.hypot(*goal.direction)
-        found = [
-            replace(gap, along=math.copysign(1.0, float(gap.along @ wanted)) * gap.along)
-            for gap in self.gaps_between(*goal.between)
-            if abs(gap.along @ wanted) >= 0.5
-        ]
-        least = min((gap.width for gap in found), default=0.0)
-        return [gap for gap in found if gap.width <= 2.0 * least]
-
-    def gaps_between(self, first_name: str, second_name: str) -> list[Gap]:
-        """Return the narrowest places between two shapes, each passed along its direction or against it."""
-        first, second = (map_clearance(self.scene, (name,)).distance for name in (first_name, second_name))
-        width, step = first + second, self.near.step
-        midway = (np.abs(first - second) <= 1.5 * step) & (self.near.distance >= 0.45 * width)
-        if not midway.any():
-            return []
-        # Up to 1.03 of its least width it is one gap.
-        narrow = midway & (width <= ndimage.minimum_filter(np.where(midway, width, np.inf), 9) * 1.03)
-        labels, count = ndimage.label(narrow, np.ones((3, 3)))
-        slope = np.asarray(np.gradient(first - second))
-        found = []
-        for label in range(1, count + 1):
-            rows, columns = np.nonzero(labels == label)
-            narrowest = float(width[rows, columns].min())
-            across = np.array([slope[1][rows, columns].mean(), slope[0][rows, columns].mean()])
-            if not (size := math.hypot(*across)) > 0.0:
-                continue
-            along = np.array([-across[1], across[0]]) / size
-            # The middle of the gap along its direction, on the line midway between the shapes.
-            points = self.near.origin + step * np.column_stack([columns, rows])
-            found.append(Gap(points.mean(axis=0), along, narrowest))
-        return found
+    def beside(self, middle: Vector, angle: float) -> str:
+        """Return in words what a needle in a pose is as close to as it may be; empty for nothing."""
+        c, s = math.cos(angle), math.sin(angle)
+        axis = shapely.LineString(self.body @ np.array([[c, s], [-s, c]]) + middle)
+        away = {name: axis.distance(solid_of(self.scene, name)) for name in (WALL_NAME, *self.scene.names)}
+        name = min(away, key=lambda name: away[name])
+        return f" beside {name}" if away[name] <= self.keep_out + self.near.step else ""
 
     def thread_clearance(self, name: str, thread: Points) -> float:
         """Return the greatest distance from a shape of the part of a thread that sweeps the most about it [m]."""
-        centre = self._centre(name)
+        centre = centre_of(self.scene, name)
         turns = np.unwrap(np.arctan2(*(thread - centre).T[::-1]))
         sense = math.copysign(1.0, turns[-1] - turns[0])
         # The part between the least and the greatest angle.
         first, last = sorted((int(np.argmin(sense * turns)), int(np.argmax(sense * turns))))
         from_shape = map_clearance(self.scene, (name,))
         return max(clearance_at(x, y, from_shape) for x, y in thread[first : last + 1].tolist())
-
-    def bearing(self, name: str, point: Vector) -> float:
-        """Return the direction of a point from the centre of a shape [rad]."""
-        x, y = point - self._centre(name)
-        return math.atan2(float(y), float(x))
-
-    def swept_by(self, name: str, points: Points) -> float:
-        """Return the angle that a polyline sweeps about a shape from its first point to its last [rad]."""
-        turns = np.unwrap(np.arctan2(*(points - self._centre(name)).T[::-1]))
-        return float(turns[-1] - turns[0])
 
     def _search(self, goal: LatticeGoal, kept: float, start: NDArray[np.int64]) -> Points:
         """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none."""
@@ -264,9 +256,9 @@ class NeedlePlanner:
             # 32 ways are kept.
             if len(self._ways) >= 32:
                 self._ways.clear()
-            found = self._ways[key] = search_lattice(
-                start, self.body, self.lever, kept, kept + PREFERRED, goal, self.near
-            )
+            found, looked = search_lattice(start, self.body, self.lever, kept, kept + PREFERRED, goal, self.near)
+            self._ways[key] = found
+            self.looked += looked
         return found  # kept or not: another thread may have cleared what is kept
 
     def _state_of(self, state: Vector) -> NDArray[np.int64]:
@@ -288,44 +280,150 @@ class NeedlePlanner:
                         best, found = off, np.array([i, j, k])
         return found
 
-    def _lattice_goal(self, goal: Goal, start: Vector, swept: float | None) -> LatticeGoal:
-        everywhere, nowhere = np.ones((self._size, self._size), bool), np.full(2, np.nan)
-        any_heading = np.ones(len(DIRECTIONS), bool)
+    def _way(
+        self,
+        procedure: Procedure,
+        index: int,
+        goal: Goal,
+        start: Vector,
+        state: NDArray[np.int64],
+        thread: Points,
+        crossed: int,
+        kept: float,
+    ) -> Points:
+        """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none.
+
+        A thread that is led around a shape loses what its free end wound about it before: the angle that is swept is
+        corrected by that of the thread as it will lie.
+        """
+        found, more = np.empty((0, 3)), 0.0
+        for _ in range(3):
+            target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
+            found = self._search(target, kept, state)
+            if not isinstance(goal, Wrap) or not len(found):
+                break
+            short = self._left_to_wind(procedure, index, goal, self.led(thread, found))
+            if abs(short) <= WRAP_LEAD:
+                break
+            more += short
+        return found
+
+    def _left_to_wind(self, procedure: Procedure, index: int, goal: Wrap, thread: Points) -> float:
+        """Return the angle, in its sense, that a wrap still asks of a thread, with what the needle goes on [rad]."""
+        missing = procedure.windings[index] - winding(thread, centre_of(self.scene, goal.around))
+        return math.copysign(1.0, goal.swept) * missing + WRAP_LEAD
+
+    def _lattice_goal(
+        self,
+        procedure: Procedure,
+        index: int,
+        goal: Goal,
+        start: Vector,
+        state: NDArray[np.int64],
+        thread: Points,
+        crossed: int,
+        more: float,
+    ) -> LatticeGoal:
+        """Return what a goal asks of the lattice.
+
+        See `plan`; the way to it begins at `state`, and a wrap is to sweep `more` than what is left of it [rad].
+        """
+        everywhere, any_heading = np.ones((self._size, self._size), bool), np.ones(len(DIRECTIONS), bool)
+        middle = np.asarray(self.near.origin + self._step * state[:2])
+        kept = self._done(procedure, index, middle, thread)
+        anything = LatticeGoal(everywhere, everywhere, any_heading, kept[:0], 0, 0.0, kept, np.full(2, np.nan))
         if isinstance(goal, Wrap):
-            wanted = goal.swept if swept is None else swept
-            return LatticeGoal(
-                self._in_view_of(goal.around), everywhere, any_heading, wanted, self._centre(goal.around), nowhere
-            )
+            sense = math.copysign(1.0, goal.swept)
+            left = self._left_to_wind(procedure, index, goal, thread) + more
+            if left <= WRAP_LEAD:
+                return anything
+            # The tail, which leads the thread, crosses a line from the shape to beyond the wall, where the wrap ends.
+            direction = DIRECTIONS[state[2]]
+            tail = middle - self.lever * np.array([math.cos(direction), math.sin(direction)])
+            cuts = self._ray(goal.around, tail, sense, left).reshape(1, 4)
+            turns = math.ceil(left / (2.0 * math.pi))
+            allowed = self._in_view_of(goal.around)
+            return anything._replace(allowed=allowed, cuts=cuts, crossings=turns, lag=self.lever)
         at = self.near.origin + self._step * np.arange(self._size)
         x, y = np.meshgrid(at, at)
         if isinstance(goal, PassThrough):
+            if crossed >= 1:
+                return anything
+            lines = lines_of_pass(self.scene, goal)
             places, headings = np.zeros_like(everywhere), np.zeros(len(DIRECTIONS), bool)
-            for gap in self.gaps(goal):
-                dx, dy = x - gap.centre[0], y - gap.centre[1]
-                ahead, aside = dx * gap.along[0] + dy * gap.along[1], dy * gap.along[0] - dx * gap.along[1]
-                places |= (ahead >= 0.0) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * gap.width)
-                off = np.abs(turn_of(DIRECTIONS - math.atan2(gap.along[1], gap.along[0])))
+            for first, second in lines:
+                (across_x, across_y), width = (second - first) / math.dist(first, second), math.dist(first, second)
+                dx, dy = x - 0.5 * (first[0] + second[0]), y - 0.5 * (first[1] + second[1])
+                ahead, aside = dy * across_x - dx * across_y, dx * across_x + dy * across_y
+                # Beyond the line by a step, so that nobody doubts the pass.
+                places |= (ahead >= self._step) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * width)
                 # The needle may be 0.8 rad off the direction of a gap while it passes.
-                headings |= off <= 0.8
-            return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), nowhere)
-        place, tolerance = start, self._step
-        headed: tuple[float, ...] = ()
-        if isinstance(goal, GoTo):
-            place, tolerance, headed = np.array(goal.position), goal.tolerance, goal.heading
-        elif isinstance(goal, Tighten):
-            place = np.array(goal.toward)
-        else:
-            place, tolerance = np.array(goal.to) if goal.to else start, goal.tolerance
+                headings |= np.abs(turn_of(DIRECTIONS - math.atan2(across_x, -across_y))) <= 0.8
+            cuts = np.reshape(lines, (-1, 4))
+            return anything._replace(places=places, headings=headings, cuts=cuts, crossings=1 - crossed)
+        place, tolerance = place_of(goal, start), self._step if isinstance(goal, Tighten) else goal.tolerance
         # At least the nearest point of the lattice.
         places = np.hypot(x - place[0], y - place[1]) <= max(PLACE_SHARE * tolerance, PLACE_STEPS * self._step)
+        headed = goal.heading if isinstance(goal, GoTo) else ()
         headings = np.abs(turn_of(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
-        return LatticeGoal(everywhere, places, headings, 0.0, np.zeros(2), place)
+        return anything._replace(places=places, headings=headings, target=place)
+
+    def _ray(self, name: str, point: Vector, sense: float, angle: float) -> Points:
+        """Return the line from a shape to beyond the wall that a point crosses after it has swept an angle about it.
+
+        Args:
+            name: of the shape.
+            point: shape (2,) [m].
+            sense: of the angle: 1 counterclockwise, -1 clockwise. The line is crossed in this sense from right to left.
+            angle: [rad].
+        """
+        centre = centre_of(self.scene, name)
+        end = math.atan2(*(point - centre)[::-1]) + sense * angle
+        line = np.array([centre, centre + 2.0 * self.scene.dish.diameter * np.array([math.cos(end), math.sin(end)])])
+        return line if sense > 0.0 else line[::-1]
+
+    def _done(self, procedure: Procedure, index: int, middle: Vector, thread: Points) -> Points:
+        """Return the lines by whose crossing back a goal would undo what was done before, shape (k, 4) [m].
+
+        They are across the gaps that were passed, but on the way out, and where the thread would wind half a turn less
+        about a shape than it is to.
+        """
+        goals, goal = procedure.goals[:index], procedure.goals[index]
+        passed = {frozenset(done.between): done for done in goals if isinstance(done, PassThrough)}
+        if isinstance(goal, PassThrough):
+            passed.pop(frozenset(goal.between), None)
+        lines = [line for done in passed.values() for line in lines_of_pass(self.scene, done)]
+        lines = [] if isinstance(goal, Withdraw) else lines
+        wraps = {done.around: k for k, done in enumerate(goals) if isinstance(done, Wrap)}
+        for name, k in wraps.items():
+            sense = math.copysign(1.0, procedure.windings[k])
+            room = sense * (winding(thread, centre_of(self.scene, name)) - procedure.windings[k]) + math.pi
+            if room > 0.0 and not (isinstance(goal, Wrap) and goal.around == name):
+                lines.append(self._ray(name, middle, sense, -min(room, 1.5 * math.pi)))
+        return np.reshape(np.array(lines, np.float64), (-1, 4))
+
+    def length_around(self, windings: Mapping[str, float]) -> float:
+        """Return the length of thread that winds about shapes and leads from each to the next, at the least [m].
+
+            max(max_k l_k |w_k|, sum_k l_k max(0, |w_k| - pi) + sum_k d(k, k + 1)),    l_k = girth_k / 2 pi
+
+        A thread that is straight winds by up to pi, past a shape that other parts of it are wrapped around.
+
+        Args:
+            windings: about each shape, in the order of the wraps [rad].
+        """
+        solids = [solid_of(self.scene, name) for name in windings]
+        radii = [float(solid.convex_hull.length) / (2.0 * math.pi) for solid in solids]
+        angles = [abs(angle) for angle in windings.values()]
+        alone = max((radius * angle for radius, angle in zip(radii, angles, strict=True)), default=0.0)
+        around = sum(radius * max(0.0, angle - math.pi) for radius, angle in zip(radii, angles, strict=True))
+        return max(alone, around + sum(float(first.distance(second)) for first, second in pairwise(solids)))
 
     def _end_of(self, goal: Goal, start: Vector, state: Vector, kept: float) -> Vector | None:
         """Return the pose that a goal asks for, near a state of the lattice; None for none, or if it is not free."""
         if not isinstance(goal, GoTo | Withdraw) or PLACE_SHARE * goal.tolerance >= PLACE_STEPS * self._step:
             return None  # a state of the lattice is near enough
-        x, y = goal.position if isinstance(goal, GoTo) else goal.to or start.tolist()
+        x, y = place_of(goal, start).tolist()
         angle = float(state[2])
         if isinstance(goal, GoTo) and goal.heading:
             angle += math.remainder(goal.heading[0] - angle, 2.0 * math.pi)
@@ -350,15 +448,16 @@ class NeedlePlanner:
             free &= blocking[at[0], at[1]] > 0.0
         return np.asarray(free)
 
-    def _centre(self, name: str) -> Vector:
-        return np.array(self._shape(name).solid.centroid.coords[0])
 
-    def girth(self, name: str) -> float:
-        """Return the length of a thread that lies around a shape once [m]."""
-        return float(self._shape(name).solid.convex_hull.length)
+def place_of(goal: GoTo | Tighten | Withdraw, start: Vector) -> Vector:
+    """Return the place that a goal brings the needle's middle to, shape (2,) [m].
 
-    def _shape(self, name: str) -> SceneShape:
-        return next(shape for shape in self.scene.shapes if shape.name == name)
+    Args:
+        goal: what is to be reached.
+        start: where the procedure began, shape (2,) [m].
+    """
+    place = goal.position if isinstance(goal, GoTo) else goal.toward if isinstance(goal, Tighten) else goal.to
+    return np.array(place) if place else start
 
 
 def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:
@@ -389,53 +488,95 @@ def planned_duration(procedure: Procedure, paths: Sequence[BodyPath]) -> float:
     )
 
 
-def _check_procedure(procedure: Procedure, planner: NeedlePlanner) -> None:
-    wrapped: defaultdict[str, float] = defaultdict(float)  # about each shape, by the wraps one after the other
+def _check_procedure(procedure: Procedure, planner: NeedlePlanner, first: int) -> None:
+    wrapped: dict[str, float] = {}  # what the thread winds about each shape, the last one last [rad]
     for index, (goal, limits) in enumerate(zip(procedure.goals, procedure.limits, strict=True)):
         where, required = f"goals[{index}].{goal.GROUP}", max(planner.keep_out, limits.clearance)
-        if not isinstance(goal, Wrap):
-            wrapped.clear()  # another goal may unwind the thread
-        if isinstance(goal, PassThrough):
-            _check_gap(planner, where, goal, required)
-        elif isinstance(goal, Wrap):
+        if isinstance(goal, Wrap):
             _check_name(planner, f"{where}.around", goal.around)
-            wrapped[goal.around] += goal.swept
-            needed = sum(abs(angle) / (2.0 * math.pi) * planner.girth(name) for name, angle in wrapped.items())
-            if needed > planner.thread_length:
-                before = ", with the wraps before it" if index and isinstance(procedure.goals[index - 1], Wrap) else ""
-                expected = f"an angle for which {1e3 * planner.thread_length:.3g} mm of thread are enough{before}"
-                raise ConfigurationError(f"{where}.angle", goal.angle, expected)
+            if wrapped.pop(goal.around, 0.0) * goal.swept < 0.0:
+                sense = "clockwise" if goal.swept > 0.0 else "counterclockwise"
+                raise ConfigurationError(f"{where}.sense", goal.sense, f"{sense}, as {goal.around} is wrapped before")
+            wrapped[goal.around] = procedure.windings[index]
+            needed, length = planner.length_around(wrapped), planner.thread_length
+            if needed > length:
+                whole = " with the wraps before" if len(wrapped) > 1 or goal.swept != procedure.windings[index] else ""
+                expected = f"an angle for which {1e3 * length:.3g} mm of thread are enough{goal.in_radians}"
+                raise ConfigurationError(
+                    f"{where}.angle", f"{goal.angle:g} rad, {1e3 * needed:.3g} mm of thread{whole}", expected
+                )
         elif isinstance(goal, Tighten):
-            if goal.around:
-                _check_name(planner, f"{where}.around", goal.around)
-            if goal.tension > limits.tension:
-                expected = f"at most the limit of the tension, {limits.tension:.3g} N"
-                raise ConfigurationError(f"{where}.tension", goal.tension, expected)
-            _check_place(planner, f"{where}.toward", goal.toward, required)
+            _check_tighten(planner, where, goal, limits, required, wrapped)
+        elif index < first:
+            continue
+        elif isinstance(goal, PassThrough):
+            _check_gap(planner, where, goal, required)
         elif isinstance(goal, GoTo):
             _check_place(planner, f"{where}.position", goal.position, required)
             if goal.heading:
                 _check_place(planner, f"{where}.position", goal.position, required, goal.heading[0])
-        elif isinstance(goal, Withdraw) and goal.to:
+        elif goal.to:
             _check_place(planner, f"{where}.to", goal.to, required)
 
 
+def _check_tighten(
+    planner: NeedlePlanner,
+    where: str,
+    goal: Tighten,
+    limits: ProcedureLimits,
+    required: float,
+    wrapped: Mapping[str, float],
+) -> None:
+    if goal.around:
+        _check_name(planner, f"{where}.around", goal.around)
+    if not wrapped or (goal.around and goal.around not in wrapped):
+        around = f" around {goal.around}" if goal.around else ""
+        raise ConfigurationError(
+            where, "no wrap before it", f"a wrap{around} before, as else there is nothing to tighten"
+        )
+    if goal.tension > limits.tension:
+        expected = f"at most the limit of the tension, {limits.tension:.3g} N"
+        raise ConfigurationError(f"{where}.tension", goal.tension, expected)
+    _check_place(planner, f"{where}.toward", goal.toward, required)
+    around = goal.around or list(wrapped)[-1]
+    away = float(solid_of(planner.scene, around).distance(shapely.Point(goal.toward))) - planner.lever
+    left = planner.thread_length - planner.length_around(wrapped)
+    if away > left:
+        expected = f"a place within {1e3 * (left + planner.lever):.3g} mm of {around}, which the thread reaches"
+        raise ConfigurationError(f"{where}.toward", list(goal.toward), expected)
+
+
 def _check_gap(planner: NeedlePlanner, where: str, goal: PassThrough, required: float) -> None:
+    names = planner.scene.names
     for name in goal.between:
-        _check_name(planner, f"{where}.between", name)
-    between = planner.gaps_between(*goal.between)
+        if name != WALL_NAME:
+            _check_name(planner, f"{where}.between", name)
+    between = gap_lines(planner.scene, goal.between)
     if not between:
-        expected = "two shapes with a gap between them, in which no other shape lies"
-        raise ConfigurationError(f"{where}.between", list(goal.between), expected)
-    gaps = planner.gaps(goal)
-    if not gaps:
-        x, y = np.round(min(between, key=lambda gap: gap.width).along, 2) + 0.0
+        raise ConfigurationError(f"{where}.between", list(goal.between), "two shapes with a gap between them")
+    lines = lines_of_pass(planner.scene, goal)
+    if not lines:
+        across = (between[0][1] - between[0][0]) / math.dist(*between[0])
+        x, y = np.round([-across[1], across[0]], 2) + 0.0
         expected = f"one along a gap between them, as [{x:g}, {y:g}] or [{0.0 - x:g}, {0.0 - y:g}]"
         raise ConfigurationError(f"{where}.direction", list(goal.direction), expected)
-    width = max(gap.width for gap in gaps)
+    width = max(math.dist(*line) for line in lines)
     if width <= 2.0 * required:
         expected = f"a gap wider than {2e3 * required:.3g} mm, twice the needle's clearance"
         raise ConfigurationError(f"{where}.between", f"a gap of {1e3 * width:.3g} mm", expected)
+    cut, others = shapely.MultiLineString(lines), [name for name in (WALL_NAME, *names) if name not in goal.between]
+    away = {name: float(solid_of(planner.scene, name).distance(cut)) for name in others}
+    room = max(clearance_at(x, y, planner.near) for line in lines for x, y in _points_of(line, planner.near.step))
+    within = [name for name, distance in away.items() if distance < (required if room <= required else 1e-9)]
+    if within:
+        expected = f"a gap in which {' and '.join(within)} does not lie"
+        raise ConfigurationError(f"{where}.between", list(goal.between), expected)
+
+
+def _points_of(line: Points, spacing: float) -> Points:
+    """Return points on a line that are no farther apart than a spacing [m], shape (k, 2)."""
+    shares = np.linspace(0.0, 1.0, math.ceil(math.dist(*line) / spacing) + 1)[:, None]
+    return np.asarray((1.0 - shares) * line[0] + shares * line[1])
 
 
 def _check_name(planner: NeedlePlanner, where: str, name: str) -> None:

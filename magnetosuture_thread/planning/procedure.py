@@ -11,8 +11,11 @@ goals:
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -26,6 +29,7 @@ from magnetosuture_thread.configuration import (
 )
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.resources import find_procedure_file
+from magnetosuture_thread.scene import WALL_NAME
 
 MAX_GOALS = 100
 HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
@@ -68,7 +72,7 @@ class GoTo(Configuration):
 
 @dataclass(frozen=True)
 class PassThrough(Configuration):
-    """Drive through the gap between two shapes."""
+    """Drive through the gap between two shapes, or a shape and the dish's wall, `wall`."""
 
     GROUP: ClassVar[str] = "pass_through"
 
@@ -87,18 +91,23 @@ class PassThrough(Configuration):
 
 @dataclass(frozen=True)
 class Wrap(Configuration):
-    """Drive around a shape, so that the thread lies around it."""
+    """Drive around a shape until the thread winds about it by an angle, with that of the wraps before."""
 
     GROUP: ClassVar[str] = "wrap"
 
     around: str = quantity("", "name of the shape")
-    angle: float = quantity(0.0, "that the needle sweeps about it", unit="rad", minimum=0.0, maximum=63.0)
+    angle: float = quantity(0.0, "that the thread winds about it", unit="rad", minimum=0.0, maximum=3600.0)
     sense: str = quantity("counterclockwise", "of the way", choices=("clockwise", "counterclockwise"))
 
     def check(self) -> None:
-        """Refuse a wrap by no angle."""
-        if not self.angle > 0.0:
-            raise self.refused("angle", "an angle above 0 rad")
+        """Refuse a wrap by no angle, or by more than ten turns."""
+        if not 0.0 < self.angle <= 20.0 * math.pi:
+            raise self.refused("angle", f"an angle above 0 and up to ten turns, 62.83 rad{self.in_radians}")
+
+    @property
+    def in_radians(self) -> str:
+        """What the angle would be if it was meant in degrees, in words."""
+        return f"; degrees? {self.angle:g} degrees are {math.radians(self.angle):.4g} rad" if self.angle > 20.0 else ""
 
     @property
     def swept(self) -> float:
@@ -172,10 +181,21 @@ class Procedure:
         names: set[str] = set()
         for goal in self.goals:
             if isinstance(goal, PassThrough):
-                names.update(goal.between)
+                names.update(name for name in goal.between if name != WALL_NAME)
             elif isinstance(goal, Wrap | Tighten) and goal.around:
                 names.add(goal.around)
         return frozenset(names)
+
+    @cached_property
+    def windings(self) -> tuple[float, ...]:
+        """What the thread is to wind about its shape after each wrap, positive counterclockwise [rad]; else 0."""
+        wound: defaultdict[str, float] = defaultdict(float)
+        found = []
+        for goal in self.goals:
+            if isinstance(goal, Wrap):
+                wound[goal.around] += goal.swept
+            found.append(wound[goal.around] if isinstance(goal, Wrap) else 0.0)
+        return tuple(found)
 
 
 def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:

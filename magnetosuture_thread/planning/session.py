@@ -397,7 +397,8 @@ class ProcedureSession:
             raise InvalidInputError("procedure", procedure.name, "a scene first, as a parameter or on its topic")
         if self._pose is None or not self.known.has_pose(now):
             raise InvalidInputError("procedure", procedure.name, "a needle that is tracked")
-        paths = self._planner.plan_all(procedure, *self._planner.pose(*self._pose[1:]))
+        thread = self.known.condition(now).vertices
+        paths = self._planner.plan_all(procedure, *self._planner.pose(*self._pose[1:]), thread)
         self._planned = [(index, path) for (index, _), path in zip(chains(procedure), paths, strict=True)]
         self.planned_duration = planned_duration(procedure, paths)
         self._executor = ProcedureExecutor(procedure, self._planner, self._submit, self._settings.thread_wait)

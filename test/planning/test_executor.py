@@ -47,18 +47,21 @@ class Needle:
         self.share, self.drift, self.time, self.way = 1.0, np.zeros(2), 1.0, 0.0
         self.pull = np.zeros(2)  # whatever is commanded
         self.thrown = np.zeros(2)  # for each radian that it turns, as by its thread in a crossing of an axis [m]
+        self.trail = [self.tail - 0.03 * self.heading]  # where its tail has been: its thread, the free end first
 
     def run(
         self,
         run: ProcedureExecutor,
         seconds: float,
-        condition: Callable[[], ThreadCondition] = lambda: KNOWN,
+        condition: Callable[[], ThreadCondition] | None = None,
         until: Callable[[], bool] = lambda: False,
     ) -> None:
         """Follow the commands of a procedure for some time, or until it has ended."""
         end = self.time + seconds
         while self.time < end and run.state not in (ProcedureState.DONE, ProcedureState.FAILED) and not until():
-            velocity = run.update(self.time, self.tail, self.heading, condition())
+            self.trail.append(self.tail)
+            known = replace(KNOWN, vertices=self.thread) if condition is None else condition()
+            velocity = run.update(self.time, self.tail, self.heading, known)
             self.way += math.hypot(*velocity) / RATE
             moved = NEEDLE.body_velocity(self.heading, self.share * velocity)
             before = self.heading
@@ -66,6 +69,11 @@ class Needle:
             self.tail = self.tail + math.acos(min(1.0, float(before @ self.heading))) * self.thrown
             self.tail = self.tail + (self.drift * bool(velocity.any()) + self.pull) / RATE
             self.time += 1.0 / RATE
+
+    @property
+    def thread(self) -> np.ndarray:
+        """The thread behind it, the tail first, shape (n + 1, 2) [m]."""
+        return np.array(self.trail[::-1])
 
     @property
     def middle(self) -> np.ndarray:
@@ -195,6 +203,14 @@ def test_a_needle_that_rests_backs_off_and_is_given_up_in_the_end():
     assert not run.update(needle.time, needle.tail, needle.heading, KNOWN).any()
 
 
+def test_a_needle_that_is_held_at_the_wall_is_given_up_with_the_place_and_the_remedy():
+    run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}), Needle(0.01472, 0.0)
+    needle.share = 0.0
+    run.start()
+    needle.run(run, 60.0)
+    assert "the needle rests beside wall with motion_compensation of the coil bridge off, however" in run.reason
+
+
 def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
     goal = {"tighten": {"tension": 1e-4, "toward": [-0.012, 0.0]}}
     run, needle = executor(goal), Needle()
@@ -257,7 +273,7 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
 
     def wrapped() -> bool:
         poses.append((needle.tail, needle.heading))
-        return run.pursuit.swept > 4.6
+        return run.judge.windings["post"] > 4.6
 
     needle.run(run, 300.0, until=wrapped)
     way = needle.way
@@ -265,8 +281,72 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
         run.pause("the operator has taken over")
         for tail, heading in reversed(poses):
             needle.tail, needle.heading, needle.time = tail, heading, needle.time + 1.0 / RATE
-            run.update(needle.time, tail, heading, KNOWN)
+            needle.trail.pop()
+            run.update(needle.time, tail, heading, replace(KNOWN, vertices=needle.thread))
         run.start()
     needle.run(run, 300.0)
     assert run.state is ProcedureState.DONE
+    assert run.judge.windings["post"] > 6.1
     assert (needle.way > 1.9 * way) == pauses  # all of the way again, or what was left of it
+
+
+def test_a_thread_that_slips_off_is_wound_again_and_given_up_in_the_end():
+    """The needle goes round, and the thread stays straight: what counts is the thread."""
+    run, needle = executor({"wrap": {"around": "post", "angle": 6.2}}), Needle()
+    run.start()
+    needle.run(run, 600.0, lambda: replace(KNOWN, vertices=np.array([needle.tail, [-0.012, 0.0]])))
+    assert run.state is ProcedureState.FAILED
+    assert "the thread slips on post: it winds" in run.reason
+    assert "of 355 degrees" in run.reason
+
+
+def test_a_wrap_that_has_slipped_off_at_the_end_fails_the_procedure():
+    goals: list[dict[str, Any]] = [{"wrap": {"around": "post", "angle": 6.2}}, {"go_to": {"position": [-0.006, 0.004]}}]
+    run, needle = executor(*goals), Needle()
+    run.start()
+
+    def condition() -> ThreadCondition:
+        thread = needle.thread if run.goal == 0 else np.array([needle.tail, [-0.012, 0.0]])
+        return replace(KNOWN, vertices=thread)
+
+    needle.run(run, 300.0, condition)
+    assert (run.state, run.goal) == (ProcedureState.FAILED, 1)
+    assert "the thread slips on post" in run.reason
+
+
+def test_a_needle_that_is_carried_past_a_gap_goes_back_and_passes_it():
+    """It is where its path ends, but has not crossed the line across the gap."""
+    goals: list[dict[str, Any]] = [
+        {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
+        {"go_to": {"position": [0.003, 0.008]}},
+    ]
+    run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
+    run.start()
+    needle.run(run, 60.0, until=lambda: needle.middle[1] > -0.002)
+    assert (run.goal, run.judge.crossed) == (0, 0)
+    for x in np.arange(needle.tail[0], -0.004, -0.004):  # carried around the post on its other side
+        needle.tail = np.array([x, -0.006])
+        needle.run(run, 1.0 / RATE)
+    needle.tail, needle.heading = np.array([-0.004, 0.006]), np.array([1.0, 0.0])
+    needle.run(run, 1.0 / RATE)
+    needle.tail = np.array([0.010, 0.004])
+    needle.run(run, 300.0)
+    assert (run.state, run.reason) == (ProcedureState.DONE, "")
+
+
+def test_a_shape_that_appears_in_a_gap_ahead_fails_the_procedure_and_one_in_a_gap_passed_does_not():
+    goals: list[dict[str, Any]] = [
+        {"pass_through": {"between": ["post", "wall"], "direction": [0.0, 1.0]}},
+        {"go_to": {"position": [0.003, 0.008]}},
+    ]
+    plug = SceneShape("plug", "instrument", Disc((0.0112, 0.0), 0.004))
+    for passed in (False, True):
+        run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
+        run.start()
+        needle.run(run, 60.0, until=lambda: run.goal == 1 if passed else needle.middle[1] > -0.002)  # noqa: B023
+        run.set_planner(NeedlePlanner(Scene(Dish(), (POST, plug)), NEEDLE, 2.5e-4, 0.05))
+        if not passed:
+            assert run.state is ProcedureState.FAILED
+            assert "a gap in which plug does not lie" in run.reason
+        else:
+            assert run.state is ProcedureState.RUNNING

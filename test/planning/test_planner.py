@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
+from magnetosuture_thread.planning.verdict import winding
 from magnetosuture_thread.safety import NeedleSafetyFilter
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -41,9 +44,22 @@ def clearance(path: BodyPath, scene: Scene, needle: NeedleKinematics) -> float:
 
 
 def swept(path: BodyPath, centre: np.ndarray) -> float:
-    """Return the angle that a path sweeps about a point [rad]."""
-    turns = np.unwrap(np.arctan2(*(path.middles - centre).T[::-1]))
+    """Return the angle that the needle's tail, which leads the thread, sweeps about a point [rad]."""
+    tails = path.middles - path.lever * np.column_stack([np.cos(path.angles), np.sin(path.angles)])
+    turns = np.unwrap(np.arctan2(*(tails - centre).T[::-1]))
     return float(turns[-1] - turns[0])
+
+
+def net_crossings(path: BodyPath, line: list[tuple[float, float]], first: float = 0.0, last: float = math.inf) -> int:
+    """Return how often the middle crosses a line from right to left, less the other way round, between two ways."""
+    points = path.middles[(path.travel >= first) & (path.travel <= last)]
+    (ax, ay), (bx, by) = line
+    count = 0
+    for before, after in itertools.pairwise(points):
+        step = shapely.LineString([before, after])
+        if step.crosses(shapely.LineString(line)):
+            count += 1 if (bx - ax) * (after[1] - ay) > (by - ay) * (after[0] - ax) else -1
+    return count
 
 
 def test_the_hernia_repair_is_planned_clear_of_everything(hernia: Setup, planner: NeedlePlanner):
@@ -54,9 +70,11 @@ def test_the_hernia_repair_is_planned_clear_of_everything(hernia: Setup, planner
     assert [len(path.ends) for path in paths] == [4, 1]
     kept = hernia.coils.keep_out
     assert min(clearance(path, hernia.scene, planner.needle) for path in paths) > kept - 5e-6
-    inside = paths[0].middles[(paths[0].travel >= paths[0].ends[0]) & (paths[0].travel <= paths[0].ends[1])]
-    around = np.unwrap(np.arctan2(*(inside - [0.0, 0.005]).T[::-1]))
-    assert around[-1] - around[0] == pytest.approx(-6.2832, abs=0.2)
+    poses = np.column_stack([paths[0].middles, paths[0].angles])
+    chosen = (paths[0].travel >= paths[0].ends[0]) & (paths[0].travel <= paths[0].ends[1])
+    inside = paths[0].middles[chosen]
+    thread = planner.led(np.empty((0, 2)), poses[: np.flatnonzero(chosen)[-1] + 1])
+    assert -2.0 * math.pi - 0.35 < winding(thread, np.array([0.0, 0.005])) < -2.0 * math.pi + 0.1
     # Between ring and tissue, and not around all of it.
     assert np.hypot(*(inside - [0.0, 0.005]).T).max() < 0.0125
 
@@ -69,7 +87,9 @@ def test_a_wrap_goes_around_by_its_angle_in_its_sense(sense: str, angle: float):
     goal = {"wrap": {"around": "post_0", "angle": angle, "sense": sense}}
     (path,) = planner.plan_all(procedure(goal), np.array([-0.006, -0.004]), 0.3)
     wanted = angle if sense == "counterclockwise" else -angle
-    assert swept(path, np.array([0.001, 0.002])) == pytest.approx(wanted, abs=0.35)
+    about = swept(path, np.array([0.001, 0.002]))
+    assert abs(wanted) <= abs(about) < abs(wanted) + 0.35
+    assert about * wanted > 0.0
     assert abs(swept(path, np.array([0.008, 0.001]))) < math.pi  # not around the other one
     assert clearance(path, scene, planner.needle) > KEEP_OUT - 5e-6
 
@@ -93,16 +113,17 @@ def test_a_needle_turns_round_in_a_dead_end():
         ({"wrap": {"around": "post_0", "angle": 30.0}}, "of thread are enough"),
         ({"go_to": {"position": [0.0, 0.002]}}, "around the needle in some direction"),
         ({"go_to": {"position": [0.03, 0.0]}}, "around the needle in some direction"),
-        ({"tighten": {"tension": 1e-4, "toward": [0.0, 0.002]}}, "goals[0].tighten.toward"),
+        ({"tighten": {"tension": 1e-4, "toward": [0.012, 0.0]}}, "expected a wrap before, as else there is nothing"),
+        ({"wrap": {"around": "post_0", "angle": 45.0}}, "degrees? 45 degrees are 0.7854 rad"),
         ({"pass_through": {"between": ["post_0", "post_2"], "direction": [1.0, 0.0]}}, "a gap of 0.3"),
         ({"pass_through": {"between": ["post_0", "post_1"], "direction": [0.0, 1.0]}}, "one along a gap between them"),
         ({"pass_through": {"between": ["post_0", "post_1"], "direction": [0.0, 1.0]}}, "as [-1, 0] or [1, 0]"),
-        ({"pass_through": {"between": ["post_1", "post_2"], "direction": [0.0, 1.0]}}, "in which no other shape lies"),
-        ({"go_to": {"position": [0.0169, 0.0], "heading": [0.0]}}, "around the needle at its heading"),
         (
-            {"tighten": {"tension": 2e-4, "toward": [0.012, 0.0]}, "limits": {"tension": 1e-4}},
-            "goals[0].tighten.tension: got 0.0002, expected at most the limit of the tension, 0.0001 N",
+            {"pass_through": {"between": ["post_1", "post_2"], "direction": [1.0, 0.0]}},
+            "a gap in which post_0 does not lie",
         ),
+        ({"pass_through": {"between": ["post_1", "fence"], "direction": [1.0, 0.0]}}, "got 'fence', expected a shape"),
+        ({"go_to": {"position": [0.0169, 0.0], "heading": [0.0]}}, "around the needle at its heading"),
     ],
 )
 def test_what_can_be_known_to_fail_is_refused_before_anything_moves(goal: dict[str, Any], message: str):
@@ -113,19 +134,81 @@ def test_what_can_be_known_to_fail_is_refused_before_anything_moves(goal: dict[s
     assert message in str(caught.value)
 
 
-def test_wraps_that_follow_each_other_need_the_thread_of_them_all():
+def test_the_wraps_of_a_procedure_need_the_thread_of_them_all():
     scene = posts((0.0, 0.0, 0.002), (0.009, 0.0, 0.002))
     planner = NeedlePlanner(scene, NeedleKinematics(0.0025), KEEP_OUT, 0.03)
     once, back, other = (
         {"wrap": {"around": name, "angle": 8.0, "sense": sense}}
         for name, sense in (("post_0", "clockwise"), ("post_0", "counterclockwise"), ("post_1", "clockwise"))
     )
+    place = {"go_to": {"position": [0.0, 0.006]}}
     planner.check(procedure(once))  # 16 of 30 mm
-    planner.check(procedure(once, back, once))
-    planner.check(procedure(once, {"go_to": {"position": [0.0, 0.006]}}, once))  # which may have unwound it
-    for second in (once, other):
-        with pytest.raises(ConfigurationError, match=r"goals\[1\]\.wrap\.angle.*with the wraps before it"):
-            planner.check(procedure(once, second))
+    planner.check(procedure(once, other))  # 10 mm around each, which half a turn is passed by, and 5 mm between
+    for goals in ((once, once), (once, place, once), (once, other, once)):
+        with pytest.raises(ConfigurationError, match=r"mm of thread with the wraps before.*30 mm of thread"):
+            planner.check(procedure(*goals))
+    with pytest.raises(ConfigurationError, match=r"goals\[2\]\.wrap\.sense.*expected clockwise, as post_0 is wrapped"):
+        planner.check(procedure(once, place, back))
+
+
+@pytest.mark.parametrize(
+    ("tighten", "message"),
+    [
+        ({"tension": 1e-4, "toward": [0.0, 0.002]}, "goals[1].tighten.toward"),
+        ({"clearance": 1e-3, "around": "post_1", "toward": [0.012, 0.0]}, "expected a wrap around post_1 before"),
+        ({"tension": 1e-4, "toward": [-0.016, 0.0]}, "a place within 5.25 mm of post_0, which the thread reaches"),
+        ({"tension": 2e-4, "toward": [0.0, 0.006]}, "goals[1].tighten.tension: got 0.0002, expected at most the limit"),
+    ],
+)
+def test_a_thread_is_tightened_around_what_it_is_wrapped_around_and_within_its_length(
+    tighten: dict[str, Any], message: str
+):
+    scene = posts((0.0, 0.0, 0.002), (0.009, 0.0, 0.002))
+    planner = NeedlePlanner(scene, NeedleKinematics(0.0025), KEEP_OUT, 0.02)
+    goals: list[dict[str, Any]] = [{"wrap": {"around": "post_0", "angle": 8.0}}]
+    planner.check(procedure(*goals, {"tighten": {"tension": 1e-4, "toward": [0.0, 0.006]}}))
+    with pytest.raises(ConfigurationError) as caught:
+        planner.check(procedure(*goals, {"tighten": tighten, "limits": {"tension": 1e-4}}))
+    assert message in str(caught.value)
+
+
+def test_slits_that_are_passed_in_the_same_direction_are_each_crossed_and_none_is_undone():
+    """Between one pass and the next the needle comes back around the ends of the row, not through a slit."""
+    scene = posts(*[(x, 0.0, 0.002) for x in (-0.009, -0.003, 0.003, 0.009)])
+    planner = NeedlePlanner(scene, NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+    between = [(f"post_{k}", f"post_{k + 1}") for k in range(3)]
+    goals = [{"pass_through": {"between": list(pair), "direction": [0.0, 1.0]}} for pair in between]
+    (path,) = planner.plan_all(procedure(*goals), np.array([-0.006, -0.006]), 1.5)
+    for k, end in enumerate(path.ends):
+        line = [(6e-3 * k - 0.007, 0.0), (6e-3 * k - 0.005, 0.0)]  # from post to post, passed upwards to its left
+        before = path.ends[k - 1] if k else 0.0
+        assert net_crossings(path, line, before, end) == 1
+        assert net_crossings(path, line) == 1
+    assert clearance(path, scene, planner.needle) > KEEP_OUT - 5e-6
+
+
+def test_a_gap_to_the_wall_is_passed():
+    planner = NeedlePlanner(posts((0.006, 0.0, 0.002)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+    goal = {"pass_through": {"between": ["wall", "post_0"], "direction": [0.0, 1.0]}}
+    (path,) = planner.plan_all(procedure(goal), np.array([0.0, -0.004]), 0.0)
+    assert net_crossings(path, [(0.008, 0.0), (0.0175, 0.0)]) == 1
+
+
+def test_a_plug_in_a_slit_blocks_it():
+    """Two tissues of 6 mm with a slit of 2 mm between them, and a plug inside of it."""
+    outline = np.array([(-0.003, -0.003), (0.003, -0.003), (0.003, 0.003), (-0.003, 0.003)])
+    tissues = [
+        SceneShape(name, "tissue", Polygon(outline + np.array([x, 0.0]))) for name, x in (("a", -0.004), ("b", 0.004))
+    ]
+    goal = {"pass_through": {"between": ["a", "b"], "direction": [0.0, 1.0]}}
+    for y in (0.0, 0.0012):
+        plug = SceneShape("plug", "instrument", Disc((0.0, y), 0.0009))
+        planner = NeedlePlanner(Scene(Dish(), (*tissues, plug)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+        with pytest.raises(MagnetosutureError, match=r"a gap in which plug does not lie|no way for the needle to pass"):
+            planner.plan_all(procedure(goal), np.array([0.0, -0.009]), 1.5)
+    planner = NeedlePlanner(Scene(Dish(), tuple(tissues)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+    (path,) = planner.plan_all(procedure(goal), np.array([0.0, -0.009]), 1.5)
+    assert net_crossings(path, [(-0.001, 0.0), (0.001, 0.0)]) == 1
 
 
 def test_a_place_behind_a_closed_wall_of_posts_cannot_be_reached():

@@ -34,15 +34,18 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
     tail, heading, time = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)]), 0.0
     executor.start()
     clearance, tight_at = math.inf, math.inf
+    trail = [tail - setup.model.thread_length * heading]  # the thread lies where the tail has been
     while executor.state is ProcedureState.RUNNING and time < 300.0:
         # The thread is tight half a second after it is pulled, by its tension or close to the shape.
-        goal, condition = procedure.goals[executor.goal], ThreadCondition()
+        trail.append(tail)
+        goal, condition = procedure.goals[executor.goal], ThreadCondition(np.array(trail[::-1]))
         if isinstance(goal, Tighten):
             tight_at = min(tight_at, time + 0.5)
             if time >= tight_at:
-                shapes = [shape for shape in setup.scene.shapes if shape.name == goal.around]
-                thread = np.array([shape.solid.centroid.coords[0] for shape in 2 * shapes])
-                condition = replace(condition, tension=goal.tension, vertices=thread)
+                at = [shape.solid.centroid.coords[0] for shape in setup.scene.shapes if shape.name == goal.around]
+                centre = np.array(at[0]) if at else np.zeros(2)
+                drawn = centre + 0.1 * (np.array(trail[::-1]) - centre)  # which winds as before
+                condition = replace(condition, tension=goal.tension, vertices=drawn)
         velocity = executor.update(time, tail, heading, condition)
         if velocity.any():
             velocity = safety.filter(velocity, tail, heading).filtered

@@ -1,0 +1,79 @@
+"""Ground truth of goals: what was not made is named, whatever the nodes say."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.campaign.truth import GoalTruth
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.planning.procedure import parse_procedure
+from magnetosuture_thread.scene import Dish, Scene, SceneShape
+
+SCENE = Scene(
+    Dish(), tuple(SceneShape(name, "instrument", Disc((x, 0.0), 0.002)) for name, x in (("a", -4e-3), ("b", 4e-3)))
+)
+UP = {"pass_through": {"between": ["a", "b"], "direction": [0.0, 1.0]}}
+WALL = {"pass_through": {"between": ["wall", "b"], "direction": [0.0, 1.0]}}
+AROUND = {"wrap": {"around": "b", "angle": 6.0}}
+PLACE = {"go_to": {"position": [0.0, 0.008], "heading": [0.0]}}
+STRAIGHT = np.array([[0.0, 0.0], [0.0, 0.0]])
+
+
+def judged(goals: list[dict[str, Any]], frames: list[tuple[int, tuple[float, float], np.ndarray]]) -> list[str]:
+    """Return the failures of frames: goals met, middle of a needle along x, and thread, the tail first."""
+    truth = GoalTruth(parse_procedure({"goals": goals}, "test"), SCENE)
+    for met, (x, y), thread in frames:
+        truth.update(met, np.array([x, y]), np.array([x - 1e-3, y]), thread)
+    return truth.failures(ended=frames[-1][0] == len(goals))
+
+
+def around(degrees: float) -> np.ndarray:
+    """Return a thread that winds about b, counterclockwise from its free end to its tail."""
+    angles = np.radians(np.linspace(degrees, 0.0, 60))
+    return np.column_stack([4e-3 + 2.2e-3 * np.cos(angles), 2.2e-3 * np.sin(angles)])
+
+
+@pytest.mark.parametrize(
+    ("ys", "failures"),
+    [
+        ([-2e-3, 1e-3], []),
+        ([-2e-3, 1e-3, -1e-3, 2e-3], []),
+        ([1e-3, 2e-3], ["0 net crossings between a and b"]),
+        ([1e-3, -1e-3, 1e-3], ["0 net crossings between a and b"]),
+        ([2e-3, -1e-3], ["-1 net crossings between a and b"]),
+    ],
+)
+def test_a_pass_is_a_net_crossing_in_its_direction(ys: list[float], failures: list[str]):
+    frames = [(0, (0.0, y), STRAIGHT) for y in ys]
+    found = judged([UP], [*frames, (1, (0.0, ys[-1]), STRAIGHT)])
+    assert [text.split(": ")[1] for text in found] == failures
+
+
+def test_a_pass_beside_the_gap_does_not_count_and_one_at_the_wall_does():
+    beside = [(0, (0.010, -2e-3), STRAIGHT), (0, (0.010, 2e-3), STRAIGHT), (1, (0.010, 2e-3), STRAIGHT)]
+    assert judged([UP], beside) == ["goal 1 in truth: 0 net crossings between a and b"]
+    assert judged([WALL], beside) == []
+
+
+@pytest.mark.parametrize(("then", "last", "failures"), [(350.0, 300.0, 0), (300.0, 300.0, 1), (350.0, 100.0, 1)])
+def test_a_wrap_is_of_the_thread_when_it_is_met_and_at_the_end(then: float, last: float, failures: int):
+    goals: list[dict[str, Any]] = [AROUND, PLACE]
+    at = (0.0, 0.008)
+    found = judged(goals, [(0, at, around(then)), (1, at, around(then)), (2, at, around(last))])
+    assert len(found) == failures
+    assert all(
+        "winds 300 of 344 degrees" in text or "100 degrees of thread are left around b" in text for text in found
+    )
+
+
+def test_a_place_and_its_heading_are_compared_with_the_needle():
+    off = [(0, (0.0, 0.0), STRAIGHT), (1, (6e-4, 0.008), STRAIGHT)]
+    assert judged([PLACE], off) == ["goal 1 in truth: 0.60 mm from its place"]
+    turned = {"go_to": {"position": [0.0, 0.008], "heading": [math.pi / 2.0]}}
+    assert judged([turned], [(0, (0.0, 0.0), STRAIGHT), (1, (0.0, 0.008), STRAIGHT)]) == [
+        "goal 1 in truth: -1.57 rad from its heading"
+    ]
