@@ -158,7 +158,7 @@ class ThreadModelSettings(Configuration):
         choices=(AUTOMATIC, STIFFNESS_OVER_DRAG),
     )
     forecast_horizon: float = quantity(
-        0.0, "how far ahead thread/forecast looks, the present command held; 0 for none", "s", 0.0, 30.0
+        0.0, "how far ahead thread/forecast looks, by the plan or the command held; 0 for none", "s", 0.0, 30.0
     )
     forecast_step: float = quantity(0.03, "duration of its steps", "s", 0.001, 0.5)
     forecast_period: float = quantity(
