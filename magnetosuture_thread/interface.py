@@ -119,7 +119,7 @@ ESTIMATED_THREAD = Channel(
 FORECAST = Channel(
     "thread/forecast",
     "magnetosuture_msgs/msg/ThreadForecast",
-    "where needle and thread will be if the command is held, where forecast_horizon is above 0",
+    "where needle and thread will be by the plan or the command held, where forecast_horizon is above 0",
 )
 MARGINS = Channel(
     "thread/margins",
@@ -154,7 +154,7 @@ PROCEDURE_STATE = Channel(
     Quality.LATCHED,
 )
 PROCEDURE_PLAN = Channel(
-    "procedure/plan", "nav_msgs/msg/Path", "where the middle of the needle is to go, as planned", Quality.LATCHED
+    "procedure/plan", "nav_msgs/msg/Path", "poses of the needle's chord, at its middle, as planned", Quality.LATCHED
 )
 PROCEDURE_HOLD = Channel("procedure/hold", "std_msgs/msg/Header", "a person holds the page's button", Quality.NEWEST)
 DIAGNOSTICS = Channel(

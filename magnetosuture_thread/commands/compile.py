@@ -10,8 +10,10 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.commands.command import DONE, Terminal, runs
 from magnetosuture_thread.compiled import compilations
 from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.planning.session import compile_planning
 from magnetosuture_thread.rig.rig import Rig
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.thread_model.session import ThreadSession
 from magnetosuture_thread.vision.tracker import warm_up
@@ -47,6 +49,7 @@ def kernel_steps() -> dict[str, Callable[[], object]]:
         "thread model": lambda: ThreadSession(setup.model, setup.scene),
         "tracker": warm_up,
         "safety filter and coil bridge": CoilSystem,
+        "needle's plan": lambda: PublishedForecasts(NeedleKinematics(0.0)),
         "forecast": lambda: make_forecaster(setup.model, setup.scene).warm_up(),
         "planner": compile_planning,
         "simulated rig": lambda: Rig(setup.rig, setup.scene).warm_up(),

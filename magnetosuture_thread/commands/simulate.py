@@ -67,8 +67,8 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     the setup's path. All are processes of their own, on a ROS domain that nobody else uses. Everything is
     simulated, and the bag says so.
 
-    With --procedure, needle_planner executes it in place of path_follower. What came of it is in summary.json in BAG,
-    and a procedure that fails ends the command with the reason.
+    With --procedure, needle_planner executes it in place of path_follower. Whether it succeeded, or why it failed, is
+    printed before the table, and is in summary.json in BAG.
 
     SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
@@ -83,10 +83,20 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
         raise
+    outcome = summary.procedure
+    if outcome is not None:
+        terminal.log(outcome_text(outcome))
     terminal.print(loop_table(summary))
     terminal.log(f"bag: {options.output}")
     command.write_json(options.json, summary.to_json())
-    return command.DONE
+    return command.FAILED if outcome is not None and outcome["state"] in ("not begun", "failed") else command.DONE
+
+
+def outcome_text(outcome: dict[str, Any]) -> str:
+    """Return what came of a procedure in one line: its state, the goals met, and the reason where it failed."""
+    state = "succeeded" if outcome["state"] == clients.DONE else outcome["state"]
+    reason = f": {outcome['reason']}" if outcome["reason"] else ""
+    return "procedure {procedure}: {0}, {goals_met} of {goals} goals met{1}".format(state, reason, **outcome)
 
 
 def simulate(
@@ -103,7 +113,7 @@ def simulate(
     """Run rig, tracker, model, bridge and path follower as processes of their own, and evaluate the loop.
 
     With a procedure the needle planner executes it in place of the path follower, and the figures, with what came of
-    the procedure, are in the folder too, as `summary.json`.
+    the procedure, are in the folder too, as `summary.json`; also of one that failed.
 
     `output` becomes a bag of every topic, including ground truth, with the nodes' `logs/` beside it; its
     notes hold the setup and say that it is simulated, and `replay` takes it. It is made at the end, also
@@ -124,7 +134,7 @@ def simulate(
     Raises:
         BagError: the output exists or cannot be written; where the disk was full, what was recorded is there.
         ConfigurationError: the setup cannot be used, or the procedure does not fit its scene.
-        GraphError: a node ended or did not come, the needle never got to the end of its path, or the procedure failed.
+        GraphError: a node ended or did not come, or the needle never got to the end of its path.
         KeyboardInterrupt: passed on; where the run had begun, its bag is there.
     """
     setup = read_procedure_setup(read_procedure(procedure), setup_name) if procedure else read_setup(setup_name)
@@ -136,21 +146,18 @@ def simulate(
         problem = _Run(setup, task, duration, rate, boards, log, progress).record(folder, output.name)
     if problem == INTERRUPTED:
         raise KeyboardInterrupt
-    recorded_in = f"{problem}; what was recorded is in {output}"
-    if problem and task.result is None:
-        raise GraphError(recorded_in)
+    if problem:
+        raise GraphError(f"{problem}; what was recorded is in {output}")
     log("evaluating the run")
     figures = {"setup": setup.name, "procedure": task.result}
     try:
         summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=task.result)
         figures = summary.to_json()
     except GraphError as error:
-        raise GraphError(f"{problem}; {error}" if problem else str(error)) from None
+        raise GraphError(f"{outcome_text(task.result)}; {error}" if task.result else str(error)) from None
     finally:
         if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
-    if problem:
-        raise GraphError(recorded_in)
     return summary
 
 
@@ -236,7 +243,7 @@ class _Procedure:
         self.client = clients.ProcedureClient(str(find_procedure_file(name).resolve()))
 
     def poll(self, recorder: clients.Recorder) -> str:
-        """Take what is new; return what went wrong."""
+        """Take what is new; return nothing, as what goes wrong is in the result."""
         self.client.poll()
         status, result = self.client.status, self.client.result
         if status is not None:
@@ -247,18 +254,16 @@ class _Procedure:
             if report is not None:
                 self.result |= {"state": report.state, "reason": report.reason, "goals_met": report.goals_met}
         self.ended = result is not None
-        return self._state() if result is not None and result.state != clients.DONE else ""
+        return ""
 
     def problem(self, elapsed: float, recorder: clients.Recorder) -> str:
-        """Return what to report of a run that does not end."""
+        """Register that the run does not end; return nothing."""
         if self.stage == 0:
             self.result["reason"] = self.client.refusal or "no needle planner"
-            return self._state()
-        return f"after {elapsed:.0f} s {self._state()}"
-
-    def _state(self) -> str:
-        met = "{goals_met} of {goals} goals met: {reason}".format(**self.result)
-        return f"the procedure {self.result['procedure']} is {self.result['state']}, {met}"
+        else:
+            reason = f": {self.result['reason']}" if self.result["reason"] else ""
+            self.result |= {"state": "failed", "reason": f"{self.result['state']} after {elapsed:.0f} s{reason}"}
+        return ""
 
 
 @dataclass

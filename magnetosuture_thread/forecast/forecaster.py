@@ -31,7 +31,7 @@ from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
 from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene import WALL_NAME, Scene
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
@@ -46,7 +46,6 @@ Vector = NDArray[np.float64]
 Controller = Callable[[float, Vector, Vector], Vector]
 """Velocity of the tip [m/s] for the time since the start [s], the needle's tail [m] and its heading, shapes (2,)."""
 
-WALL_NAME = "wall"
 MAX_HORIZON = 60.0  # s
 MAX_STEPS = 20_000
 

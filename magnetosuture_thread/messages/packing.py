@@ -71,20 +71,21 @@ def packed_pose_stamped(stamp: Stamp, point: Vector, angle: float) -> bytes:
 PATH_AT = aligned(DISH_END, 4) + 4  # where the poses of a path begin, behind their count
 PATH_POSES = np.dtype(  # each begins at a multiple of 8
     {
-        "names": ["time", "frame", "x", "y", "w"],
-        "formats": ["V8", f"V{DISH_END - len(BEGIN) - 8}", "<f8", "<f8", "<f8"],
-        "offsets": [0, 8, 24, 32, 72],
+        "names": ["time", "frame", "x", "y", "z", "w"],  # z and w of the quaternion
+        "formats": ["V8", f"V{DISH_END - len(BEGIN) - 8}", "<f8", "<f8", "<f8", "<f8"],
+        "offsets": [0, 8, 24, 32, 64, 72],
         "itemsize": 80,
     }
 )
 
 
 def packed_path(stamp: Stamp, points: Points) -> bytes:
-    """Return a polyline of shape (m, 2) [m] as a Path."""
+    """Return a polyline of shape (m, 2) [m], or x, y [m] and angle [rad] of poses, shape (m, 3), as a Path."""
     poses = np.zeros(len(points), PATH_POSES)
     header = packed_header(stamp)[len(BEGIN) :]
     poses["time"], poses["frame"] = np.void(header[:8]), np.void(header[8:])
-    poses["x"], poses["y"], poses["w"] = points[:, 0], points[:, 1], 1.0
+    half = 0.5 * points[:, 2] if points.shape[1:] == (3,) else np.zeros(len(points))
+    poses["x"], poses["y"], poses["z"], poses["w"] = points[:, 0], points[:, 1], np.sin(half), np.cos(half)
     return pack("header uint32 raw", stamp, len(points), poses.tobytes())
 
 

@@ -215,6 +215,19 @@ def path_points(message: Any, field: str = interface.MEASURED_THREAD.name) -> Po
     return np.array([[p.pose.position.x, p.pose.position.y] for p in message.poses]).reshape(-1, 2)
 
 
+def path_poses(message: Any, field: str) -> Points:
+    """Return x, y [m] and angle [rad] of the poses of a Path in the dish plane, shape (m, 3).
+
+    Raises:
+        InvalidInputError: wrong frame, or a number is not finite.
+    """
+    turns = np.reshape([(p.pose.orientation.z, p.pose.orientation.w) for p in message.poses], (-1, 2))
+    found = np.column_stack([path_points(message, field), 2.0 * np.arctan2(turns[:, 0], turns[:, 1])])
+    if not np.isfinite(found).all():
+        raise InvalidInputError(field, "numbers that are not finite", "finite poses")
+    return found
+
+
 def thread_observation(message: Any, field: str = interface.THREAD_OBSERVATION.name) -> ThreadObservation:
     """Return a ThreadObservation that is valid.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from queue import SimpleQueue
 from threading import Thread as Worker
 from typing import TYPE_CHECKING, Any
@@ -28,6 +27,7 @@ from magnetosuture_thread import (
 )
 from magnetosuture_thread.configuration import to_mapping
 from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_forecast_markers, packed_thread_markers
@@ -35,6 +35,7 @@ from magnetosuture_thread.messages.packing import estimate_outputs, packed_forec
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
+from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.thread.prediction import STARTED
 from magnetosuture_thread.thread.program import SOLVED
 from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
@@ -201,7 +202,7 @@ class ThreadModelNode(ManagedNode[ThreadModelSettings]):
             if self._markers.get_subscription_count() and (result.prediction or result.estimate):
                 shown = (result.prediction, result.margins, self._session.thread.diameter, result.estimate)
                 self._markers.publish(packed_thread_markers(result.stamp, *shown))
-        self._states.show(result, step_time)
+        self._states.show(result, step_time, self._forecasts.problem if self._forecasts is not None else "")
 
     def prepare(self, settings: ThreadModelSettings) -> Callable[[], None]:
         """Return what puts other settings in force, from the next pose on."""
@@ -228,8 +229,11 @@ class ThreadHealth:
         self._disturbance: tuple[float, str] | None = None  # when it was put into words [s], and these
         self._refused_pieces = 0
 
-    def show(self, result: PredictionResult, step_time: float) -> None:
-        """Report what came of a pose or an observation, and how long the prediction took [s]."""
+    def show(self, result: PredictionResult, step_time: float, no_forecast: str) -> None:
+        """Report what came of a pose or an observation, how long the prediction took [s], and why there is no forecast.
+
+        No forecast for no reason is none that is asked for.
+        """
         if isinstance(result.estimate_problem, InvalidInputError):
             self._health.refuse(result.estimate_problem)
             return
@@ -244,7 +248,7 @@ class ThreadHealth:
             self._health.error(str(result.problem), **figures)
         elif self._waiting:
             self._health.warn(WAITING if estimate is None else f"estimating; the prediction is {WAITING}", **figures)
-        elif trouble := self._troubles(result):
+        elif trouble := [*self._troubles(result), *([f"no forecast: {no_forecast}"] if no_forecast else [])]:
             self._health.warn(f"predicting, but {'; '.join(trouble)}", **figures)
         else:
             self._health.ok("predicting", **figures)
@@ -289,7 +293,11 @@ class ThreadForecasts:
 
     It is made in a thread of its own, so that the node does not wait for it. While a forecast is made, only the newest
     estimate is kept for the next one. A service answers what would happen along a path instead.
-    What is held is the command that the coil bridge follows, of `needle/filter_state`; without one the needle rests.
+    The needle follows `procedure/plan`, or the command that the coil bridge follows, of `needle/filter_state`; without
+    one it rests. See `PublishedForecasts`.
+
+    Attributes:
+        problem: why forecasts are made and not published; empty if they are.
 
     Args:
         node: of the thread model; it reports what cannot be forecast.
@@ -301,12 +309,15 @@ class ThreadForecasts:
         self._last: tuple[PredictionResult, NeedlePose] | None = None
         self._started = -math.inf  # stamp of the last estimate that is forecast [ns]
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
-        self._command: tuple[int, np.ndarray, np.ndarray, str] | None = None  # stamp, commanded, filtered, input
+        settings = session.settings
+        self._choice = PublishedForecasts(NeedleKinematics(settings.needle_length, settings.needle_curvature))
+        self.problem = ""
         self._forecaster()
         self._generation = 0  # of the forecasts that are still wanted
         self._published = node.held(topics.FORECAST.publisher(node))
         self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
+        node.held(topics.PROCEDURE_PLAN.subscribe(node, self.on_plan))
         node.held(node.serve(interface.Service.FORECAST_PATH, self.on_path))
         # Stamp of the message [ns], generation, and what makes the forecast; None at the end.
         self._waiting: SimpleQueue[tuple[int, int, Callable[[], Forecast]] | None] = SimpleQueue()
@@ -321,13 +332,22 @@ class ThreadForecasts:
 
     def reset(self) -> None:
         """Publish nothing until there is another estimate, nor what is being made."""
-        self._last, self._command = None, None
+        self._last, self.problem = None, ""
+        self._choice.reset()
         self._generation += 1
 
     def on_filter_state(self, message: object) -> None:
         """Remember the command that the bridge follows."""
         try:
-            self._command = reading.filtered_command(message)
+            stamp, commanded, filtered, source = reading.filtered_command(message)
+            self._choice.on_command(1e-9 * stamp, commanded, filtered, source)
+        except InvalidInputError as error:
+            self._node.refuse(error)
+
+    def on_plan(self, message: object) -> None:
+        """Remember where the needle planner takes the needle."""
+        try:
+            self._choice.on_plan(reading.path_poses(message, topics.PROCEDURE_PLAN.name))
         except InvalidInputError as error:
             self._node.refuse(error)
 
@@ -349,15 +369,12 @@ class ThreadForecasts:
         self._last = result, pose
         elapsed = 1e-9 * abs(result.stamp - self._started)  # time may be set back
         if forecaster is None or elapsed < settings.forecast_period:
+            self._choice.update(pose, settings.forecast_horizon)
             return
         self._started = result.stamp
-        commanded, filtered, source = np.zeros(2), None, ""
-        # A command is held for no longer than half a second when none follows.
-        if self._command is not None and abs(result.stamp - self._command[0]) <= 500_000_000:
-            _, commanded, filtered, source = self._command
-        start = ForecastStart.of_estimate(result.estimate, pose, filtered)
-        slowed = source == "operator" or settings.friction_feedback == "all"
-        make = partial(forecaster.forecast, start, commanded, settings.forecast_horizon, slowed=slowed)
+        self.problem = self._choice.judge(result.estimate)
+        slowed = settings.friction_feedback == "all"
+        make = self._choice.prepare(forecaster, result.estimate, pose, settings.forecast_horizon, slowed=slowed)
         self._waiting.put((result.stamp, self._generation, make))
 
     def _work(self) -> None:
@@ -372,7 +389,8 @@ class ThreadForecasts:
 
     def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
         forecast = make()
-        if generation == self._generation:
+        self._choice.keep(forecast)
+        if generation == self._generation and not self.problem:
             self._published.publish(packed_forecast(stamp, forecast))
             if self._markers.get_subscription_count():
                 self._markers.publish(packed_forecast_markers(stamp, forecast))
@@ -406,6 +424,7 @@ class ThreadForecasts:
         """Return the forecaster of the settings and the scene in force; None without a scene."""
         settings, scene = self._session.settings, self._session.scene
         if self._made is None or self._made[0] is not settings or self._made[1] is not scene:
+            self._choice.reset()
             self._made, self._last = (settings, scene, None), None  # also where this fails: once is enough
             if scene is not None:
                 forecaster = make_forecaster(settings, scene)

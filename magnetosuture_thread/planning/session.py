@@ -500,7 +500,7 @@ class ProcedureSession:
             self._executor.update(*self._pose, condition)
 
     def new_plan(self) -> Points | None:
-        """Return where the middle of the needle is to go, shape (m, 2) [m]; None if that is as it was."""
+        """Return x, y [m] and angle [rad] of the chord where the needle is to go, shape (m, 3); None if as it was."""
         executor = self._executor
         if executor is None:
             return None
@@ -512,7 +512,7 @@ class ProcedureSession:
             ahead = [path for _, path in self._planned]
         else:
             ahead = [current, *(path for first, path in self._planned if first > executor.goal)]
-        return np.vstack([path.middles for path in ahead])
+        return np.vstack([np.column_stack([path.middles, path.angles]) for path in ahead])
 
 
 @cache

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.barrier import load_barriers
+from magnetosuture_thread.barrier import Barrier, load_barriers
 from magnetosuture_thread.configuration import Configuration, autostart_parameter, configuration_fields, quantity
 from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
 from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG
@@ -19,6 +20,7 @@ from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Atta
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
+from magnetosuture_thread.thread.self_contact import SelfContact
 from magnetosuture_thread.thread.solvers import SOLVERS
 
 OF_MEDIUM = {
@@ -156,7 +158,7 @@ class ThreadModelSettings(Configuration):
         choices=(AUTOMATIC, STIFFNESS_OVER_DRAG),
     )
     forecast_horizon: float = quantity(
-        0.0, "how far ahead thread/forecast looks, the present command held; 0 for none", "s", 0.0, 30.0
+        0.0, "how far ahead thread/forecast looks, by the plan or the command held; 0 for none", "s", 0.0, 30.0
     )
     forecast_step: float = quantity(0.03, "duration of its steps", "s", 0.001, 0.5)
     forecast_period: float = quantity(
@@ -239,7 +241,7 @@ class ThreadModelSettings(Configuration):
     def predictor(self, scene: Scene | None) -> ThreadPredictor:
         """Return a predictor of this thread in a scene, its kernels compiled.
 
-        They are loaded by steps in the bare dish: through shapes these would take seconds.
+        They are loaded by steps where nothing is, as a scene may have no room for the thread of these steps.
 
         Args:
             scene: dish and obstacles; None for neither.
@@ -247,16 +249,22 @@ class ThreadModelSettings(Configuration):
         Raises:
             ConfigurationError: a shape is too small for the segments; see `check_scene`.
         """
-        self._predictor(scene and Scene(scene.dish)).warm_up()
-        return self._predictor(scene)
+        self._in_the_void(scene).warm_up()
+        return self._predictor(scene, load_barriers(self.barriers, f"{self.GROUP}.barriers"))
 
-    def _predictor(self, scene: Scene | None) -> ThreadPredictor:
+    def _in_the_void(self, scene: Scene | None) -> ThreadPredictor:
+        """Return a predictor for a warm-up, with the kernels of a scene and without its wall, shapes and barriers."""
+        thread = self.thread()
+        touches_itself = scene is not None and scene.dish.has_self_contact(thread.diameter)
+        return self._predictor(None, [SelfContact(thread)] if touches_itself and self.formulation == "rod" else [])
+
+    def _predictor(self, scene: Scene | None, barriers: Sequence[Barrier]) -> ThreadPredictor:
         weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
         paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
         return ThreadPredictor(
             self.thread(),
             scene,
-            load_barriers(self.barriers, f"{self.GROUP}.barriers"),
+            barriers,
             formulation=self.formulation,
             solver=self.solver,
             paper=paper,
@@ -284,8 +292,9 @@ class ThreadModelSettings(Configuration):
         if not self.is_estimated:
             return None
         options = EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
-        ThreadEstimator(self._predictor(scene and Scene(scene.dish)), options).warm_up()
-        return EstimatorSession(ThreadEstimator(self._predictor(scene), options))
+        ThreadEstimator(self._in_the_void(scene), options).warm_up()
+        barriers = load_barriers(self.barriers, f"{self.GROUP}.barriers")
+        return EstimatorSession(ThreadEstimator(self._predictor(scene, barriers), options))
 
     def friction_law(self) -> FrictionLaw:
         """Return the friction law."""

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import create_autospec
@@ -16,6 +17,7 @@ import pytest
 
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.cli import main
+from magnetosuture_thread.commands import simulate as simulate_module
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate
 from magnetosuture_thread.errors import ConfigurationError, GraphError
@@ -185,13 +187,17 @@ def test_an_interrupted_run_on_a_simulated_clock_keeps_what_was_recorded(scenari
     assert bag.start < 1000e9  # on the simulation's own clock
 
 
-def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(tmp_path: Path):
+def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     (tmp_path / "near.yaml").write_text(NEAR)
     (tmp_path / "open.yaml").write_text(OPEN)
     output = tmp_path / "bag"
     summary_file = tmp_path / "figures.json"
     arguments = ["--procedure", str(tmp_path / "near.yaml"), "--rate", "0.5", "--json", str(summary_file)]
     assert main(["simulate", str(tmp_path / "open.yaml"), "--output", str(output), *arguments]) == 0
+    printed = capsys.readouterr().out
+    assert 0 <= printed.find("procedure near: succeeded, 1 of 1 goals met\n") < printed.find("open, closed loop")
     assert (output / SUMMARY_FILE).read_text() == summary_file.read_text()
     assert '"state": "done"' in summary_file.read_text()
     assert '"goals_met": 1' in summary_file.read_text()
@@ -200,3 +206,14 @@ def test_the_goals_of_a_procedure_are_met_and_the_summary_has_the_result(tmp_pat
     assert scenes == {read_scene("dish_35mm_post").version}  # the procedure's, in place of the setup's
     for channel, count in ((PROCEDURE_STATE, 5), (PROCEDURE_PLAN, 0), (NEEDLE_COMMAND, 10), (TIP_SETPOINT, 10)):
         assert bag.counts[channel.recorded] > count
+
+
+def test_a_procedure_that_fails_has_its_reason_before_the_table(
+    run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    outcome = {"procedure": "near", "state": "failed", "reason": "no way", "goals_met": 0, "goals": 1}
+    summary = create_autospec(simulate, return_value=replace(run[1], procedure=outcome))
+    monkeypatch.setattr(simulate_module, "simulate", summary)
+    assert main(["simulate", "short", "--output", str(tmp_path / "bag"), "--procedure", "near"]) == 1
+    printed = capsys.readouterr().out
+    assert 0 <= printed.find("procedure near: failed, 0 of 1 goals met: no way\n") < printed.find("short, closed loop")

@@ -22,6 +22,7 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
 from magnetosuture_thread.messages.packing import packed_forecast
@@ -67,6 +68,21 @@ def test_every_estimate_has_a_forecast_under_the_present_command(graph: Any, mon
     assert math.isnan(message.rest_time)
     assert message.peak_tension > 0.0
     graph.wait(lambda: any(marker.ns == "forecast" for each in markers for marker in each.markers), "markers")
+
+
+def test_a_forecast_that_is_worse_than_nothing_moves_is_withheld_with_the_reason(
+    graph: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(PublishedForecasts, "judge", lambda own, estimate: "they are worse")
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
+    forecasts, reports = graph.listen(topics.FORECAST), graph.listen(topics.DIAGNOSTICS)
+    for k in range(3):
+        bench.show(k, whole(NODES[k], k))
+    graph.wait(
+        lambda: any("no forecast: they are worse" in each.message for report in reports for each in report.status),
+        "the reason",
+    )
+    assert not forecasts
 
 
 def forecast_after(bench: Any, forecasts: list[Any]) -> Any:

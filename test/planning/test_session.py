@@ -114,7 +114,8 @@ def test_a_plan_moves_nothing_and_is_begun_by_an_act_of_its_own():
     assert run.on_pose(0.05, TAIL, EAST, 0.05) is None
     plan = run.new_plan()
     assert plan is not None
-    assert len(plan) == sum(len(path.middles) for path in paths)
+    np.testing.assert_array_equal(plan[:, :2], np.vstack([path.middles for path in paths]))
+    np.testing.assert_array_equal(plan[:, 2], np.concatenate([path.angles for path in paths]))
     assert run.new_plan() is None
     run.resume()
     velocities = [run.on_pose(0.1 + 0.05 * k, TAIL, EAST, 0.1 + 0.05 * k) for k in range(4)]

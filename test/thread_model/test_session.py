@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from magnetosuture_thread.barrier import Barrier, Gradient
 from magnetosuture_thread.configuration import from_mapping
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
-from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.forecast import make_forecaster
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.margins import Friction, FrictionState
@@ -20,7 +23,7 @@ from magnetosuture_thread.thread_model import settings as model_settings
 from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
-from test.thread.worlds import scene_with
+from test.thread.worlds import polygon, scene_with
 
 EAST = np.array([1.0, 0.0])
 SECOND = 1_000_000_000
@@ -63,6 +66,37 @@ def on_a_curve(session: ThreadSession, first: int, last: int) -> list[Prediction
     """Return what comes of a needle that is driven in a curve, at 30 Hz."""
     turns = np.arange(first, last) / 40.0
     return [go(session, 1.0 + 4.0 / 3.0 * k, 0.01 * np.sin(k), 0.01 - 0.01 * np.cos(k), k) for k in turns]
+
+
+class OverTheDish(Barrier):
+    """A barrier that cannot be evaluated of a thread behind the dish's centre."""
+
+    name = "over_the_dish"
+
+    def value(self, positions: Points) -> Points:
+        """Return the root of where the free end is."""
+        return np.sqrt(positions[-1:, 0])
+
+    def gradient(self, positions: Points) -> Gradient:
+        """Return its gradient."""
+        return Gradient(np.array([[len(positions) - 1]]), np.array([[[0.5 / np.sqrt(positions[-1, 0]), 0.0]]]))
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"thread_length": 0.15, "segments": 60}, {"barriers": [f"{__name__}:OverTheDish"]}]
+)
+@pytest.mark.parametrize("depth", [2e-5, 3e-3])
+def test_kernels_are_loaded_outside_of_the_scene(values: dict[str, Any], depth: float):
+    random, shapes = np.random.default_rng(4), list[Disc | Polygon]()
+    for _ in range(3):
+        centres, turns = random.uniform(-0.01, 0.01, (2, 2)), np.arange(0.0, 6.2, 0.9)
+        outline = centres[1] + 0.004 * np.column_stack([np.cos(turns), np.sin(turns)])
+        shapes += [Disc(tuple(centres[0].tolist()), 0.004), polygon(*outline.ravel().tolist())]
+    for diameter, count in ((0.012, 0), (0.022, 2), (0.035, 6)):
+        scene = scene_with(*shapes[:count], diameter=diameter)
+        scene = replace(scene, dish=replace(scene.dish, depth=depth))
+        assert ThreadSession(made(**values), scene).scene is scene
+        make_forecaster(made(**values), scene).warm_up()
 
 
 def test_a_pose_waits_for_the_thread_of_its_frame():

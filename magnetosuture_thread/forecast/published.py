@@ -1,0 +1,208 @@
+"""What a forecast goes by, the plan of the needle or the command that is held, and whether it is good enough."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.forecast.forecaster import Forecast, ForecastStart, ThreadForecaster
+from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.safety.motion import NeedleKinematics
+from magnetosuture_thread.thread.prediction import NeedlePose
+
+Vector = NDArray[np.float64]
+
+APPROACH = 4.0  # 1/s; at which a needle that is off its plan comes back to it
+
+
+@compiled
+def follow_plan(
+    plan: Points, travel: Vector, lever: float, pose: Vector, begin: float, speed: float, step: float, steps: int
+) -> Points:
+    """Return the velocity of the tip in each step of a needle that follows a plan, shape (k, 2) [m/s].
+
+    With the planned pose (p, theta_p) at the way s, which grows by the speed w, and the drive d and rate r of the plan
+    for each metre of that way, the middle x and angle theta of the chord move with
+
+        u = w d + k (p - x) . e(theta),    omega = w r + k (theta_p + atan(d y / lever) - theta)
+
+    where y is the error across the plan, to its left, and k is `APPROACH`.
+
+    Args:
+        plan: x, y [m] and angle [rad] of the chord at each pose, shape (m, 3).
+        travel: way of the tip up to each pose, rising, shape (m,) [m].
+        lever: half of the chord [m].
+        pose: x, y and angle of the chord now, shape (3,).
+        begin: way of the tip at which the needle is [m].
+        speed: w, until the end of the plan [m/s].
+        step: [s]
+        steps: k.
+    """
+    x, y, angle = pose[0], pose[1], pose[2]
+    velocities, at = np.zeros((steps, 2)), begin
+    for k in range(steps):
+        ahead = min(travel[-1], at + speed * step)
+        i = min(max(int(np.searchsorted(travel, ahead)), 1), len(travel) - 1)
+        length, w = max(travel[i] - travel[i - 1], 1e-12), (ahead - at) / step
+        delta = plan[i] - plan[i - 1]
+        planned = plan[i - 1] + (ahead - travel[i - 1]) / length * delta
+        c, s = math.cos(planned[2]), math.sin(planned[2])
+        drive, rate = (delta[0] * c + delta[1] * s) / length, delta[2] / length
+        off_x, off_y = planned[0] - x, planned[1] - y
+        turn = planned[2] + math.atan(drive * (c * off_y - s * off_x) / lever) - angle
+        turn -= 2.0 * math.pi * round(turn / (2.0 * math.pi))
+        e_x, e_y = math.cos(angle), math.sin(angle)
+        u, omega = w * drive + APPROACH * (off_x * e_x + off_y * e_y), w * rate + APPROACH * turn
+        velocities[k, 0], velocities[k, 1] = u * e_x - lever * omega * e_y, u * e_y + lever * omega * e_x
+        x, y, angle, at = x + step * u * e_x, y + step * u * e_y, angle + step * omega, ahead
+    return velocities
+
+
+class NeedlePlan:
+    """Poses that the needle is to go through, where it is on them, and how fast it gets on.
+
+    The way s is that of the tip in the needle's frame, |dx| + lever |dangle| summed up. The needle is at the nearest
+    pose by that measure, within `lever` of where it was. Its speed is measured over the time T,
+
+        w = sum of exp(-age / T) ds / sum of exp(-age / T) dt
+
+    as friction, tension and the coils slow it: a plan has no times.
+
+    Args:
+        poses: x, y [m] and angle [rad] of the chord, shape (m, 3), m >= 2.
+        lever: half of the chord [m].
+        speed: measured on the plan before, as its two sums [m, s].
+
+    Attributes:
+        at: s of the needle [m].
+        error: of the needle from the plan there [m].
+        speed: the two sums.
+    """
+
+    def __init__(self, poses: Points, lever: float, speed: tuple[float, float] = (0.0, 0.0)) -> None:
+        self._poses, self._lever = np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]), lever
+        steps = np.abs(np.diff(self._poses, axis=0))
+        self._travel = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + lever * steps[:, 2])])
+        self.at, self.error, self.speed = 0.0, math.inf, speed
+        self._stamp = math.inf
+
+    def update(self, stamp: float, pose: Vector, memory: float) -> None:
+        """Take a pose of the chord, shape (3,), of a needle that is commanded, and the time T [s]."""
+        first, last = np.searchsorted(self._travel, (self.at - self._lever, self.at + self._lever))
+        off = pose - self._poses[first : last + 1]
+        off[:, 2] = self._lever * (np.remainder(off[:, 2] + math.pi, 2.0 * math.pi) - math.pi)
+        errors = np.linalg.norm(off, axis=1)
+        nearest = int(errors.argmin())
+        ends = [max(first + nearest - 1, 0), min(first + nearest + 1, len(self._travel) - 1)]
+        way = np.diff(self._poses[ends], axis=0)[0] * (1.0, 1.0, self._lever)
+        beyond = float(off[nearest] @ way / max(way @ way, 1e-18))  # between the poses beside the nearest one
+        at = float(self._travel[first + nearest] + np.clip(beyond, -0.5, 0.5) * np.diff(self._travel[ends])[0])
+        interval = stamp - self._stamp
+        if 0.0 < interval < memory:
+            kept = math.exp(-interval / memory)
+            self.speed = kept * self.speed[0] + at - self.at, kept * self.speed[1] + interval
+        self._stamp, self.at, self.error = stamp, at, float(errors[nearest])
+
+    def commands(self, pose: Vector, step: float, steps: int) -> Points:
+        """Return the velocity of the tip in each step from a pose of the chord on, shape (steps, 2) [m/s]."""
+        speed = max(0.0, self.speed[0] / self.speed[1]) if self.speed[1] > 0.0 else 0.0
+        return np.asarray(follow_plan(self._poses, self._travel, self._lever, pose, self.at, speed, step, steps))
+
+
+class PublishedForecasts:
+    """Forecasts by the plan of the needle, else by the command that is held, and judges them by what came of them.
+
+    A needle that is nearer to its plan than half its chord, and is commanded by a program, is taken along the plan at
+    the speed at which it got on so far. Forecasts that were made within their horizon are compared with the thread now:
+    where their nodes are farther off, in the mean, than those of the threads that they began from, by more than the
+    deviation of the estimate, they are worse than a forecast that nothing moves.
+
+    Args:
+        needle: that is planned for.
+    """
+
+    def __init__(self, needle: NeedleKinematics) -> None:
+        self._needle = needle
+        NeedlePlan(np.zeros((2, 3)), 1e-3).commands(np.zeros(3), 1.0, 1)  # compiled before anybody waits for it
+        self._plan: NeedlePlan | None = None
+        self._made: deque[Forecast] = deque()
+        self._commanded, self._filtered, self._source = np.zeros(2), np.zeros(2), ""
+        self._command_stamp = -math.inf
+
+    def reset(self) -> None:
+        """Forget the command and all forecasts; the plan stays."""
+        self._made, self._command_stamp = deque(), -math.inf
+
+    def on_plan(self, poses: Points) -> None:
+        """Take a plan: x, y [m] and angle [rad] of the needle's chord, shape (m, 3); fewer than 2 poses for none."""
+        before = self._plan.speed if self._plan is not None else (0.0, 0.0)
+        self._plan = NeedlePlan(poses, 0.5 * self._needle.chord, before) if len(poses) > 1 else None
+
+    def on_command(self, stamp: float, commanded: Vector, filtered: Vector, source: str) -> None:
+        """Take the command that the coil bridge follows from a stamp on [s], shapes (2,) [m/s], and its input."""
+        self._command_stamp, self._commanded, self._filtered, self._source = stamp, commanded, filtered, source
+
+    def update(self, pose: NeedlePose, horizon: float) -> bool:
+        """Follow the needle to a pose on its plan; return whether it goes by that."""
+        if self._plan is None or self._source == "operator" or not self._holds(pose.stamp):
+            return False
+        self._plan.update(pose.stamp, self._chord(pose), horizon)
+        return self._plan.error < 0.5 * self._needle.chord
+
+    def prepare(
+        self, forecaster: ThreadForecaster, estimate: ThreadEstimate, pose: NeedlePose, horizon: float, *, slowed: bool
+    ) -> Callable[[], Forecast]:
+        """Return what makes the forecast from an estimate, in any thread.
+
+        Args:
+            forecaster: of thread and needle.
+            estimate: of the thread.
+            pose: of the needle's tail, at the same instant.
+            horizon: of the forecast [s].
+            slowed: whether friction slows every command that is held, and not those of an operator alone.
+        """
+        holds = self._holds(pose.stamp)
+        start = ForecastStart.of_estimate(estimate, pose, self._filtered if holds else None)
+        if self.update(pose, horizon) and self._plan is not None:
+            steps = max(1, round(horizon / forecaster.step))
+            commands = self._plan.commands(self._chord(pose), forecaster.step, steps)
+            return partial(forecaster.forecast, start, commands, horizon, slowed=False)  # the measured speed is slowed
+        commands = self._commanded if holds else np.zeros(2)
+        slowed = slowed or (holds and self._source == "operator")
+        return partial(forecaster.forecast, start, commands, horizon, slowed=slowed)
+
+    def keep(self, forecast: Forecast) -> None:
+        """Remember a forecast, to compare it with what comes of it."""
+        self._made.append(forecast)
+
+    def judge(self, estimate: ThreadEstimate) -> str:
+        """Return why forecasts are not to be published, by the thread as it is now; empty if they are."""
+        made, now, nodes = self._made, estimate.stamp, estimate.positions
+        while made and not 0.0 <= now - made[0].stamp <= made[0].horizon:
+            made.popleft()
+        off, moved = [], []
+        for each in tuple(made):
+            index = int(np.searchsorted(each.times, now - each.stamp))
+            if index < len(each.times):
+                off.append(np.linalg.norm(each.vertices[index] - nodes, axis=1).mean())
+                moved.append(np.linalg.norm(each.vertices[0] - nodes, axis=1).mean())
+        if not off or np.mean(off) <= np.mean(moved) + estimate.deviation.mean():
+            return ""
+        return "the last forecasts are farther off than a thread that does not move"
+
+    def _holds(self, stamp: float) -> bool:
+        """Return whether there is a command, which is held for no longer than half a second when none follows."""
+        return abs(stamp - self._command_stamp) <= 0.5
+
+    def _chord(self, pose: NeedlePose) -> Vector:
+        """Return x, y [m] and angle [rad] of the needle's chord, shape (3,)."""
+        along = self._needle.chord_direction(pose.heading)
+        middle = pose.tail + 0.5 * self._needle.chord * along
+        return np.array([middle[0], middle[1], math.atan2(along[1], along[0])])
