@@ -294,7 +294,7 @@ class ProcedureExecutor:
         is_last = self.goal + 1 == len(self.procedure.goals)
         # A thread may be wound or tight long before the end of the path, as its free end moves too.
         is_far = self.path.ends[self._reached] > self.travel + 2.0 * PROGRESS
-        if is_met and is_far and (isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last)):
+        if is_met and (isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last)):
             self._next_goal()
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
