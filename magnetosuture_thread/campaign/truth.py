@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from typing import Any
 
 import numpy as np
 import shapely
@@ -80,7 +81,7 @@ class GoalTruth:
         goal = self._procedure.goals[index]
         if isinstance(goal, PassThrough):
             made = self._passed[index]
-            return "" if made == 1 else f"{made} net crossings between {' and '.join(goal.between)}"
+            return "" if made >= 1 else f"{made} net crossings between {' and '.join(goal.between)}"
         if isinstance(goal, Wrap):
             wound, needed = self._wound(goal.around), self._needed(index)
             is_wound = (
@@ -136,16 +137,22 @@ class GoalTruth:
     def _gaps(self, goal: PassThrough) -> list[tuple[complex, complex]]:
         """Return start and vector of the lines across a gap, which the goal's direction crosses from right to left.
 
-        They are found among a thousand points around the first shape: where those are nearest to the second one, in the
-        middle of each run.
+        They are found among thousands of points around the first shape: where those are nearest to the second one, in
+        the middle of each run.
         """
         first, second = (self._solid(name) for name in goal.between)
-        around = shapely.get_exterior_ring(first) if first.geom_type == "Polygon" else first
-        points = shapely.line_interpolate_point(around, np.linspace(0.0, 1.0, 4000, endpoint=False), normalized=True)
-        away = shapely.distance(points, second)
-        near = away <= 1.001 * away.min() + 1e-7
-        if near.all():
-            near[:] = np.arange(len(near)) == int(away.argmin())
+        rings = shapely.get_parts(first.boundary if first.geom_type == "Polygon" else first)
+        share = np.linspace(0.0, 1.0, 4000, endpoint=False)
+        sampled = [shapely.line_interpolate_point(ring, share, normalized=True) for ring in rings]
+        least = min(float(shapely.distance(points, second).min()) for points in sampled)
+        return [line for points in sampled for line in self._lines_between(points, second, least, goal)]
+
+    @staticmethod
+    def _lines_between(
+        points: Any, second: shapely.Geometry, least: float, goal: PassThrough
+    ) -> list[tuple[complex, complex]]:
+        """Return the lines from points around a shape to another, where they are nearest; see `_gaps`."""
+        near = shapely.distance(points, second) <= 1.001 * least + 1e-7
         offset = int(np.argmin(near))  # a point that is not near, to begin with
         runs = np.split(np.roll(np.arange(len(near)), -offset), np.flatnonzero(np.diff(np.roll(near, -offset))) + 1)
         found, wanted = [], complex(*goal.direction) / abs(complex(*goal.direction))

@@ -222,6 +222,8 @@ class ProcedureExecutor:
     def set_planner(self, planner: NeedlePlanner) -> None:
         """Plan in another scene from now on; a procedure that does not fit it fails."""
         self.planner = planner
+        if self.state in ENDED:
+            return
         self._drop_path()
         self._holder = None
         self.pursuit = replace(self.pursuit, left=math.inf, aim=np.zeros(2))
@@ -334,7 +336,7 @@ class ProcedureExecutor:
 
     def _at_end(self, goal: Goal, middle: Vector) -> None:
         """Go on from the end of a path: to the next goal, or anew where this one is not reached."""
-        if isinstance(goal, Tighten):
+        if isinstance(goal, Tighten):  # else it would have ended before
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
             return
         assert self._begin is not None

@@ -296,7 +296,15 @@ class NeedlePlanner:
         A thread that is led around a shape loses what its free end wound about it before: the angle that is swept is
         corrected by that of the thread as it will lie.
         """
-        found, more = np.empty((0, 3)), 0.0
+        before, more = np.empty((0, 3)), 0.0
+        target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
+        if not target.allowed[state[1], state[0]]:  # first to where the shape of a wrap is in view
+            there = target._replace(places=target.allowed, allowed=target.places, cuts=np.empty((0, 4)), crossings=0)
+            before = self._search(there, kept, state)
+            if not len(before):
+                return before
+            state, thread = self._state_of(before[-1]), self.led(thread, before)
+        found = before
         for _ in range(3):
             target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
             found = self._search(target, kept, state)
@@ -306,7 +314,7 @@ class NeedlePlanner:
             if abs(short) <= WRAP_LEAD:
                 break
             more += short
-        return found
+        return np.vstack([before, found]) if len(found) else found
 
     def _left_to_wind(self, procedure: Procedure, index: int, goal: Wrap, thread: Points) -> float:
         """Return the angle, in its sense, that a wrap still asks of a thread, with what the needle goes on [rad]."""
@@ -405,19 +413,26 @@ class NeedlePlanner:
     def length_around(self, windings: Mapping[str, float]) -> float:
         """Return the length of thread that winds about shapes and leads from each to the next, at the least [m].
 
-            max(max_k l_k |w_k|, sum_k l_k max(0, |w_k| - pi) + sum_k d(k, k + 1)),    l_k = girth_k / 2 pi
+            max(max_k L_k(|w_k|), sum_k L_k(|w_k| - pi) + sum_k d(k, k + 1))
+            L(w) = girth floor(w / 2 pi) + r (w mod 2 pi)    for w > 0, else 0
 
-        A thread that is straight winds by up to pi, past a shape that other parts of it are wrapped around.
+        with the distance d between shapes, and r of a shape's hull from its centroid. A thread that is straight winds
+        by up to pi, past a shape that other parts of it are wrapped around.
 
         Args:
             windings: about each shape, in the order of the wraps [rad].
         """
         solids = [solid_of(self.scene, name) for name in windings]
-        radii = [float(solid.convex_hull.length) / (2.0 * math.pi) for solid in solids]
-        angles = [abs(angle) for angle in windings.values()]
-        alone = max((radius * angle for radius, angle in zip(radii, angles, strict=True)), default=0.0)
-        around = sum(radius * max(0.0, angle - math.pi) for radius, angle in zip(radii, angles, strict=True))
-        return max(alone, around + sum(float(first.distance(second)) for first, second in pairwise(solids)))
+
+        def around(solid: shapely.Geometry, angle: float) -> float:
+            hull = solid.convex_hull
+            turns, rest = divmod(max(0.0, angle), 2.0 * math.pi)
+            return float(hull.length * turns + hull.exterior.distance(solid.centroid) * rest)
+
+        pairs = list(zip(solids, map(abs, windings.values()), strict=True))
+        alone = max((around(solid, angle) for solid, angle in pairs), default=0.0)
+        together = sum(around(solid, angle - math.pi) for solid, angle in pairs)
+        return max(alone, together + sum(float(first.distance(second)) for first, second in pairwise(solids)))
 
     def _end_of(self, goal: Goal, start: Vector, state: Vector, kept: float) -> Vector | None:
         """Return the pose that a goal asks for, near a state of the lattice; None for none, or if it is not free."""
@@ -446,7 +461,11 @@ class NeedlePlanner:
                 for index, part in ((rows, slope[0] / self._step), (columns, slope[1] / self._step))
             ]
             free &= blocking[at[0], at[1]] > 0.0
-        return np.asarray(free)
+        # Not from inside of a ring, around which nothing can be led there.
+        filled = shapely.polygons(shapely.get_exterior_ring(solid_of(self.scene, name)))
+        shapely.prepare(filled)
+        x, y = (self.near.origin + self._step * index for index in (columns, rows))
+        return np.asarray(free & ~shapely.contains_xy(filled, x, y))
 
 
 def place_of(goal: GoTo | Tighten | Withdraw, start: Vector) -> Vector:
@@ -553,7 +572,9 @@ def _check_gap(planner: NeedlePlanner, where: str, goal: PassThrough, required: 
             _check_name(planner, f"{where}.between", name)
     between = gap_lines(planner.scene, goal.between)
     if not between:
-        raise ConfigurationError(f"{where}.between", list(goal.between), "two shapes with a gap between them")
+        raise ConfigurationError(
+            f"{where}.between", list(goal.between), "two shapes with a place where they are nearest"
+        )
     lines = lines_of_pass(planner.scene, goal)
     if not lines:
         across = (between[0][1] - between[0][0]) / math.dist(*between[0])

@@ -31,14 +31,18 @@ def gap_lines(scene: Scene, between: tuple[str, ...]) -> list[Points]:
     """Return the lines across the gaps between two shapes, from one to the other, each of shape (2, 2) [m].
 
     A gap is where the shapes are nearest, within a thousandth of their distance; its line is in the middle of that
-    stretch. Shapes that touch have none.
+    stretch. Shapes that touch have none, nor has one that is as far from the other all around, nor one that is gone.
     """
+    if not set(between) <= {WALL_NAME, *scene.names}:
+        return []
     first, second = sorted((solid_of(scene, name) for name in between), key=lambda solid: solid.area, reverse=True)
     width = first.distance(second)
     if not width > 0.0:
         return []
     nearest = first.boundary.intersection(second.buffer(1.001 * width, quad_segs=64))
-    stretches = [part for part in shapely.get_parts(shapely.line_merge(nearest)) if part.length > 0.0]
+    stretches = [
+        part for part in shapely.get_parts(shapely.line_merge(nearest)) if part.length > 0.0 and not part.is_ring
+    ]
     middles = [part.interpolate(0.5, normalized=True) for part in stretches]
     return [np.array(shapely.shortest_line(middle, second).coords) for middle in middles]
 
@@ -147,6 +151,8 @@ class GoalJudge:
             return f"the needle did not pass between {' and '.join(wanted.between)}"
         assert isinstance(wanted, Wrap)
         now, needed = self.windings[wanted.around], abs(self._procedure.windings[goal])
+        if math.isnan(now):
+            return "the thread is not known"
         wound = math.degrees(math.copysign(1.0, wanted.swept) * now)
         return f"the thread slips on {wanted.around}: it winds {wound:.0f} of {math.degrees(needed):.0f} degrees"
 

@@ -225,6 +225,24 @@ def test_a_tightened_thread_ends_its_goal_and_one_that_stays_slack_fails():
     assert "not tight" in run.reason
 
 
+@pytest.mark.parametrize("left", [1e-3, 8e-3])
+def test_a_thread_is_tight_wherever_that_is_on_the_path(left: float):
+    goals: list[dict[str, Any]] = [
+        {"wrap": {"around": "post", "angle": 2.0}},
+        {"tighten": {"tension": 1e-4, "toward": [-0.010, 0.006]}},
+    ]
+    run, needle = executor(*goals), Needle()
+    run.start()
+    needle.run(run, 60.0, until=lambda: run.goal == 1 and run.is_tracking)
+
+    def condition() -> ThreadCondition:
+        tight = run.path is not None and run.path.length - run.travel < left
+        return replace(KNOWN, vertices=needle.thread, tension=2e-4 if tight else 0.0)
+
+    needle.run(run, 60.0, condition)
+    assert (run.state, run.reason) == (ProcedureState.DONE, "")
+
+
 def test_tension_near_its_limit_slows_the_needle_down():
     """A thread whose tension grows with the speed is pulled no harder than the limit."""
     run, needle = executor({"go_to": {"position": [-0.012, 0.0]}}, tension=1e-4), Needle(0.008, 0.008, math.pi)
@@ -350,3 +368,5 @@ def test_a_shape_that_appears_in_a_gap_ahead_fails_the_procedure_and_one_in_a_ga
             assert "a gap in which plug does not lie" in run.reason
         else:
             assert run.state is ProcedureState.RUNNING
+        run.set_planner(NeedlePlanner(Scene(Dish()), NEEDLE, 2.5e-4, 0.05))  # the post is gone, and done with
+        assert run.state is (ProcedureState.RUNNING if passed else ProcedureState.FAILED)

@@ -187,6 +187,29 @@ def test_slits_that_are_passed_in_the_same_direction_are_each_crossed_and_none_i
     assert clearance(path, scene, planner.needle) > KEEP_OUT - 5e-6
 
 
+def test_a_shape_that_is_hidden_behind_another_is_wrapped_and_one_is_not_from_inside_of_it():
+    planner = NeedlePlanner(posts((0.006, 0.0, 0.002), (0.0, 0.0, 0.003)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
+    goal = {"wrap": {"around": "post_0", "angle": 6.0}}
+    (path,) = planner.plan_all(procedure(goal), np.array([-0.006, 0.0]), 0.0)
+    assert swept(path, np.array([0.006, 0.0])) > 6.0
+    ring = [(0.014 * math.cos(a), 0.014 * math.sin(a)) for a in np.linspace(0.0, math.tau, 64, False)]
+    hole = [(0.012 * math.cos(a), 0.012 * math.sin(a)) for a in np.linspace(math.tau, 0.0, 64, False)]
+    shape = SceneShape("ring", "tissue", Polygon(tuple(ring), (tuple(hole),)))
+    planner = NeedlePlanner(Scene(Dish(), (shape,)), NeedleKinematics(0.0025), KEEP_OUT, 0.1)
+    with pytest.raises(PlanningError, match="no way for the needle to wrap"):
+        planner.plan_all(procedure({"wrap": {"around": "ring", "angle": 6.0}}), np.array([0.004, 0.0]), 0.0)
+
+
+def test_a_bar_is_wrapped_by_less_thread_than_a_disc_of_its_girth():
+    """A straight thread of 12 mm beside a bar of 18 mm winds about its middle by 2.9 rad."""
+    outline = ((-0.009, -0.0005), (0.009, -0.0005), (0.009, 0.0005), (-0.009, 0.0005))
+    scene = Scene(Dish(), (SceneShape("bar", "tissue", Polygon(outline)),))
+    planner = NeedlePlanner(scene, NeedleKinematics(0.0025), KEEP_OUT, 0.012)
+    planner.check(procedure({"wrap": {"around": "bar", "angle": 2.2}}))
+    with pytest.raises(ConfigurationError, match="mm of thread"):
+        planner.check(procedure({"wrap": {"around": "bar", "angle": 6.4}}))
+
+
 def test_a_gap_to_the_wall_is_passed():
     planner = NeedlePlanner(posts((0.006, 0.0, 0.002)), NeedleKinematics(0.0025), KEEP_OUT, 0.05)
     goal = {"pass_through": {"between": ["wall", "post_0"], "direction": [0.0, 1.0]}}
