@@ -312,7 +312,7 @@ def run_procedure(
     Raises:
         ConfigurationError: the procedure does not fit the scene.
     """
-    planner = setup.planner.planner(setup.scene)
+    planner = setup.planner.planner(setup.scene, setup.coils)
     planner.check(procedure)
     pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
     execution = pilot.executor

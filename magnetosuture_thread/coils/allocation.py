@@ -45,7 +45,6 @@ MAX_CHANGE = 0.2  # of a gain
 DRIFT_DEVIATION = 2e-3  # of a gain in a second, as coils warm up
 DIRECTION_DEVIATION = 0.02  # rad; of a tracked needle, and of its shape against a straight one
 TORQUE_TIME = 1.0  # s; in which the thread's torque on the needle changes, as a thread is led around a turn
-GATE = 4.0  # standard deviations; a needle that is farther from the field is held by something
 MIN_SHARE = 0.98  # certified share of a velocity above which no further correction is made
 
 
@@ -169,10 +168,6 @@ class CoilAllocation:
         self._max_current = max_current
         self.gains = np.ones(len(self.names))
 
-    def chord_direction(self, heading: Vector) -> Vector:
-        """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        return self._needle.chord_direction(heading)
-
     def slack_speed(self, allocation: Allocation, heading: Vector) -> float:
         """Return the speed that the force of allocated currents gives a needle that lies along it, with a slack thread.
 
@@ -220,20 +215,14 @@ class CoilAllocation:
         e = needle.chord_direction(heading)
         n = np.array([-e[1], e[0]])
         lever = 0.5 * needle.chord
-        at_tail = self.gains * self._coils.per_current(tail)
-        at_tip = self.gains * self._coils.per_current(tail + needle.chord * e)
-        mean = 0.5 * (at_tail + at_tip)
-        pull = needle.pole * (at_tip - at_tail)
-        along = e @ pull / needle.drag
-        drifting = n @ pull / needle.drag_across
-        turning = lever * needle.pole * needle.chord / needle.turning_drag * (n @ mean)
+        middle = tail + lever * e
+        along, drifting, across_field, along_field = self._rows(middle, e)
+        turning = lever * needle.pole * needle.chord / needle.turning_drag * across_field
         # A tip speed of `max_turn_speed` needs a field at the largest angle that still turns the needle faster.
         max_turn_speed = MAX_FIELD_ANGLE_SINE * lever * needle.pole * needle.chord / needle.turning_drag * self._field
-        across = float(velocity @ n)
         # Where drift is to be compensated, the needle turns as commanded also where it slips all the same.
-        to_turn = turning + drifting if disturbance is None else turning
-        sideways = across if disturbance is None else across + disturbance.drift
-        sideways = min(max_turn_speed, max(-max_turn_speed, sideways))
+        to_turn, drift = (turning + drifting, 0.0) if disturbance is None else (turning, disturbance.drift)
+        sideways = min(max_turn_speed, max(-max_turn_speed, float(velocity @ n) + drift))
         reference_speed = needle.pole * self._field / needle.drag  # from the field at one pole alone
         effort, misaligned = np.full(len(self.names), CURRENT_WEIGHT / self._max_current), np.zeros(len(self.names))
         align_weight, turn_weight = ALIGN_WEIGHT, MAX_FIELD_ANGLE_SINE / max_turn_speed
@@ -241,37 +230,34 @@ class CoilAllocation:
             align_weight, turn_weight = COMPENSATED_ALIGN_WEIGHT, COMPENSATED_TURN_WEIGHT * turn_weight
             # What a coil's error does to drift and direction, for one ampere. Close to the coils' axes a force across
             # the needle takes large currents whose fields cancel each other, and their errors do not.
-            turned = lever / CORRECTION_TIME * (n @ mean) / (MIN_ALIGNING_SHARE * self._field)
+            turned = lever / CORRECTION_TIME * across_field / (MIN_ALIGNING_SHARE * self._field)
             # And what an error of the heading does to the drift: in a crossing it is on the other side of the axis.
             growth = min(math.log(MAX_HEADING_ERROR / HEADING_ERROR), ERROR_GROWTH * max(age, 0.0))
             error = HEADING_ERROR * math.exp(growth)
-            misaligned = error / HEADING_STEP * (self._drifting(tail, heading, HEADING_STEP) - drifting)
+            beside = math.cos(HEADING_STEP) * e + math.sin(HEADING_STEP) * n
+            misaligned = error / HEADING_STEP * (self._rows(middle, beside)[1] - drifting)
             effort = np.hypot(effort, COIL_ERROR / reference_speed * np.hypot(drifting, turned))
         system = np.vstack(
             [
                 along / reference_speed,
                 turn_weight * to_turn,
-                align_weight / self._field * (e @ mean),
+                align_weight / self._field * along_field,
                 drifting / reference_speed,
                 misaligned / reference_speed,
                 np.diag(effort),
             ]
         )
         target = np.zeros(len(system))
-        target[0] = float(velocity @ e) / reference_speed
-        target[1] = turn_weight * sideways
-        target[2] = align_weight
-        if disturbance is not None:
-            target[3] = -disturbance.drift / reference_speed
+        target[0], target[3] = float(velocity @ e) / reference_speed, -drift / reference_speed
+        target[1:3] = turn_weight * sideways, align_weight
         limit = np.full(len(self.names), self._max_current)
         lower, upper = -limit, limit
         if previous is not None:
-            lower = np.minimum(np.maximum(previous - max_change, -limit), limit)
-            upper = np.minimum(np.maximum(previous + max_change, -limit), limit)
+            lower, upper = (np.clip(previous + change, -limit, limit) for change in (-max_change, max_change))
         currents = self._bounded_least_squares(system, target, lower, upper)
-        if disturbance is not None and e @ mean @ currents < MIN_ALIGNING_SHARE * self._field:
+        if disturbance is not None and along_field @ currents < MIN_ALIGNING_SHARE * self._field:
             # A constraint that the optimum violates is active in the constrained optimum.
-            system[2] = CONSTRAINT_WEIGHT / self._field * (e @ mean)
+            system[2] = CONSTRAINT_WEIGHT / self._field * along_field
             target[2] = CONSTRAINT_WEIGHT * MIN_ALIGNING_SHARE
             currents = self._bounded_least_squares(system, target, lower, upper)
         reached = float(along @ currents) * e + float((turning + drifting) @ currents) * n
@@ -279,14 +265,40 @@ class CoilAllocation:
         saturated = inaccurate and bool(np.any(np.abs(currents) >= 0.999 * limit))
         return Allocation(currents, reached, saturated, float(drifting @ currents))
 
-    def _drifting(self, tail: Vector, heading: Vector, turned: float) -> Vector:
-        """Return the drift by each coil's ampere of the needle turned about its middle, shape (m,) [m/s]."""
-        needle, c, s = self._needle, math.cos(turned), math.sin(turned)
-        x, y = needle.chord_direction(heading).tolist()
-        e, n = np.array([c * x - s * y, s * x + c * y]), np.array([-s * x - c * y, c * x - s * y])
-        middle, lever = tail + 0.5 * needle.chord * np.array([x, y]), 0.5 * needle.chord
-        at_ends = self._coils.per_current(middle + lever * e) - self._coils.per_current(middle - lever * e)
-        return np.asarray(n @ (needle.pole * self.gains * at_ends) / needle.drag_across)
+    def _rows(self, middle: Vector, e: Vector) -> Vector:
+        """Return what one ampere in each coil gives a needle with its chord along e, shape (4, m).
+
+        Rows: velocity along the chord and across it, to its left [m/s]; mean field across it and along it [T].
+        """
+        needle, n = self._needle, np.array([-e[1], e[0]])
+        at_tail = self.gains * self._coils.per_current(middle - 0.5 * needle.chord * e)
+        at_tip = self.gains * self._coils.per_current(middle + 0.5 * needle.chord * e)
+        pull, mean = needle.pole * (at_tip - at_tail), 0.5 * (at_tail + at_tip)
+        return np.vstack([e @ pull / needle.drag, n @ pull / needle.drag_across, n @ mean, e @ mean])
+
+    def axes(self) -> tuple[float, ...]:
+        """Return the directions, of half a turn, in which the coils hold no needle against a pull across it [rad].
+
+        By currents of norm one that neither drive nor turn it nor change the field along it, a needle in the dish's
+        middle is given across it at the most the velocity
+
+            A(theta) = |(1 - P) w|
+
+        with the row w of that velocity, and P the projection onto the rows of the other three. An axis is where A falls
+        to less than half of what it is elsewhere: four coils have two, six have none.
+        """
+
+        def authority(angle: float) -> float:
+            rows = self._rows(np.zeros(2), np.array([math.cos(angle), math.sin(angle)]))
+            kept = np.linalg.qr(rows[[0, 2, 3]].T)[0]
+            return float(np.linalg.norm(rows[1] - kept @ (kept.T @ rows[1])))
+
+        found, axes = np.array([authority(angle) for angle in np.radians(np.arange(180.0))]), []
+        minima = (found < np.roll(found, 1)) & (found <= np.roll(found, -1)) & (found < 0.5 * found.max())
+        for angle in np.radians(np.flatnonzero(minima)).tolist():
+            before, after = authority(angle - HEADING_STEP), authority(angle + HEADING_STEP)
+            axes.append(round(angle + HEADING_STEP * (before - after) / (before + after), 6))  # it grows alike beside
+        return tuple(axes)
 
     def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:
         """Return the x of least |system x - target| within bounds, shapes (k, m), (k,), (m,) and (m,)."""
@@ -372,13 +384,12 @@ class CoilGainEstimator:
         before = last[2]
         turned = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
         turning = self._needle.turning_drag / self._needle.moment / interval  # field for one radian in the interval
-        deviation = math.hypot(
-            DIRECTION_DEVIATION * float(np.linalg.norm(fields @ self.gains)), HEADING_ERROR * turning
-        )
+        size = float(np.linalg.norm(fields @ self.gains))
+        deviation = math.hypot(DIRECTION_DEVIATION * size, HEADING_ERROR * turning)
         spread = self._covariance @ row
         variance = float(row @ spread) + deviation**2
         residual = turning * turned - float(row @ self._state)
-        if residual**2 > GATE**2 * variance:
+        if residual**2 > 16.0 * variance:  # four standard deviations: the needle is held by something
             return
         self._state = self._state + spread * (residual / variance)
         gains = self.gains
@@ -416,23 +427,6 @@ class CertifiedAllocation:
         self._coils = coils
         self._max_speed = max_speed
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The coils' names, in the order of their currents."""
-        return self._coils.names
-
-    def zero(self) -> Allocation:
-        """Return zero currents."""
-        return self._coils.zero()
-
-    def set_gains(self, gains: Vector) -> None:
-        """Set by which factor each coil's field differs from its calibration, shape (m,)."""
-        self._coils.gains = gains
-
-    def chord_direction(self, heading: Vector) -> Vector:
-        """Return the unit vector from tail to tip for the heading at the tail, shapes (2,)."""
-        return self._coils.chord_direction(heading)
-
     def allocate(
         self,
         velocity: Vector,
@@ -457,7 +451,7 @@ class CertifiedAllocation:
         if disturbance is None:
             return self._allocate(velocity, pose, safety, previous, max_change, None, 0.0)
         sidestep = min(max_sidestep, max(-max_sidestep, safety.sidestep(pose.tail, pose.heading)))
-        disturbed = disturbance.velocity(self._coils.chord_direction(pose.heading))
+        disturbed = disturbance.velocity(safety.kinematics.chord_direction(pose.heading))
         best, max_share = (self._coils.zero(), ""), -1.0
         for step in (sidestep, 0.0) if sidestep else (0.0,):
             found = self._allocate(velocity, pose, safety, previous, max_change, disturbance, step)
@@ -480,10 +474,9 @@ class CertifiedAllocation:
         sidestep: float,
     ) -> tuple[Allocation, str]:
         """Return currents for a velocity of the tip, and of the whole needle across its chord; see `allocate`."""
-        disturbed = aside = np.zeros(2)
-        to_compensate = disturbance
+        disturbed, aside, to_compensate = np.zeros(2), np.zeros(2), disturbance
         if disturbance is not None:
-            e = self._coils.chord_direction(pose.heading)
+            e = safety.kinematics.chord_direction(pose.heading)
             disturbed, aside = disturbance.velocity(e), sidestep * np.array([-e[1], e[0]])
             to_compensate = disturbance._replace(drift=disturbance.drift - sidestep)
         velocity = velocity + aside - disturbed

@@ -128,7 +128,7 @@ class CoilBridge:
         self.latch, self.scene_problem = latch, ""
         self.watchdogs = {name: CommandWatchdog(settings.command_timeout, topic) for name, topic in INPUTS.items()}
         self._hold = min(settings.command_timeout, settings.driver_timeout)  # the coils certainly hold a current
-        needle = settings.needle()
+        needle = self._needle = settings.needle()
         kinematics = needle.kinematics
         self.extrapolator = PoseExtrapolator(
             kinematics,
@@ -142,10 +142,10 @@ class CoilBridge:
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
         self._observer = MotionObserver(kinematics, self._hold, settings.max_speed)
         self._follow = FollowMonitor(settings.pose_uncertainty, needle.drag / needle.slack_drag)
-        self._settings, self._gains = settings, settings.gain_estimator()
-        self._coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
+        self._settings, self._gains, self._allocation = settings, settings.gain_estimator(), settings.allocation()
+        self._coils = CertifiedAllocation(self._allocation, settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None
-        self._losses, self._previous, self._velocity = 0, self._coils.zero(), np.zeros(2)
+        self._losses, self._previous, self._velocity = 0, self._allocation.zero(), np.zeros(2)
         self._last_step, self._was_armed, self._blocked, self._blocked_reason = -math.inf, False, -math.inf, ""
         self._stopped: float | None = None
         self.set_scene(scene)
@@ -153,7 +153,7 @@ class CoilBridge:
     @property
     def coils(self) -> tuple[str, ...]:
         """The coils' names, in the order of their currents."""
-        return self._coils.names
+        return self._allocation.names
 
     @property
     def scene(self) -> Scene | None:
@@ -220,7 +220,7 @@ class CoilBridge:
                 self.latch.trip(problem)
         if self._settings.motion_compensation:
             self._gains.update(tail, heading, stamp)
-            self._coils.set_gains(self._gains.gains)
+            self._allocation.gains = self._gains.gains
 
     def on_margins(self, stamp: float, valid: bool, slowdown: float, scene_version: str, arrival: float) -> None:
         """Register the thread model's margins; see `PredictionMonitor.update`."""
@@ -319,7 +319,8 @@ class CoilBridge:
         allocation, limiting = self._coils.allocate(
             filtered.filtered, pose, self._filter, self._previous, max_change, disturbance, sidestep
         )
-        e, limits = self._coils.chord_direction(pose.heading), (limiting, CURRENT_LIMIT if allocation.saturated else "")
+        e = self._needle.chord_direction(pose.heading)
+        limits = limiting, CURRENT_LIMIT if allocation.saturated else ""
         active += tuple(name for name in limits if name and name not in active)
         measured = MotionDisturbance() if disturbance is None else disturbance
         expected = allocation.velocity + measured.velocity(e)
@@ -347,7 +348,7 @@ class CoilBridge:
 
     def _probe_velocity(self, pose: Pose) -> Vector:
         """Return the tip velocity that turns the needle to see whether it follows, shape (2,) [m/s]."""
-        x, y = self._coils.chord_direction(pose.heading).tolist()
+        x, y = self._needle.chord_direction(pose.heading).tolist()
         return 0.5 * self.extrapolator.chord * self._follow.probe_rate * np.array([-y, x])
 
     def _select_input(self, now: float, arrival: float) -> _SelectedInput:
@@ -417,5 +418,5 @@ class CoilBridge:
 
     def _clear(self) -> None:
         """Restart the limits on change from zero current and velocity."""
-        self._previous, self._velocity = self._coils.zero(), np.zeros(2)
+        self._previous, self._velocity = self._allocation.zero(), np.zeros(2)
         self._gains.stop()

@@ -20,6 +20,7 @@ from rclpy.clock import Clock, ClockType
 from std_msgs.msg import Header
 
 from magnetosuture_thread import InvalidInputError, Scene, interface
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.interface import Service
@@ -27,6 +28,7 @@ from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
+from magnetosuture_thread.nodes.parameters import settings_of
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import read_procedure_text
@@ -51,6 +53,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(interface.PLANNER, NeedlePlannerSettings, **options)
+        self._coils = settings_of(self, CoilBridgeSettings, options)
         self._planning = ThreadPoolExecutor(1)
         self._moving = False  # whether the last command was not zero
         self._scene = SceneFollower(self, self.on_scene)
@@ -58,7 +61,8 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
 
     def allocate(self, settings: NeedlePlannerSettings) -> None:
         """Load the planner's kernels, and offer what it does."""
-        self._session = ProcedureSession(settings, self._scene.load(settings.scene), self._planning.submit)
+        scene = self._scene.load(settings.scene)
+        self._session = ProcedureSession(settings, scene, self._planning.submit, self._coils)
         with self.health.load("the planner's kernels"):
             compile_planning()
         self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, TypeVar
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 import rclpy
@@ -103,6 +103,30 @@ def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[
     if isinstance(clock := given.get("use_sim_time"), bool):
         node.set_parameters([Parameter("use_sim_time", value=clock)])
     return {name: value for name, value in given.items() if name.split(".")[0] not in ROS_PARAMETERS}
+
+
+def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
+    """Return the settings of another kind of node in the namespace of this one, as the same files give them.
+
+    What no file gives keeps its default.
+
+    Args:
+        node: this one.
+        cls: settings of the other.
+        options: as given to this node; of its own parameters those count that nodes share.
+
+    Raises:
+        ConfigurationError: a value is invalid.
+    """
+    name = f"{node.get_fully_qualified_name().rpartition('/')[0]}/{cls.GROUP}"
+    other = SimpleNamespace(
+        get_name=lambda: cls.GROUP, get_fully_qualified_name=lambda: name, set_parameters=lambda _: None
+    )
+    own = [each for each in options.get("parameter_overrides") or [] if each.name in SHARED_PARAMETERS]
+    known, given = {each.name for each in configuration_fields(cls)}, {each.name: plain_value(each) for each in own}
+    with suppress(ConfigurationError):  # a file that is for this node alone
+        given = given_parameters(cast(Node, other), cls.GROUP, {**options, "parameter_overrides": own})
+    return from_mapping(cls, {name: value for name, value in given.items() if name in known})
 
 
 def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:

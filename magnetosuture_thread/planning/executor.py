@@ -377,7 +377,7 @@ class ProcedureExecutor:
             return False
         pending, self._pending = self._pending, None
         self.path = pending.result()
-        self._tracker, self._reached = PathTracker(self.path, self.planner.coil_angles), 0
+        self._tracker, self._reached = PathTracker(self.path, self.planner.axes), 0
         return True
 
     def _plan_ahead(self, goal: Wrap) -> None:
@@ -408,7 +408,7 @@ class ProcedureExecutor:
         """Return the command that keeps the needle where it was when this began, against what pulls it."""
         limits = self.procedure.limits[self.goal]
         if self._holder is None:
-            self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.coil_angles)
+            self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.axes)
         at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
         return self._holder.compute_command(*at, hold=True).velocity
 

@@ -71,7 +71,7 @@ class NeedlePlanner:
         needle: its kinematics.
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
-        coil_angles: direction of each coil from the dish's centre [rad], for `PathTracker`.
+        axes: of the coils [rad], for `PathTracker`.
 
     Attributes:
         looked: states of the lattice that were looked at so far.
@@ -86,13 +86,13 @@ class NeedlePlanner:
         needle: NeedleKinematics,
         keep_out: float,
         thread_length: float,
-        coil_angles: Sequence[float] = (),
+        axes: Sequence[float] = (),
     ) -> None:
         least = needle.chord + 2.0 * keep_out
         if scene.dish.diameter <= least:
             expected = f"more than {least:g} m, room for the needle and the clearance on both sides"
             raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
-        self.scene, self.needle, self.coil_angles = scene, needle, tuple(coil_angles)
+        self.scene, self.needle, self.axes = scene, needle, tuple(axes)
         self.keep_out, self.thread_length = keep_out, thread_length
         self.near = map_clearance(scene)
         self.lever = 0.5 * needle.chord

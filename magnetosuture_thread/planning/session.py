@@ -10,6 +10,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.needle_arc import check_needle
@@ -45,7 +46,6 @@ class NeedlePlannerSettings(Configuration):
     needle_length: float = shared_parameter("needle_length")
     needle_curvature: float = shared_parameter("needle_curvature")
     thread_length: float = shared_parameter("thread_length")
-    coil_angles: tuple[float, ...] = shared_parameter("coil_angles")
     friction_feedback: str = shared_parameter("friction_feedback")
     keep_out: float = shared_parameter("keep_out")
     pose_margin: float = shared_parameter("pose_margin")
@@ -96,11 +96,12 @@ class NeedlePlannerSettings(Configuration):
         """Reject a coiled needle."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
-    def planner(self, scene: Scene) -> NeedlePlanner:
-        """Return a planner for a scene."""
+    def planner(self, scene: Scene, coils: CoilBridgeSettings | None = None) -> NeedlePlanner:
+        """Return a planner for a scene, that knows the axes of the coil bridge's coils."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
         clearance = self.keep_out + self.pose_margin  # as the bridge's filter
-        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, self.coil_angles)
+        axes = coils.allocation().axes() if coils else ()
+        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, axes)
 
 
 class _Margins(NamedTuple):
@@ -306,14 +307,21 @@ class ProcedureSession:
         settings: of the planner.
         scene: dish and shapes; None until one is known.
         submit: begins to plan a path while the needle is moved; see `ProcedureExecutor`.
+        coils: settings of the coil bridge that follows.
 
     Attributes:
         known: what the loop's nodes report.
         planned_duration: of what was planned last, at the allowed speed, without friction [s].
     """
 
-    def __init__(self, settings: NeedlePlannerSettings, scene: Scene | None, submit: PathSubmitter = plan_now) -> None:
-        self._settings, self._submit = settings, submit
+    def __init__(
+        self,
+        settings: NeedlePlannerSettings,
+        scene: Scene | None,
+        submit: PathSubmitter = plan_now,
+        coils: CoilBridgeSettings | None = None,
+    ) -> None:
+        self._settings, self._submit, self._coils = settings, submit, coils
         self.known = LoopState(settings)
         self.planned_duration = 0.0
         self._planner: NeedlePlanner | None = None
@@ -366,7 +374,7 @@ class ProcedureSession:
         Raises:
             ConfigurationError: the needle has no room in it; the scene of before stays.
         """
-        self._planner = self._settings.planner(scene)
+        self._planner = self._settings.planner(scene, self._coils)
         self.known.scene_version = scene.version
         del self._planned[1:]  # paths of later goals, by the scene of before
         self._shown = None

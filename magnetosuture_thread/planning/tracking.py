@@ -77,7 +77,7 @@ class PathTracker:
     profile between the places where the needle changes between ahead and back. It waits while the needle is farther
     from it than `MAX_LAG` along the path or `MAX_ANGLE`.
 
-    Along the axis of a coil no currents give a force across the needle. Where something pulls it across its chord at
+    Along the axes of the coils no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off the axes by
     min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
     crosses, or while the needle is far off its path to the wrong side, as a ship tacks, but not within `MIN_TACK_TIME`
@@ -93,12 +93,11 @@ class PathTracker:
 
     Args:
         path: to track.
-        coil_angles: direction of each coil from the dish's centre [rad]; none where it does not matter.
+        axes: directions in which the coils give no force across the needle, see `CoilAllocation.axes` [rad].
     """
 
-    def __init__(self, path: BodyPath, coil_angles: Sequence[float] = ()) -> None:
-        self.path = path
-        self._axes = tuple({round(math.remainder(angle, math.pi), 6) for angle in coil_angles})
+    def __init__(self, path: BodyPath, axes: Sequence[float] = ()) -> None:
+        self.path, self._axes = path, tuple(axes)
         self.travel = 0.0
         turning = turning_points(path.middles, path.angles, path.lever)
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]

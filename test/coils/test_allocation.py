@@ -118,3 +118,21 @@ def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_c
     fields = [coils.per_current(at) @ found.currents for at in (tail, tail + needle.chord * e)]
     assert 0.5 * (fields[0] + fields[1]) @ e > 0.35 * settings.aligning_field
     assert found.velocity @ n - found.drift == pytest.approx(-0.001, abs=1e-4)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, np.pi / 4])
+def test_along_the_axes_of_coils_no_currents_hold_the_needle_and_beside_them_they_do(turn: float):
+    coils = LoopCoils(coils_around([turn + k * np.pi / 2 for k in range(4)], 0.05, 0.025, 1.2e-3))
+    made, pull = CoilAllocation(coils, NEEDLE, 0.008, 10.0), MotionDisturbance(0.0, 1e-3)
+    assert made.axes() == pytest.approx([turn, turn + 0.5 * np.pi], abs=1e-3)
+    for axis in made.axes():
+        drifts = []
+        for angle in (axis - 0.3, axis, axis + 0.3):
+            e = turned(EAST, angle)
+            drifts.append(made.allocate(-pull.velocity(e), -0.5 * NEEDLE.chord * e, e, disturbance=pull).drift)
+        assert drifts == pytest.approx([-1e-3, 0.0, -1e-3], abs=2e-4)
+
+
+def test_six_coils_have_no_axis():
+    coils = LoopCoils(coils_around([k * np.pi / 3 for k in range(6)], 0.05, 0.025, 1.2e-3))
+    assert CoilAllocation(coils, NEEDLE, 0.008, 10.0).axes() == ()

@@ -16,6 +16,7 @@ from magnetosuture_thread.geometry.obstacles import Polygon
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True, needle_length=0.0025, keep_out=2.5e-4)
+ZERO = SETTINGS.allocation().zero()
 HEADING = 0.6  # rad; off the axes of the coils, where there is a force across the needle
 E = np.array([math.cos(HEADING), math.sin(HEADING)])
 LEFT = np.array([-E[1], E[0]])
@@ -39,7 +40,7 @@ def test_a_needle_too_close_to_a_block_leaves_it_sideways_against_what_pulls_it(
     safety, coils = SETTINGS.safety_filter(scene), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
     pose = Pose(-1.25e-3 * E, E)
     disturbance = MotionDisturbance(0.0, side * pull)
-    found, _ = coils.allocate(1e-3 * E, pose, safety, coils.zero(), math.inf, disturbance, 2e-3)
+    found, _ = coils.allocate(1e-3 * E, pose, safety, ZERO, math.inf, disturbance, 2e-3)
     assert -side * (found.drift + disturbance.drift) > 5e-4
     share, _ = safety.safe_share(
         found.velocity + disturbance.velocity(E), pose.tail, pose.heading, found.drift + disturbance.drift
@@ -51,7 +52,7 @@ def test_it_is_taken_off_no_faster_than_it_may():
     safety, coils = SETTINGS.safety_filter(blocks(1e-4)), CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed)
     pose = Pose(-1.25e-3 * E, E)
     for limit in (0.0, 1e-4, 5e-4):
-        found, _ = coils.allocate(1e-4 * E, pose, safety, coils.zero(), math.inf, MotionDisturbance(), limit)
+        found, _ = coils.allocate(1e-4 * E, pose, safety, ZERO, math.inf, MotionDisturbance(), limit)
         assert -found.drift == pytest.approx(limit, rel=0.1, abs=5e-5)
 
 
@@ -62,7 +63,7 @@ def test_command_and_compensation_give_a_needle_with_a_slack_thread_no_more_than
     for angle in np.linspace(0.0, 2.0 * math.pi, 12):
         e = np.array([math.cos(angle), math.sin(angle)])
         pose = Pose(-0.5 * needle.chord * e, e)
-        found, limit = coils.allocate(2e-3 * e, pose, safety, coils.zero(), math.inf, MotionDisturbance(-5e-3, 1e-3))
+        found, limit = coils.allocate(2e-3 * e, pose, safety, ZERO, math.inf, MotionDisturbance(-5e-3, 1e-3))
         force = math.hypot((found.velocity @ e) * needle.drag, found.drift * needle.drag_across)
         assert force / needle.slack_drag <= 2e-3 * (1.0 + 1e-9)
         assert limit == "speed"
@@ -75,7 +76,7 @@ def test_where_currents_are_not_certified_with_what_is_measured_they_are_without
     safety = SETTINGS.safety_filter(blocks(left, -right))
     coils, pose = CertifiedAllocation(SETTINGS.allocation(), SETTINGS.max_speed), Pose(-1.25e-3 * E, E)
     disturbance, wanted = MotionDisturbance(*random.uniform(-3e-3, 3e-3, 2)), random.uniform(-4e-3, 4e-3, 2)
-    found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, disturbance)
+    found, _ = coils.allocate(wanted, pose, safety, ZERO, math.inf, disturbance)
     shares = [
         safety.safe_share(found.velocity + more.velocity(E), pose.tail, pose.heading, found.drift + more.drift)[0]
         for more in (disturbance, MotionDisturbance())
@@ -93,7 +94,7 @@ def test_a_velocity_along_the_wall_is_reached_where_the_coils_draw_the_needle_to
     pose = Pose(reach * out - 0.5 * needle.chord * e, e)
     wanted = safety.filter(0.005 * e + 0.003 * out, pose.tail, pose.heading).filtered
     coils = CertifiedAllocation(settings.allocation(), settings.max_speed)
-    found, _ = coils.allocate(wanted, pose, safety, coils.zero(), math.inf, None)
+    found, _ = coils.allocate(wanted, pose, safety, ZERO, math.inf, None)
     assert np.linalg.norm(found.velocity - wanted) < 1.5e-4
     assert safety.safe_share(found.velocity, pose.tail, pose.heading)[0] > 0.999
 
@@ -106,7 +107,7 @@ def test_a_needle_on_a_coil_s_axis_that_is_pulled_to_a_block_may_be_driven_along
     pose = Pose(-1.25e-3 * east, east)
 
     def allocated(velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        found, _ = coils.allocate(velocity, pose, safety, coils.zero(), math.inf, pull)
+        found, _ = coils.allocate(velocity, pose, safety, ZERO, math.inf, pull)
         assert found.drift + pull.drift > 5e-4
         return found.velocity
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from rclpy.context import Context
 
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.nodes.parameters import init
+from magnetosuture_thread.nodes.parameters import init, settings_of
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
 
@@ -123,3 +124,22 @@ def test_a_file_of_which_nothing_applies_or_that_is_none_is_refused(
 def test_sections_of_others_do_not_matter(followed):
     text = "/lab1/camera: {ros__parameters: {exposure: 3}}\n/**/coil_bridge: {ros__parameters: {rate: 50.0}}\n"
     assert followed([OWN + text], LAB1)[1] == 0.004
+
+
+def test_a_node_knows_the_settings_of_another_by_the_same_files(tmp_path: Path, domain: int):
+    bridge = "/**/coil_bridge: {ros__parameters: {needle_moment: 5.0e-4}}\n"
+    own = "/**/path_follower: {ros__parameters: {pose_timeout: 0.06}}\n"  # of a name that the bridge has too
+    for text, moment in ((COMMON + bridge + own, 5e-4), (COMMON + own, CoilBridgeSettings().needle_moment)):
+        file = tmp_path / "setup.yaml"
+        file.write_text(text)
+        context, node = Context(), None
+        try:
+            init(["program", "--ros-args", "--params-file", str(file), *LAB1], context)
+            node = PathFollowerNode(context=context)
+            found = settings_of(node, CoilBridgeSettings, {"context": context})
+            assert (found.needle_length, found.needle_moment) == (0.006, moment)
+            assert found.pose_timeout == CoilBridgeSettings().pose_timeout
+        finally:
+            if node is not None:
+                node.destroy_node()
+            context.try_shutdown()
