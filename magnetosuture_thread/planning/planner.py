@@ -180,7 +180,8 @@ class NeedlePlanner:
                 begin = np.array([[*middle, states[0, 2] + math.remainder(angle - states[0, 2], 2.0 * math.pi)]])
                 states = np.vstack([begin, states])
                 return smooth_path(states, np.array(ends), self.lever, self.body, required, margin, self.near)
-        where, kept = f"{1e3 * middle[0]:.1f}, {1e3 * middle[1]:.1f} mm", f"{1e3 * required:.3g} mm around it"
+        x, y = 1e3 * (states[-1, :2] if len(states) else middle)
+        where, kept = f"{x:.1f}, {y:.1f} mm", f"{1e3 * required:.3g} mm around it"
         raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}, with {kept}", len(ends))
 
     def led(self, thread: Points, poses: Points) -> Points:
