@@ -176,13 +176,12 @@ def measure_accuracy(name: str, period: float, horizon: float, seed: int) -> dic
         if pose.stamp < due:
             choice.update(pose, horizon)
             continue
-        due, count = due + period, count + 1
-        problem = choice.judge(estimate)
-        forecast = choice.prepare(made, estimate, pose, horizon, slowed=slowed)()
-        choice.keep(forecast)
         end = pose.stamp + made.step * round(horizon / made.step)
         if end > record.frame_times[-1]:
             break
+        due, count = due + period, count + 1
+        problem = choice.judge(estimate)
+        forecast = choice.prepare(made, estimate, pose, horizon, slowed=slowed)()
         failed += bool(forecast.problem)
         if problem or forecast.problem:
             continue

@@ -171,7 +171,7 @@ class Graph(Protocol):
                         "prediction_only": bool, "unmeasured_for": s, "hidden": share,
                         "disturbances": [{"position": [x, y], "direction": [x, y], "force": N, "text": str}, ...],
                         "age": s} | None,
-          "forecast": {"horizon": s,        # while the present command is held
+          "forecast": {"horizon": s,        # along the plan, or while the present command is held
                        "ghosts": [{"time": s, "vertices": [[x, y], ...]}, ...],   # the thread, last at the horizon
                        "events": [str],     # what happens when
                        "problem": str,      # why it ends early, empty if it does not

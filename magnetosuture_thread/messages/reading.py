@@ -219,12 +219,14 @@ def path_poses(message: Any, field: str) -> Points:
     """Return x, y [m] and angle [rad] of the poses of a Path in the dish plane, shape (m, 3).
 
     Raises:
-        InvalidInputError: wrong frame, or a number is not finite.
+        InvalidInputError: wrong frame, too many poses, or one that is not finite or far away.
     """
+    if len(message.poses) > 20_000:
+        raise InvalidInputError(field, f"{len(message.poses)} poses", "at most 20000")
     turns = np.reshape([(p.pose.orientation.z, p.pose.orientation.w) for p in message.poses], (-1, 2))
     found = np.column_stack([path_points(message, field), 2.0 * np.arctan2(turns[:, 0], turns[:, 1])])
-    if not np.isfinite(found).all():
-        raise InvalidInputError(field, "numbers that are not finite", "finite poses")
+    if not (np.abs(found) <= (0.5, 0.5, math.inf)).all():  # m, m, rad
+        raise InvalidInputError(field, "a pose that is not finite or far away", "within 0.5 m")
     return found
 
 

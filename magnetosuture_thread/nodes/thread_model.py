@@ -311,9 +311,8 @@ class ThreadForecasts:
         self._made: tuple[ThreadModelSettings, Scene | None, ThreadForecaster | None] | None = None
         settings = session.settings
         self._choice = PublishedForecasts(NeedleKinematics(settings.needle_length, settings.needle_curvature))
-        self.problem = ""
+        self.problem, self._generation = "", 0  # the latter of the forecasts that are still wanted
         self._forecaster()
-        self._generation = 0  # of the forecasts that are still wanted
         self._published = node.held(topics.FORECAST.publisher(node))
         self._markers = node.held(topics.THREAD_MARKERS.publisher(node))
         node.held(topics.FILTER_STATE.subscribe(node, node.while_active(self.on_filter_state)))
@@ -389,7 +388,6 @@ class ThreadForecasts:
 
     def _publish(self, stamp: int, generation: int, make: Callable[[], Forecast]) -> None:
         forecast = make()
-        self._choice.keep(forecast)
         if generation == self._generation and not self.problem:
             self._published.publish(packed_forecast(stamp, forecast))
             if self._markers.get_subscription_count():
@@ -424,8 +422,9 @@ class ThreadForecasts:
         """Return the forecaster of the settings and the scene in force; None without a scene."""
         settings, scene = self._session.settings, self._session.scene
         if self._made is None or self._made[0] is not settings or self._made[1] is not scene:
-            self._choice.reset()
-            self._made, self._last = (settings, scene, None), None  # also where this fails: once is enough
+            self.reset()
+            self._choice.on_needle(NeedleKinematics(settings.needle_length, settings.needle_curvature))
+            self._made = settings, scene, None  # also where this fails: once is enough
             if scene is not None:
                 forecaster = make_forecaster(settings, scene)
                 forecaster.warm_up()

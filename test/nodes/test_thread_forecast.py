@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from threading import Event, current_thread
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
-from magnetosuture_thread.messages.packing import packed_forecast
+from magnetosuture_thread.messages.packing import packed_forecast, packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import make_path_follower
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
@@ -85,10 +86,54 @@ def test_a_forecast_that_is_worse_than_nothing_moves_is_withheld_with_the_reason
     assert not forecasts
 
 
-def forecast_after(bench: Any, forecasts: list[Any]) -> Any:
-    """Show the next frame and return the forecast from it."""
+def test_a_forecast_that_is_made_for_other_settings_is_dropped(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    begun, go, forecast = Event(), Event(), ThreadForecaster.forecast
+
+    def delayed(*arguments: Any, **options: Any) -> Any:
+        if current_thread().name == "forecasts":
+            begun.set()
+            go.wait(30.0)
+        return forecast(*arguments, **options)
+
+    bench = counting(monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03)
+    forecasts = graph.listen(topics.FORECAST)
+    monkeypatch.setattr(ThreadForecaster, "forecast", delayed)
+    bench.show(0)
+    assert begun.wait(30.0)
+    bench.node.change({"segments": 30})
+    bench.show(1)
+    go.set()
+    graph.wait(lambda: bool(forecasts), "a forecast")
+    assert forecast_after(bench, forecasts, 2).header.stamp == stamp(2)
+    assert [len(each.positions) / len(each.time) for each in forecasts] == [31, 31]
+
+
+def test_a_plan_is_followed_with_the_needle_that_is_set(graph: Any, monkeypatch: pytest.MonkeyPatch):
+    bench = counting(
+        monkeypatch, graph, scene="dish_150mm", forecast_horizon=HORIZON, forecast_step=0.03, needle_length=0.007
+    )
+    forecasts = graph.listen(topics.FORECAST)
+    bench.show(0)
+    graph.wait(lambda: bool(forecasts), "a forecast")
+    ahead = np.linspace(0.0, 0.04, 400)  # to the left of the needle, which points east
+    plan = np.column_stack([WAY[0].tail[0] + ahead, np.full(400, WAY[0].tail[1] + 0.0045), np.zeros(400)])
+    graph.publish(topics.PROCEDURE_PLAN, topics.PROCEDURE_PLAN.decode(packed_path(7, plan)))
+    state = filter_state(1, 0.004, 0.0)
+    state.source = "needle"
+    graph.publish(topics.FILTER_STATE, state)
+    graph.wait(lambda: forecast_after(bench, forecasts).commanded.x == 0.004, "a forecast under the command")
+    bench.node.change({"needle_length": 0.014})
+    forecast_after(bench, forecasts)  # which forgets the command
+    state.header = wire.header(stamp(len(forecasts)))
+    graph.publish(topics.FILTER_STATE, state)
+    graph.wait(lambda: forecast_after(bench, forecasts).commanded.y > 1e-3, "a forecast to the plan")
+
+
+def forecast_after(bench: Any, forecasts: list[Any], frame: int | None = None) -> Any:
+    """Show a frame, the next one by default, and return the forecast from it."""
     before = len(forecasts)
-    bench.show(before, whole(NODES[before], before))
+    k = before if frame is None else frame
+    bench.show(k, whole(NODES[k], k))
     bench.graph.wait(lambda: len(forecasts) > before, "a forecast")
     return forecasts[-1]
 

@@ -164,7 +164,7 @@ export class Dish {
     this.context.setLineDash([]);
   }
 
-  // Where the thread will be while the present command is held, fainter the later.
+  // Where the thread will be along the plan, or while the present command is held, fainter the later.
   #drawGhosts(ghosts, dark) {
     ghosts.forEach(({ vertices }, at) => {
       this.context.globalAlpha = 0.55 - 0.13 * at;

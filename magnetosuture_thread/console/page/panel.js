@@ -135,7 +135,7 @@ function showVision({ graph, since, hasImage }) {
   write("vision", capital(lines.join(", ")));
 }
 
-// What happens ahead if the present command is held.
+// What happens ahead along the plan, or if the present command is held.
 function showForecast({ graph, since }) {
   const forecast = graph ? forecastOf(graph, since) : null;
   find("forecast-legend").hidden = !forecast;
