@@ -37,7 +37,7 @@ OWNED = (
     ("dask distributed", {"workers"}),
     ("pyarrow", {"commands"}),
     ("upath", {"files"}),
-    ("shapely", {"geometry", "scene"}),
+    ("shapely", {"geometry", "scene", "planning", "campaign"}),
     ("jinja2 plotly", {"evaluation"}),
     ("matplotlib", {"evaluation", "calibration", "reproduce"}),
     ("rich", {"commands", "evaluation", "calibration", "reproduce"}),

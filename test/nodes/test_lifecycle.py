@@ -49,7 +49,7 @@ HANDLERS: dict[str, Any] = {  # classes of which methods take messages and timer
     "needle_planner": [NeedlePlannerNode],
     "path_follower": [PathFollowerNode],
 }
-IN_EVERY_STATE = ("on_scene", "on_material", "on_camera_info", "on_bridge")  # published only when it changes
+IN_EVERY_STATE = ("on_scene", "on_material", "on_camera_info", "on_bridge", "on_plan")  # published only when it changes
 BEGIN = int(time.time()) + 3600  # s; late poses are refused, however slowly a test runs
 
 
