@@ -131,7 +131,8 @@ def test_an_inactive_node_handles_no_message_and_no_timer(
 
     assert call() == []
     assert graph.change(name, ACTIVATE)
-    in_every_state = sum(each.topic_name == f"/{topics.BRIDGE_STATE.name}" for each in subscriptions)
+    latched = {f"/{topics.BRIDGE_STATE.name}", f"/{topics.PROCEDURE_PLAN.name}"}
+    in_every_state = sum(each.topic_name in latched for each in subscriptions)
     assert len(call()) == len(subscriptions) + len(timers) - in_every_state > 0
 
 
