@@ -102,7 +102,7 @@ class NeedlePlan:
         self._stamp, self.speed = math.inf, (0.0, 0.0)
 
     def update(self, stamp: float, pose: Vector, command: Vector, memory: float) -> bool:
-        """Take where the needle is; return whether it follows the plan, which is near, and goes on as commanded.
+        """Take where the needle is; return whether it follows the plan: it is near, not at the end, and gets on.
 
         Args:
             stamp: of the pose [s].
@@ -130,19 +130,23 @@ class NeedlePlan:
             kept = math.exp(-interval / memory)
             self.speed = kept * self.speed[0] + at - self.at, kept * self.speed[1] + interval
         self._stamp, self.at = stamp, at
-        return self._error < self._lever and self._commanded > 0.0 and at < self._travel[-1]
+        return self._error < self._lever and self._pace() > 0.0 and at < self._travel[-1]
 
     def commands(self, pose: Vector, step: float, steps: int) -> Points:
         """Return the velocity of the tip in each step from a pose of the chord on, shape (steps, 2) [m/s]."""
-        speed = max(0.0, self.speed[0] / self.speed[1]) if self.speed[1] > 0.3 else self._commanded  # s
-        return np.asarray(follow_plan(self.poses, self._travel, self._lever, pose, self.at, speed, step, steps))
+        moves = self._travel, self._lever, pose, self.at, max(0.0, self._pace()), step, steps
+        return np.asarray(follow_plan(self.poses, *moves))
+
+    def _pace(self) -> float:
+        """Return w [m/s]."""
+        return self.speed[0] / self.speed[1] if self.speed[1] > 0.3 else self._commanded  # s
 
 
 class PublishedForecasts:
     """Forecasts by the plan of the needle, else by the command that is held, and judges them by what came of them.
 
-    A needle that is nearer to its plan than half its chord, and is commanded along it by a program, is taken along the
-    plan at the speed at which it got on so far. Forecasts that were made within their horizon, up to thirty, are
+    A needle that is nearer to its plan than half its chord, and gets on along it as a program commands, is taken along
+    the plan at the speed at which it got on so far. Forecasts that were made within their horizon, up to thirty, are
     compared with the thread now: where their nodes are farther off, in the mean, than those of the threads that they
     began from, by more than the deviation of the estimate, they are worse than a forecast that nothing moves.
 
