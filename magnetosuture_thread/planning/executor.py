@@ -307,9 +307,11 @@ class ProcedureExecutor:
             else:
                 self._begin_goal(self.goal + 1)
                 self._tracker = None
-                if not self._plan(middle, angle):
-                    return None
-                return self._pursue(stamp, middle, angle, thread)
+                try:
+                    is_planned = self._plan(middle, angle)
+                except PlanningError:
+                    is_planned = False  # there may be a way from where the needle is now
+                return self._pursue(stamp, middle, angle, thread) if is_planned else None
         if self._tracker.travel > PROGRESS:
             self.pursuit.replans = 0
         if (left := self.path.length - self._tracker.travel) < self.pursuit.left - PROGRESS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -358,10 +359,10 @@ def test_a_shape_that_appears_in_a_gap_ahead_fails_the_procedure_and_one_in_a_ga
         {"go_to": {"position": [0.003, 0.008]}},
     ]
     plug = SceneShape("plug", "instrument", Disc((0.0112, 0.0), 0.004))
-    for passed in (False, True):
+    for passed, y in ((False, -0.002), (True, 0.002)):
         run, needle = executor(*goals), Needle(0.010, -0.006, 1.5)
         run.start()
-        needle.run(run, 60.0, until=lambda: run.goal == 1 if passed else needle.middle[1] > -0.002)  # noqa: B023
+        needle.run(run, 60.0, until=partial(lambda needle, y: bool(needle.middle[1] > y), needle, y))
         run.set_planner(NeedlePlanner(Scene(Dish(), (POST, plug)), NEEDLE, 2.5e-4, 0.05))
         if not passed:
             assert run.state is ProcedureState.FAILED
