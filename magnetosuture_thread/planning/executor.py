@@ -166,6 +166,7 @@ class ProcedureExecutor:
         self._waits_since = 0.0  # for the thread, since this stamp [s]
         self._judge: GoalJudge | None = None
         self._thread: Points | None = None  # as it was known last
+        self._compensates = False  # whether the bridge has ever measured what pulls the needle
 
     @property
     def judge(self) -> GoalJudge:
@@ -246,6 +247,7 @@ class ProcedureExecutor:
         self._begin = middle if self._begin is None else self._begin
         self._heed(stamp, thread)
         self._thread = thread.vertices
+        self._compensates = self._compensates or thread.drift != 0.0
         if self.state in (ProcedureState.RUNNING, ProcedureState.PAUSED):
             self.judge.update(middle, thread.vertices)  # also by hand: a wrap may be unwound in a pause
         if self.state is not ProcedureState.RUNNING:
@@ -331,7 +333,7 @@ class ProcedureExecutor:
         rests = self._rest.update(stamp, middle, angle, self.planner.lever, commanded, command.travel)
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             beside = self.planner.beside(middle, angle)
-            pulled = " with motion_compensation of the coil bridge off" if thread.drift == 0.0 else ""
+            pulled = "" if self._compensates else " with motion_compensation of the coil bridge off"
             self._replan(stamp, command.velocity if rests else np.zeros(2), f"{beside}{pulled}")
             return None
         return command.velocity
