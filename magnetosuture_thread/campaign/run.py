@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning import executor
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
-from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wrap
+from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wait, Wrap
 from magnetosuture_thread.planning.verdict import centre_of, winding
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Scene
@@ -107,7 +107,7 @@ class RunFigures:
         ideal_time_s: of the path planned at the start, at the allowed speed, slowed by friction as it was in the run.
         min_needle_clearance_m: of the needle's axis from wall and shapes.
         max_thread_penetration_m: of a node of the thread into wall or shapes.
-        longest_rest_s: for which the needle did not move, while the procedure ran.
+        longest_rest_s: for which the needle did not move, while it had a path to follow.
         wrap_degrees: that the thread swept at the most about the shape of the first wrap; 0 without one.
         max_tension_n: peak of the thread.
         max_friction_nodes: under friction at once, by the model.
@@ -200,7 +200,7 @@ class RunExtremes:
 
         Args:
             frame: of the loop.
-            running: whether the needle is to move.
+            running: whether the needle has a path to follow.
             goal: index of the goal.
             path: of the needle's middle as planned, shape (m, 2) [m]; None without one.
         """
@@ -288,7 +288,7 @@ def check_run(procedure: Procedure, setup: Setup, variation: Variation) -> None:
         PlanningError: there is no way to a goal.
     """
     x, y, angle = variation.setup.rig.needle_start
-    planner = setup.planner.planner(setup.scene)
+    planner = setup.planner.planner(setup.scene, model=setup.model)
     planner.plan_all(procedure, *planner.pose(np.array([x, y]), np.array([math.cos(angle), math.sin(angle)])))
 
 
@@ -312,7 +312,7 @@ def run_procedure(
     Raises:
         ConfigurationError: the procedure does not fit the scene.
     """
-    planner = setup.planner.planner(setup.scene, setup.coils)
+    planner = setup.planner.planner(setup.scene, setup.coils, setup.model)
     planner.check(procedure)
     pilot, rig = _Pilot(procedure, planner), Rig(variation.setup.rig, setup.scene)
     execution = pilot.executor
@@ -329,7 +329,8 @@ def run_procedure(
             if frame is None:
                 continue
             running, path = execution.state is executor.ProcedureState.RUNNING, execution.path
-            extremes.update(frame, running, execution.goal, None if path is None else path.middles)
+            is_moving = running and execution.is_tracking and not isinstance(procedure.goals[execution.goal], Wait)
+            extremes.update(frame, is_moving, execution.goal, None if path is None else path.middles)
             middle, _ = planner.pose(frame.tail, np.array([math.cos(frame.heading), math.sin(frame.heading)]))
             met = execution.goal if execution.state is not executor.ProcedureState.DONE else len(procedure.goals)
             truth_of_goals.update(met, middle, frame.tail, frame.thread)

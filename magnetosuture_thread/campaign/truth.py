@@ -13,7 +13,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from magnetosuture_thread.planning.procedure import GoTo, PassThrough, Procedure, Tighten, Withdraw, Wrap
+from magnetosuture_thread.planning.procedure import (
+    BringEnd,
+    GoTo,
+    KeepSide,
+    Lay,
+    PassThrough,
+    Procedure,
+    TakeOff,
+    Tighten,
+    Unwind,
+    Wait,
+    Wind,
+    WindingGoal,
+    Withdraw,
+    Wrap,
+)
 from magnetosuture_thread.scene import Scene
 
 Vector = NDArray[np.float64]
@@ -25,7 +40,8 @@ class GoalTruth:
     A pass counts where the middle of the needle's chord crosses the line across the gap once more in the goal's
     direction than against it, from the end of the goal before to its own; a wrap where the thread winds so far when the
     goal ends, and not half a turn less at the end of the procedure; a place where the needle is there when the goal
-    ends; a thread is tight where it is as near to its shape as wanted.
+    ends; a thread is tight where it is as near to its shape as wanted. A thread lies along a line where no point of
+    either is farther than the tolerance from the other.
 
     Args:
         procedure: its goals.
@@ -69,12 +85,12 @@ class GoalTruth:
             ended: whether the nodes take all goals for met; then no wrap may have slipped off either.
         """
         found = [f"goal {index + 1} in truth: {problem}" for index, problem in sorted(self._problems.items())]
-        last = {goal.around: k for k, goal in enumerate(self._procedure.goals) if isinstance(goal, Wrap)}
-        for name, index in last.items() if ended else ():
-            needed = self._needed(index)
-            if needed and self._wound(name) / needed < 1.0 - math.pi / abs(needed):
-                wound = f"{math.degrees(self._wound(name)):.0f} degrees of thread are left around {name}"
-                found.append(f"{wound} in truth, of {math.degrees(needed):.0f}")
+        for name in {goal.around for goal in self._procedure.goals if isinstance(goal, WindingGoal)} if ended else ():
+            index = max(k for k, goal in enumerate(self._procedure.goals) if getattr(goal, "around", "") == name)
+            while not isinstance(self._procedure.goals[index], WindingGoal):
+                index -= 1
+            if problem := self._unwound(index, math.pi):
+                found.append(f"at the end, {problem} in truth")
         return found
 
     def _problem(self, index: int, at: complex, along: complex) -> str:
@@ -82,19 +98,66 @@ class GoalTruth:
         if isinstance(goal, PassThrough):
             made = self._passed[index]
             return "" if made >= 1 else f"{made} net crossings between {' and '.join(goal.between)}"
-        if isinstance(goal, Wrap):
-            wound, needed = self._wound(goal.around), self._needed(index)
-            is_wound = (
-                wound * math.copysign(1.0, needed) >= abs(needed) - 0.1
-            )  # rad, by which an estimated thread may be off
-            return (
-                "" if is_wound else f"the thread winds {math.degrees(wound):.0f} of {math.degrees(needed):.0f} degrees"
-            )
+        if isinstance(goal, WindingGoal):
+            problem = self._unwound(index, 0.1)  # rad, by which an estimated thread may be off
+            if isinstance(goal, TakeOff):
+                away = float(shapely.distance(shapely.points(self._thread), self._solid(goal.around)).min())
+                if away < goal.clearance - 2e-4:  # m, by which an estimated thread may be off
+                    problem = f"the thread is {1e3 * away:.2f} mm from {goal.around}"
+            return problem or (self._misplaced(goal, at, along) if isinstance(goal, KeepSide) else "")
+        if isinstance(goal, Lay):
+            return self._off_line(goal)
+        if isinstance(goal, BringEnd):
+            off = abs(complex(*self._thread[-1]) - complex(*goal.position))
+            return f"the free end is {1e3 * off:.2f} mm from its place" if off > goal.tolerance + 2e-4 else ""
+        if isinstance(goal, Wait):
+            return ""
         if isinstance(goal, Tighten):
             return self._slack(goal) if goal.clearance > 0.0 else ""
         return self._misplaced(goal, at, along)
 
-    def _misplaced(self, goal: GoTo | Withdraw, at: complex, along: complex) -> str:
+    def _off_line(self, goal: Lay) -> str:
+        """Return how far thread and line are apart, if that is too far, of 2,000 points on each."""
+        share = np.linspace(0.0, 1.0, 2000)
+
+        def spread(points: Vector) -> Vector:
+            along = np.cumsum([0.0, *np.abs(np.diff(points @ np.array([1.0, 1.0j])))])
+            at = share * along[-1]
+            return np.asarray(np.interp(at, along, points[:, 0]) + 1j * np.interp(at, along, points[:, 1]))
+
+        line, thread = spread(np.array(goal.along).reshape(-1, 2)), spread(self._thread)
+        length = float(np.abs(np.diff(self._thread @ np.array([1.0, 1.0j]))).sum())
+        first, last = (
+            [round(1999 * min(1.0, at / length)) for at in goal.stretch]
+            if goal.stretch
+            else sorted(int(np.abs(thread - end).argmin()) for end in (line[0], line[-1]))
+        )
+        apart = np.abs(line[:, None] - thread[None, first : last + 1])
+        off = float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
+        return f"the thread is {1e3 * off:.2f} mm off its line" if off > goal.tolerance + 2e-4 else ""
+
+    def _unwound(self, index: int, slack: float) -> str:
+        """Return how the thread winds about the shape of a goal, if that is off by more than an angle [rad]."""
+        goal = self._procedure.goals[index]
+        assert isinstance(goal, WindingGoal)
+        wound, least, greatest = self._wound(goal.around), -math.inf, math.inf
+        if isinstance(goal, Wrap):
+            needed = self._needed(index)
+            least, greatest = (needed, math.inf) if goal.sense == "counterclockwise" else (-math.inf, needed)
+        elif isinstance(goal, Wind):
+            needed = goal.angle if goal.sense == "counterclockwise" else -goal.angle
+            least, greatest = needed - goal.tolerance, needed + goal.tolerance
+        elif isinstance(goal, KeepSide):  # the thread passes the shape at its left in the sense of a clock
+            least, greatest = (-2.0 * math.pi, 0.0) if goal.side == "left" else (0.0, 2.0 * math.pi)
+        else:
+            greatest = goal.angle if isinstance(goal, Unwind) else math.pi
+            least = -greatest
+        if least - slack <= wound <= greatest + slack:
+            return ""
+        limits = " to ".join(f"{math.degrees(each):.0f}" for each in (least, greatest) if math.isfinite(each))
+        return f"the thread winds {math.degrees(wound):.0f} of {limits} degrees about {goal.around}"
+
+    def _misplaced(self, goal: GoTo | Withdraw | KeepSide, at: complex, along: complex) -> str:
         place = goal.position if isinstance(goal, GoTo) else goal.to
         assert self._start is not None
         off = abs(at - (complex(*place) if place else self._start))
@@ -115,9 +178,14 @@ class GoalTruth:
 
     def _needed(self, index: int) -> float:
         """Return the angle by which the thread is to wind about a wrap's shape once that is met [rad]."""
-        wraps = [goal for goal in self._procedure.goals[: index + 1] if isinstance(goal, Wrap)]
-        signs = {"counterclockwise": 1.0, "clockwise": -1.0}
-        return sum(signs[wrap.sense] * wrap.angle for wrap in wraps if wrap.around == wraps[-1].around)
+        needed, name = 0.0, getattr(self._procedure.goals[index], "around", "")
+        for goal in self._procedure.goals[: index + 1]:
+            if isinstance(goal, Wrap | Wind) and goal.around == name:
+                turned = goal.angle if goal.sense == "counterclockwise" else -goal.angle
+                needed = turned + (needed if isinstance(goal, Wrap) else 0.0)
+            elif isinstance(goal, WindingGoal) and goal.around == name:
+                needed = 0.0
+        return needed
 
     def _wound(self, name: str) -> float:
         """Return the angle by which the thread winds about a shape, from its free end to the needle [rad]."""

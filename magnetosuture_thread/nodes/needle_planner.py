@@ -39,6 +39,7 @@ from magnetosuture_thread.planning.session import (
     compile_planning,
 )
 from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 
@@ -54,6 +55,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
     def __init__(self, **options: Any) -> None:
         super().__init__(interface.PLANNER, NeedlePlannerSettings, **options)
         self._coils = settings_of(self, CoilBridgeSettings, options)
+        self._model = settings_of(self, ThreadModelSettings, options)
         self._planning = ThreadPoolExecutor(1)
         self._moving = False  # whether the last command was not zero
         self._scene = SceneFollower(self, self.on_scene)
@@ -62,7 +64,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
     def allocate(self, settings: NeedlePlannerSettings) -> None:
         """Load the planner's kernels, and offer what it does."""
         scene = self._scene.load(settings.scene)
-        self._session = ProcedureSession(settings, scene, self._planning.submit, self._coils)
+        self._session = ProcedureSession(settings, scene, self._planning.submit, self._coils, self._model)
         with self.health.load("the planner's kernels"):
             compile_planning()
         self._commands = self.held(topics.NEEDLE_COMMAND.publisher(self))

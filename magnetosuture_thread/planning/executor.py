@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,18 @@ from numpy.typing import NDArray
 from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
-from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, place_of
-from magnetosuture_thread.planning.procedure import Goal, GoTo, PassThrough, Procedure, Tighten, Withdraw, Wrap
+from magnetosuture_thread.planning.planner import WELL_MET, NeedlePlanner, PlanningError, place_of
+from magnetosuture_thread.planning.procedure import (
+    Goal,
+    GoTo,
+    KeepSide,
+    Procedure,
+    ThreadGoal,
+    Tighten,
+    Wait,
+    Withdraw,
+    Wrap,
+)
 from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
 from magnetosuture_thread.planning.verdict import GoalJudge, centre_of, winding
 
@@ -44,6 +54,7 @@ class ProcedureState(Enum):
 
 
 ENDED = (ProcedureState.DONE, ProcedureState.FAILED)
+PLACES = GoTo | Withdraw | KeepSide  # goals that end where the middle of the needle is at a place
 
 
 @dataclass(frozen=True)
@@ -71,22 +82,22 @@ class ThreadCondition:
 
 
 class PendingPath(Protocol):
-    """A path that is being planned, as `concurrent.futures.Future` is one."""
+    """A path that is being planned or forecast, as `concurrent.futures.Future` is one."""
 
     def done(self) -> bool:
         """Return whether planning has ended."""
 
-    def result(self) -> BodyPath:
-        """Return the path, or raise what planning raised."""
+    def result(self) -> Any:
+        """Return the path, or whether it leads to its goal; or raise what planning raised."""
 
 
-PathSubmitter = Callable[[Callable[[], BodyPath]], PendingPath]
+PathSubmitter = Callable[[Callable[[], Any]], PendingPath]
 """Begins to plan a path, as `concurrent.futures.Executor.submit` does."""
 
 
-def plan_now(task: Callable[[], BodyPath]) -> PendingPath:
+def plan_now(task: Callable[[], Any]) -> PendingPath:
     """Plan a path here and now."""
-    pending: Future[BodyPath] = Future()
+    pending: Future[Any] = Future()
     try:
         pending.set_result(task())
     except PlanningError as error:
@@ -156,6 +167,10 @@ class ProcedureExecutor:
         self._tracker: PathTracker | None = None
         self._holder: PathTracker | None = None  # of the pose in which the needle is kept
         self._pending: PendingPath | None = None
+        self._foreseen: PendingPath | None = None  # whether the path leads to its goal
+        self._foresees_at = 0.0  # way on the path at which that is asked next [m]
+        self._left: BodyPath | None = None  # of a path that does not, for when there is no better one
+        self._goal_since = math.nan  # stamp at which the present goal was begun to be pursued [s]
         self._begin: Vector | None = None
         self._rest = RestDetector()
         self._back_off, self._back_off_until = np.zeros(2), -math.inf
@@ -296,10 +311,26 @@ class ProcedureExecutor:
         assert self._tracker is not None
         assert self.path is not None
         is_last = self.goal + 1 == len(self.procedure.goals)
+        if isinstance(goal, Wait):
+            self._goal_since = self._goal_since if self._goal_since <= stamp else stamp
+            if stamp - self._goal_since >= goal.time:
+                self._next_goal()
+                return None
+            held = stamp, middle, angle, self.procedure.limits[self.goal].speed, thread.slowdown, thread.drift
+            return self._tracker.compute_command(*held, hold=True).velocity
         # A thread may be wound or tight long before the end of the path, as its free end moves too.
         is_far = self.path.ends[self._reached] > self.travel + 2.0 * PROGRESS
-        if is_met and (isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last)):
+        if isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last):
+            is_enough = is_met
+        else:
+            is_enough = isinstance(goal, ThreadGoal) and not isinstance(goal, KeepSide) and self.judge.miss <= WELL_MET
+        if is_enough:
             self._next_goal()
+            return None
+        if isinstance(goal, ThreadGoal) and self._strays():
+            rest, index = self.path.part(self.travel, self.path.length), self.goal
+            self._at_end(goal, middle)
+            self._left = rest if self.goal == index else None
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
             self._plan_ahead(goal)
@@ -344,11 +375,8 @@ class ProcedureExecutor:
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
             return
         assert self._begin is not None
-        if isinstance(goal, GoTo | Withdraw):
-            is_met = math.dist(middle, place_of(goal, self._begin)) <= goal.tolerance
-        else:
-            is_met = self.judge.is_met
-        if is_met:
+        is_there = not isinstance(goal, PLACES) or math.dist(middle, place_of(goal, self._begin)) <= goal.tolerance
+        if is_there and self.judge.is_met:
             self._next_goal()
         else:
             self._miss(goal, middle)
@@ -358,11 +386,13 @@ class ProcedureExecutor:
         self.pursuit.misses += 1
         off = np.zeros(2)
         assert self._begin is not None
-        if isinstance(goal, GoTo | Withdraw):
+        if isinstance(goal, PLACES):
             off = place_of(goal, self._begin) - middle
         if self.pursuit.misses > MAX_MISSES:
-            missing = self.judge.missing(self.goal) if isinstance(goal, PassThrough | Wrap) else ""
-            if isinstance(goal, GoTo | Withdraw):
+            if not self.judge.is_met:
+                missing = self.judge.missing(self.goal)
+            else:
+                assert isinstance(goal, PLACES)
                 by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
                 missing = f"the needle misses its place {by}"
             self.abort(f"goal {self.goal + 1} is given up: {missing}, however it is planned")
@@ -372,6 +402,18 @@ class ProcedureExecutor:
         self.pursuit.aim = aim * min(1.0, leeway / max(math.hypot(*aim), 1e-12))
         self._drop_path()
 
+    def _strays(self) -> bool:
+        """Return whether, by a forecast, what is left of the path does not lead the thread to its goal any more."""
+        assert self.path is not None
+        if self._foreseen is None and self.travel >= self._foresees_at and self._thread is not None:
+            left = self.path.part(self.travel, self.path.length)
+            self._foreseen = self._submit(partial(self.planner.leads_to, self.procedure, self.goal, left, self._thread))
+        elif self._foreseen is not None and self._foreseen.done():
+            leads, self._foreseen = self._foreseen.result(), None
+            self._foresees_at = self.travel + 2.0 * PROGRESS
+            return not leads
+        return False
+
     def _plan(self, middle: Vector, angle: float) -> bool:
         """Plan from a pose, or go on with that; return whether there is a path to track."""
         if self._pending is None:
@@ -380,7 +422,14 @@ class ProcedureExecutor:
         if not self._pending.done():
             return False
         pending, self._pending = self._pending, None
-        self.path = pending.result()
+        self._foresees_at = 2.0 * PROGRESS
+        try:
+            self.path = pending.result()
+        except PlanningError:
+            if self._left is None:
+                raise
+            self.path, self._foresees_at = self._left, math.inf
+        self._left = None
         self._tracker, self._reached = PathTracker(self.path, self.planner.axes), 0
         return True
 
@@ -400,12 +449,13 @@ class ProcedureExecutor:
     def _ask_for_path(self, goal: int, middle: Vector, angle: float) -> None:
         assert self._begin is not None
         at = self.procedure, goal, middle, angle, self._begin.copy(), self._thread
-        known = (self.judge.crossed, self.pursuit.aim) if goal == self.goal else ()
+        known = (self.judge.crossed, self.pursuit.aim, self._left) if goal == self.goal else ()
         self._pending = self._submit(partial(self.planner.plan, *at, *known))
 
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
-        self._tracker, self._pending, self._rest = None, None, RestDetector()
+        self._tracker, self._pending, self._foreseen, self._left = None, None, None, None
+        self._rest = RestDetector()
         self._back_off_until = -math.inf
 
     def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:
@@ -433,13 +483,13 @@ class ProcedureExecutor:
         self._drop_path()
         if self.goal + 1 < len(self.procedure.goals):
             self._begin_goal(self.goal + 1)
-        elif lost := self.judge.lost_wrap():
+        elif lost := self.judge.lost_winding():
             self.abort(lost)
         else:
             self.state = ProcedureState.DONE
 
     def _begin_goal(self, goal: int) -> None:
-        self.goal, self.pursuit = goal, Pursuit()
+        self.goal, self.pursuit, self._goal_since = goal, Pursuit(), math.nan
         self.judge.begin(goal)
 
     def _allowed_speed(self, thread: ThreadCondition) -> float:

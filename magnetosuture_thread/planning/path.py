@@ -296,6 +296,7 @@ def search_lattice(
     return _way_to(last, parent, size, near.origin, step, directions), looked
 
 
+PASSES = 400  # of the smoothing
 SPACING = 1.0e-4  # m; of the tip's way between two poses
 PULL = 0.4  # share by which a pose moves towards the middle of its neighbours in a pass
 PREFERRED = 5e-4  # m; beyond the required clearance, more is not worth a longer way
@@ -336,6 +337,21 @@ class BodyPath:
         x, y = (float(np.interp(travel, self.travel, column)) for column in self.middles.T)
         return np.array([x, y]), float(np.interp(travel, self.travel, self.angles))
 
+    def part(self, begin: float, end: float) -> BodyPath:
+        """Return the path from one way of the tip to another, where its last goal is reached."""
+        between = (self.travel > begin) & (self.travel < end)
+        (first, turned), (last, angle) = self.at(begin), self.at(end)
+        middles = np.vstack([first, self.middles[between], last])
+        angles, leeways = (
+            np.concatenate([[from_], column[between], [to]])
+            for from_, column, to in (
+                (turned, self.angles, angle),
+                (self.leeway_at(begin), self.leeway, self.leeway_at(end)),
+            )
+        )
+        found = BodyPath(middles, angles, self.lever, leeways, np.zeros(0))
+        return replace(found, ends=np.array([found.length]))
+
     def leeway_at(self, travel: float) -> float:
         """Return the leeway at a way of the tip [m]."""
         return float(np.interp(travel, self.travel, self.leeway))
@@ -349,6 +365,7 @@ def smooth_path(
     required: float,
     margin: float,
     near: ClearanceMap,
+    passes: int = PASSES,
 ) -> BodyPath:
     """Return the path through the states of the lattice, its corners rounded as far as the clearance allows.
 
@@ -360,6 +377,7 @@ def smooth_path(
         required: clearance of the body [m].
         margin: how much more than that is kept on the path [m].
         near: distances from wall and shapes.
+        passes: by which corners are rounded; none, and only the kinks of the lattice are filtered out.
     """
     poses, reached, first = [states[:1]], [], 0
     states = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
@@ -368,7 +386,7 @@ def smooth_path(
         coarse = BodyPath(part[:, :2], part[:, 2], lever, np.zeros(len(part)), np.zeros(0))
         at = np.linspace(0.0, coarse.length, max(2, math.ceil(coarse.length / SPACING) + 1))
         dense = np.column_stack([np.interp(at, coarse.travel, column) for column in part.T])
-        _relax(dense, body, required + margin, required + margin + PREFERRED, near)
+        _relax(dense, body, required + margin, required + margin + PREFERRED, near, passes)
         poses.append(_filtered(dense, body, required + margin, near)[1:])
         reached.append(sum(map(len, poses)) - 1)
         first = end
@@ -412,14 +430,13 @@ def _filtered(poses: Points, body: Points, required: float, near: ClearanceMap) 
 
 
 @compiled_without_gil
-def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap) -> None:
+def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap, passes: int) -> None:
     """Move each pose to the middle of its neighbours, and turn it along the way, where the clearance allows.
 
     A clearance may not fall below the one that is preferred; where it is less already, it may not fall at all.
     """
     count = len(poses)
-    # Passes of the smoothing.
-    for _ in range(400):
+    for _ in range(passes):
         for k in range(1, count - 1):
             x, y, angle = poses[k, 0], poses[k, 1], poses[k, 2]
             nx = x + PULL * (0.5 * (poses[k - 1, 0] + poses[k + 1, 0]) - x)

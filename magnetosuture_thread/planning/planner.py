@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
+    PASSES,
     PREFERRED,
     STRIDE,
     BodyPath,
@@ -30,23 +34,43 @@ from magnetosuture_thread.planning.path import (
 )
 from magnetosuture_thread.planning.procedure import (
     HEADING_TOLERANCE,
+    BringEnd,
     Goal,
     GoTo,
+    KeepSide,
+    Lay,
     PassThrough,
     Procedure,
     ProcedureLimits,
+    TakeOff,
+    ThreadGoal,
     Tighten,
+    Unwind,
+    Wait,
+    Wind,
+    WindingGoal,
     Withdraw,
     Wrap,
 )
-from magnetosuture_thread.planning.verdict import centre_of, gap_lines, lines_of_pass, solid_of, winding
+from magnetosuture_thread.planning.thread_ways import Candidate, ThreadRollout, candidates, line_states
+from magnetosuture_thread.planning.verdict import (
+    GoalJudge,
+    centre_of,
+    gap_lines,
+    left_to_wind,
+    lines_of_pass,
+    solid_of,
+    winding,
+)
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import WALL_NAME, Scene
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
 
 MARGINS = (3e-4, 1e-4, 3e-5, 5e-6)  # m; beyond the required clearance, for errors of control: the widest with a way
 WRAP_LEAD = 0.1  # rad; that the needle goes on after a wrap, as the thread follows it
+WELL_MET = 0.7  # of what a goal of the thread tolerates: enough, for errors of forecast and estimate
 PLACE_SHARE, PLACE_STEPS = 0.7, 0.75  # of a goal's tolerance, and of the lattice: how far from its place a way may end
 
 
@@ -63,6 +87,16 @@ class PlanningError(MagnetosutureError):
         self.goal = goal
 
 
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A candidate, its path up to where the thread comes nearest to the goal, by how much it misses, and the thread."""
+
+    candidate: Candidate
+    path: BodyPath
+    miss: float
+    thread: Points
+
+
 class NeedlePlanner:
     """Plans paths of the needle's body through a scene.
 
@@ -72,9 +106,10 @@ class NeedlePlanner:
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
         axes: of the coils [rad], for `PathTracker`.
+        model: settings of the thread model, for forecasts; None for those of the thread model's defaults.
 
     Attributes:
-        looked: states of the lattice that were looked at so far.
+        looked: states of the lattice that were looked at so far, with what forecasts took as long as.
 
     Raises:
         ConfigurationError: the needle has no room in the dish.
@@ -87,6 +122,7 @@ class NeedlePlanner:
         keep_out: float,
         thread_length: float,
         axes: Sequence[float] = (),
+        model: ThreadModelSettings | None = None,
     ) -> None:
         least = needle.chord + 2.0 * keep_out
         if scene.dish.diameter <= least:
@@ -94,6 +130,7 @@ class NeedlePlanner:
             raise ConfigurationError("scene.dish.diameter", scene.dish.diameter, expected)
         self.scene, self.needle, self.axes = scene, needle, tuple(axes)
         self.keep_out, self.thread_length = keep_out, thread_length
+        self._model = ThreadModelSettings() if model is None else model
         self.near = map_clearance(scene)
         self.lever = 0.5 * needle.chord
         # Points a step of the grid apart, about the middle of the chord.
@@ -135,6 +172,7 @@ class NeedlePlanner:
         thread: Points | None = None,
         crossed: int = 0,
         aim: Vector | None = None,
+        before: BodyPath | None = None,
     ) -> BodyPath:
         """Return a path from a pose through the goals of a `chain`.
 
@@ -147,6 +185,7 @@ class NeedlePlanner:
             thread: the tail first, shape (n + 1, 2) [m]; one that winds about nothing if None.
             crossed: how often the needle has passed the gap of the first goal since that began.
             aim: from the place of the first goal to where the path is to end, shape (2,) [m].
+            before: what is left of a path to a goal of the thread, from which a better one is looked for first.
 
         Raises:
             PlanningError: there is no way to one of them.
@@ -156,6 +195,11 @@ class NeedlePlanner:
             x, y = (place_of(goal, start) + aim).tolist()
             goals = (replace(goal, position=(x, y)) if isinstance(goal, GoTo) else replace(goal, to=(x, y)),)
         required = max(self.keep_out, limits.clearance)
+        if isinstance(goal, Wait):
+            return self.standing_path(middle, angle, limits)
+        if isinstance(goal, ThreadGoal):
+            lies = np.empty((0, 2)) if thread is None else thread
+            return self._plan_thread(procedure, first, np.array([*middle, angle]), lies, required, before)
         for margin in MARGINS:
             states, ends, at = np.empty((0, 3)), [], self._nearest_free(middle, angle, required + margin)
             lies = np.empty((0, 2)) if thread is None else thread
@@ -180,9 +224,198 @@ class NeedlePlanner:
                 begin = np.array([[*middle, states[0, 2] + math.remainder(angle - states[0, 2], 2.0 * math.pi)]])
                 states = np.vstack([begin, states])
                 return smooth_path(states, np.array(ends), self.lever, self.body, required, margin, self.near)
-        x, y = 1e3 * (states[-1, :2] if len(states) else middle)
-        where, kept = f"{x:.1f}, {y:.1f} mm", f"{1e3 * required:.3g} mm around it"
-        raise PlanningError(f"no way for the needle to {goals[len(ends)].GROUP} from {where}, with {kept}", len(ends))
+        last = states[-1, :2] if len(states) else middle
+        raise PlanningError(_no_way(goals[len(ends)], last, required), len(ends))
+
+    @cached_property
+    def rollout(self) -> ThreadRollout:
+        """What forecasts the thread along a path; it raises a `PlanningError` where the thread model does not fit."""
+        try:
+            return ThreadRollout(make_forecaster(self._model, self.scene), self.needle)
+        except ConfigurationError as error:
+            raise PlanningError(f"no forecast of the thread: {error}") from None
+
+    def leads_to(self, procedure: Procedure, index: int, path: BodyPath, thread: Points) -> bool:
+        """Return whether a goal of the thread is met, by a forecast, at the end of a path."""
+        trial = self._foresee(Candidate(), path, procedure, index, thread)
+        return trial is not None and trial.miss <= 1.0
+
+    def _plan_thread(
+        self,
+        procedure: Procedure,
+        index: int,
+        pose: Vector,
+        thread: Points,
+        required: float,
+        before: BodyPath | None,
+    ) -> BodyPath:
+        """Return the path from a pose of the chord by which the thread comes to lie as a goal asks; see `plan`.
+
+        Every candidate is forecast along its corners. The two that miss by the least are improved, and rounded. Of
+        those that meet the goal well the shortest is chosen.
+        """
+        goal = procedure.goals[index]
+        assert isinstance(goal, ThreadGoal)
+        trials: list[_Trial] = []
+        if before is not None:
+            at = procedure, index, pose, thread, required, MARGINS[-1]
+            known = self._try(Candidate(path=np.column_stack([before.middles, before.angles])), *at, passes=0)
+            known = known and self._try(self._improved(known, *at).candidate, *at)
+            if known is not None and known.miss <= 1.0:
+                return known.path
+        for margin in MARGINS:
+            reach = self.scene.dish.radius - required - margin - self.lever
+            at = procedure, index, pose, thread, required, margin
+            found = filter(None, [self._try(candidate, *at, passes=0) for candidate in candidates(goal, reach)])
+            first = sorted(found, key=lambda trial: max(trial.miss, WELL_MET))[:2]
+            for trial in first:
+                rounded = self._try(self._improved(trial, *at).candidate, *at)
+                trials += [rounded] if rounded is not None else []
+                if rounded is not None and rounded.miss <= WELL_MET:
+                    break
+            if trials:
+                break
+        if not trials:
+            raise PlanningError(_no_way(goal, pose[:2], required))
+        best = min(trials, key=lambda trial: (max(trial.miss, WELL_MET), trial.path.length))
+        if best.miss > 1.0:
+            judge = GoalJudge(procedure, self.scene)
+            judge.update(best.path.middles[-1], best.thread)
+            raise PlanningError(f"{_no_way(goal, pose[:2], required)}; at best, {judge.missing(index)}")
+        return best.path
+
+    def _improved(
+        self,
+        trial: _Trial,
+        procedure: Procedure,
+        index: int,
+        pose: Vector,
+        thread: Points,
+        required: float,
+        margin: float,
+    ) -> _Trial:
+        """Return the best of a candidate, what corrects it by its error, and of variations of the best so far.
+
+        Source: the (1 + 1) evolution strategy with the rule of successes, Rechenberg 1973.
+        """
+        goal, rng, scale, is_new = procedure.goals[index], np.random.default_rng(0), 1.0, True
+        assert isinstance(goal, ThreadGoal)
+        for _ in range(32):
+            if trial.miss <= WELL_MET:
+                break
+            left = self._left_to_wind(procedure, index, trial.thread)
+            moved = trial.candidate.corrected(goal, trial.thread, left) if is_new else None
+            moved = trial.candidate.varied(rng, scale) if moved is None else moved
+            latest = self._try(moved, procedure, index, pose, thread, required, margin, passes=0)
+            is_new = latest is not None and latest.miss < trial.miss
+            trial = latest if latest is not None and is_new else trial
+            scale *= 1.5 if is_new else 0.9
+        return trial
+
+    def _try(
+        self,
+        candidate: Candidate,
+        procedure: Procedure,
+        index: int,
+        pose: Vector,
+        thread: Points,
+        required: float,
+        margin: float,
+        passes: int = PASSES,
+    ) -> _Trial | None:
+        """Return what a forecast makes of a candidate, see `smooth_path`; None where there is no way for it."""
+        states = self._states_of(candidate, procedure, index, pose, thread, required + margin)
+        if states is None:
+            return None
+        states = np.vstack([pose, states])
+        states[:, 2] = np.unwrap(states[:, 2])
+        ends = np.array([len(states) - 1])
+        path = smooth_path(states, ends, self.lever, self.body, required, margin, self.near, passes)
+        self.looked += passes * len(path.angles) // 6  # which takes as long
+        return self._foresee(candidate, path, procedure, index, thread)
+
+    def _foresee(
+        self, candidate: Candidate, path: BodyPath, procedure: Procedure, index: int, thread: Points
+    ) -> _Trial | None:
+        """Return what the forecast along a path makes of it; None where needle or thread lie where they cannot."""
+        goal, judge, before = procedure.goals[index], GoalJudge(procedure, self.scene), self.rollout.steps
+        judge.begin(index)
+        best: _Trial | None = None
+        try:
+            for way, lies in self.rollout.threads(path, procedure.limits[index].speed, thread):
+                judge.update(pose := path.at(way)[0], lies)
+                if isinstance(goal, KeepSide) and math.dist(pose, goal.to) > goal.tolerance:
+                    continue
+                if best is None or judge.miss < best.miss:
+                    best = _Trial(candidate, path.part(0.0, way), judge.miss, lies)
+                if judge.miss <= WELL_MET:
+                    break
+        except InvalidInputError:
+            return None
+        # A step of a forecast, and what is compared with the goal, take as long as 30 states of the lattice.
+        self.looked += 30 * (self.rollout.steps - before)
+        return best
+
+    def _states_of(
+        self, candidate: Candidate, procedure: Procedure, index: int, pose: Vector, thread: Points, kept: float
+    ) -> Points | None:
+        """Return the states on the way of a candidate, shape (k, 3); None where there is none."""
+        if len(candidate.path):
+            free = [body_clearance(x, y, angle, self.body, self.near) >= kept for x, y, angle in candidate.path[1:]]
+            return candidate.path if all(free) else None
+        goal, at = procedure.goals[index], self._nearest_free(pose[:2], float(pose[2]), kept)
+        if at is None:
+            return None
+        parts = [self._pose_of(at)[None]]
+        if len(candidate.via):
+            if (way := self._to_place(candidate.via, parts[-1][-1], kept)) is None:
+                return None
+            parts.append(way)
+        if not math.isnan(candidate.more):
+            found = self._way(procedure, index, goal, pose[:2], at, thread, 0, kept, candidate.more)
+            if not len(found):
+                return None
+            parts.append(found)
+        if len(candidate.line):
+            # Straight on before and beyond as far as there is room, as a thread lies straight that is pulled straight.
+            line = line_states(candidate.line, self.lever, self.thread_length, self.thread_length)
+            free = [body_clearance(x, y, angle, self.body, self.near) >= kept for x, y, angle in line]
+            ends = np.linalg.norm(line[:, None, :2] - candidate.line[[0, -1]], axis=2).argmin(axis=0)
+            first, last = ends[0], ends[1]
+            while first > 0 and free[first - 1]:
+                first -= 1
+            while not len(candidate.onward) and last + 1 < len(line) and free[last + 1]:
+                last += 1
+            line = line[first : last + 1]
+            if not all(free[first : last + 1]):
+                return None
+            back = np.add(line[::-1], (0.0, 0.0, math.pi))
+            for k in range(candidate.passes, 0, -1):
+                states = line if k % 2 else back
+                if (way := self._to_place(states[0, :2], parts[-1][-1], kept, states[0, 2])) is None:
+                    return None
+                parts += [way, states]
+        for place in candidate.onward:
+            way = self._to_place(place, parts[-1][-1], kept)
+            parts += [way] if way is not None else []
+        return np.vstack(parts)
+
+    def _to_place(self, place: Vector, state: Vector, kept: float, heading: float | None = None) -> Points | None:
+        """Return the states on the way to a place, in a direction if one is given; None where there is none."""
+        x, y = place.tolist()
+        if not any(body_clearance(x, y, angle, self.body, self.near) >= kept for angle in DIRECTIONS):
+            return None
+        direction = math.atan2(y - state[1], x - state[0])
+        first, then, last = np.unwrap([state[2], direction, direction if heading is None else heading]).tolist()
+        way = np.linspace(state[:2], place, 100)
+        here, along, there = np.linspace(first, then, 16), np.full(len(way), then), np.linspace(then, last, 16)
+        middles = np.vstack([np.tile(state[:2], (16, 1)), way, np.tile(place, (16, 1))])
+        straight = np.column_stack([middles, np.concatenate([here, along, there])])
+        if all(body_clearance(u, v, angle, self.body, self.near) >= kept for u, v, angle in straight):
+            return straight
+        goal = GoTo(position=(x, y), heading=() if heading is None else (math.remainder(heading, 2.0 * math.pi),))
+        found = self._search(self._place_goal(goal, place, np.empty((0, 4))), kept, self._state_of(state))
+        return found if len(found) else None
 
     def led(self, thread: Points, poses: Points) -> Points:
         """Return where a thread lies after the needle has led it: along the tail's way, and then where it lay before.
@@ -225,8 +458,11 @@ class NeedlePlanner:
                 path = self.plan(procedure, index, middle, angle, start, thread)
             except PlanningError as error:
                 raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
-            poses = np.column_stack([path.middles, path.angles])
-            thread = self.led(np.empty((0, 2)) if thread is None else thread, poses)
+            lies = np.empty((0, 2)) if thread is None else thread
+            thread = self.led(lies, np.column_stack([path.middles, path.angles]))
+            if any(isinstance(goal, ThreadGoal) for goal in procedure.goals[index:]):
+                with suppress(InvalidInputError):  # of a thread that cannot lie as it is
+                    *_, (_, thread) = self.rollout.threads(path, procedure.limits[index].speed, lies)
             middle, angle = path.middles[-1], float(path.angles[-1])
             paths.append(path)
         return tuple(paths)
@@ -267,6 +503,10 @@ class NeedlePlanner:
         column, row = np.rint((np.asarray(state[:2]) - self.near.origin) / self._step).astype(int)
         return np.array([column, row, int(np.argmin(np.abs(turn_of(DIRECTIONS - state[2]))))])
 
+    def _pose_of(self, state: NDArray[np.int64]) -> Vector:
+        """Return x, y and direction of a state of the lattice, shape (3,)."""
+        return np.array([*(self.near.origin + self._step * state[:2]), DIRECTIONS[state[2]]])
+
     def _nearest_free(self, middle: Vector, angle: float, required: float) -> NDArray[np.int64] | None:
         """Return the free state of the lattice that is nearest to a pose; None where none is near."""
         column, row = np.rint((middle - self.near.origin) / self._step).astype(int)
@@ -291,13 +531,14 @@ class NeedlePlanner:
         thread: Points,
         crossed: int,
         kept: float,
+        more: float = 0.0,
     ) -> Points:
         """Return x, y and direction of the states on the way to a goal, shape (k, 3); empty where there is none.
 
-        A thread that is led around a shape loses what its free end wound about it before: the angle that is swept is
-        corrected by that of the thread as it will lie.
+        A thread that is led around a shape loses what its free end wound about it before: the angle that a wrap sweeps
+        is corrected by that of the thread as it will lie.
         """
-        before, more = np.empty((0, 3)), 0.0
+        before = np.empty((0, 3))
         target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
         if not target.allowed[state[1], state[0]]:  # first to where the shape of a wrap is in view
             there = target._replace(places=target.allowed, allowed=target.places, cuts=np.empty((0, 4)), crossings=0)
@@ -311,16 +552,19 @@ class NeedlePlanner:
             found = self._search(target, kept, state)
             if not isinstance(goal, Wrap) or not len(found):
                 break
-            short = self._left_to_wind(procedure, index, goal, self.led(thread, found))
+            short = self._left_to_wind(procedure, index, self.led(thread, found))
             if abs(short) <= WRAP_LEAD:
                 break
             more += short
         return np.vstack([before, found]) if len(found) else found
 
-    def _left_to_wind(self, procedure: Procedure, index: int, goal: Wrap, thread: Points) -> float:
-        """Return the angle, in its sense, that a wrap still asks of a thread, with what the needle goes on [rad]."""
-        missing = procedure.windings[index] - winding(thread, centre_of(self.scene, goal.around))
-        return math.copysign(1.0, goal.swept) * missing + WRAP_LEAD
+    def _left_to_wind(self, procedure: Procedure, index: int, thread: Points) -> float:
+        """Return by how much the winding of a goal has to change, to be well within its limits [rad]."""
+        goal, (least, greatest) = procedure.goals[index], procedure.windings[index]
+        if not isinstance(goal, WindingGoal):
+            return 0.0
+        clear = WRAP_LEAD if isinstance(goal, Wrap) else 0.5 * WELL_MET * (greatest - least)
+        return left_to_wind((least + clear, greatest - clear), winding(thread, centre_of(self.scene, goal.around)))
 
     def _lattice_goal(
         self,
@@ -335,20 +579,23 @@ class NeedlePlanner:
     ) -> LatticeGoal:
         """Return what a goal asks of the lattice.
 
-        See `plan`; the way to it begins at `state`, and a wrap is to sweep `more` than what is left of it [rad].
+        See `plan`; the way to it begins at `state`, and is to wind `more` than what is left of it [rad].
         """
         everywhere, any_heading = np.ones((self._size, self._size), bool), np.ones(len(DIRECTIONS), bool)
         middle = np.asarray(self.near.origin + self._step * state[:2])
         kept = self._done(procedure, index, middle, thread)
         anything = LatticeGoal(everywhere, everywhere, any_heading, kept[:0], 0, 0.0, kept, np.full(2, np.nan))
-        if isinstance(goal, Wrap):
-            sense = math.copysign(1.0, goal.swept)
-            left = self._left_to_wind(procedure, index, goal, thread) + more
-            if left <= WRAP_LEAD:
-                return anything
+        if isinstance(goal, WindingGoal):
             # The tail, which leads the thread, crosses a line from the shape to beyond the wall, where the wrap ends.
             direction = DIRECTIONS[state[2]]
             tail = middle - self.lever * np.array([math.cos(direction), math.sin(direction)])
+            if isinstance(goal, KeepSide):
+                wound = winding(thread, centre_of(self.scene, goal.around)) - more
+                return self._past(goal, procedure.windings[index], tail, wound, kept)
+            left = self._left_to_wind(procedure, index, thread) + more
+            sense, left = math.copysign(1.0, left), abs(left)
+            if left <= WRAP_LEAD:
+                return anything
             cuts = self._ray(goal.around, tail, sense, left).reshape(1, 4)
             turns = math.ceil(left / (2.0 * math.pi))
             allowed = self._in_view_of(goal.around)
@@ -370,12 +617,42 @@ class NeedlePlanner:
                 headings |= np.abs(turn_of(DIRECTIONS - math.atan2(across_x, -across_y))) <= 0.8
             cuts = np.reshape(lines, (-1, 4))
             return anything._replace(places=places, headings=headings, cuts=cuts, crossings=1 - crossed)
-        place, tolerance = place_of(goal, start), self._step if isinstance(goal, Tighten) else goal.tolerance
+        assert isinstance(goal, GoTo | Tighten | Withdraw)
+        return self._place_goal(goal, place_of(goal, start), kept)
+
+    def _place_goal(self, goal: GoTo | Tighten | Withdraw | KeepSide, place: Vector, kept: Points) -> LatticeGoal:
+        """Return what a place asks of the lattice, and a heading there, if the goal has one."""
+        tolerance = self._step if isinstance(goal, Tighten) else goal.tolerance
+        at = self.near.origin + self._step * np.arange(self._size)
+        away, headings = np.hypot(at[None, :] - place[0], at[:, None] - place[1]), np.ones(len(DIRECTIONS), bool)
         # At least the nearest point of the lattice.
-        places = np.hypot(x - place[0], y - place[1]) <= max(PLACE_SHARE * tolerance, PLACE_STEPS * self._step)
-        headed = goal.heading if isinstance(goal, GoTo) else ()
-        headings = np.abs(turn_of(DIRECTIONS - headed[0])) <= HEADING_TOLERANCE if headed else any_heading
-        return anything._replace(places=places, headings=headings, target=place)
+        places = away <= max(PLACE_SHARE * tolerance, PLACE_STEPS * self._step)
+        if isinstance(goal, GoTo) and goal.heading:
+            headings = np.abs(turn_of(DIRECTIONS - goal.heading[0])) <= HEADING_TOLERANCE
+        return LatticeGoal(np.ones_like(places), places, headings, kept[:0], 0, 0.0, kept, place)
+
+    def _past(
+        self, goal: KeepSide, allowed: tuple[float, float], tail: Vector, wound: float, kept: Points
+    ) -> LatticeGoal:
+        """Return what a place asks of the lattice to which the tail is led past a shape, on one side of it.
+
+        Args:
+            goal: with the place.
+            allowed: interval of the winding about the shape then [rad].
+            tail: of the needle now, shape (2,) [m].
+            wound: winding now [rad].
+            kept: see `LatticeGoal`.
+        """
+        centre, place = centre_of(self.scene, goal.around), np.array(goal.to)
+        before, after = (math.atan2(*(point - centre)[::-1]) for point in (tail, place))
+        direct = math.remainder(after - before, 2.0 * math.pi)
+        turns = round((0.5 * sum(allowed) - wound - direct) / (2.0 * math.pi))
+        sweep = direct + 2.0 * math.pi * turns
+        # The line that is crossed is halfway, and opposite of a sweep that is too small to cross any.
+        whole, rest = divmod(abs(sweep), 2.0 * math.pi)
+        sense, count = math.copysign(1.0, sweep), int(whole) + (rest > 0.2)
+        ray = self._ray(goal.around, tail, sense, 0.5 * rest if rest > 0.2 else math.pi)
+        return self._place_goal(goal, place, kept)._replace(cuts=ray.reshape(1, 4), crossings=count, lag=self.lever)
 
     def _ray(self, name: str, point: Vector, sense: float, angle: float) -> Points:
         """Return the line from a shape to beyond the wall that a point crosses after it has swept an angle about it.
@@ -403,11 +680,13 @@ class NeedlePlanner:
             passed.pop(frozenset(goal.between), None)
         lines = [line for done in passed.values() for line in lines_of_pass(self.scene, done)]
         lines = [] if isinstance(goal, Withdraw) else lines
-        wraps = {done.around: k for k, done in enumerate(goals) if isinstance(done, Wrap)}
-        for name, k in wraps.items():
-            sense = math.copysign(1.0, procedure.windings[k])
-            room = sense * (winding(thread, centre_of(self.scene, name)) - procedure.windings[k]) + math.pi
-            if room > 0.0 and not (isinstance(goal, Wrap) and goal.around == name):
+        for name, k in procedure.lasting(index).items():
+            least, greatest = procedure.windings[k]
+            if least < 0.0 < greatest or isinstance(procedure.goals[k], KeepSide):
+                continue
+            sense = 1.0 if least > 0.0 else -1.0
+            room = sense * winding(thread, centre_of(self.scene, name)) - min(abs(least), abs(greatest)) + math.pi
+            if room > 0.0 and not (isinstance(goal, WindingGoal) and goal.around == name):
                 lines.append(self._ray(name, middle, sense, -min(room, 1.5 * math.pi)))
         return np.reshape(np.array(lines, np.float64), (-1, 4))
 
@@ -469,7 +748,12 @@ class NeedlePlanner:
         return np.asarray(free & ~shapely.contains_xy(filled, x, y))
 
 
-def place_of(goal: GoTo | Tighten | Withdraw, start: Vector) -> Vector:
+def _no_way(goal: Goal, middle: Vector, required: float) -> str:
+    x, y = 1e3 * middle
+    return f"no way for the needle to {goal.GROUP} from {x:.1f}, {y:.1f} mm, with {1e3 * required:.3g} mm around it"
+
+
+def place_of(goal: GoTo | Tighten | Withdraw | KeepSide, start: Vector) -> Vector:
     """Return the place that a goal brings the needle's middle to, shape (2,) [m].
 
     Args:
@@ -488,6 +772,8 @@ def chain(procedure: Procedure, index: int) -> tuple[Goal, ...]:
         # Where a tightened thread ends depends on the thread, and so does what follows.
         if not isinstance(procedure.goals[last], PassThrough | Wrap):
             break
+        if isinstance(procedure.goals[last + 1], ThreadGoal | Wait):
+            break
         last += 1
     return procedure.goals[index : last + 1]
 
@@ -503,7 +789,8 @@ def chains(procedure: Procedure) -> list[tuple[int, tuple[Goal, ...]]]:
 
 def planned_duration(procedure: Procedure, paths: Sequence[BodyPath]) -> float:
     """Return the time of planned paths at the speeds of their goals, without friction [s]."""
-    return sum(
+    waits = sum(goal.time for goal in procedure.goals if isinstance(goal, Wait))
+    return waits + sum(
         path.length / procedure.limits[index].speed for (index, _), path in zip(chains(procedure), paths, strict=True)
     )
 
@@ -512,23 +799,30 @@ def _check_procedure(procedure: Procedure, planner: NeedlePlanner, first: int) -
     wrapped: dict[str, float] = {}  # what the thread winds about each shape, the last one last [rad]
     for index, (goal, limits) in enumerate(zip(procedure.goals, procedure.limits, strict=True)):
         where, required = f"goals[{index}].{goal.GROUP}", max(planner.keep_out, limits.clearance)
-        if isinstance(goal, Wrap):
+        if isinstance(goal, WindingGoal):
             _check_name(planner, f"{where}.around", goal.around)
-            if wrapped.pop(goal.around, 0.0) * goal.swept < 0.0:
+            before = wrapped.pop(goal.around, 0.0)
+            if isinstance(goal, Wrap) and before * goal.swept < 0.0:
                 sense = "clockwise" if goal.swept > 0.0 else "counterclockwise"
                 raise ConfigurationError(f"{where}.sense", goal.sense, f"{sense}, as {goal.around} is wrapped before")
-            wrapped[goal.around] = procedure.windings[index]
+        if isinstance(goal, Wrap | Wind):
+            wrapped[goal.around] = min(procedure.windings[index], key=abs)
             needed, length = planner.length_around(wrapped), planner.thread_length
             if needed > length:
-                whole = " with the wraps before" if len(wrapped) > 1 or goal.swept != procedure.windings[index] else ""
+                is_alone = len(wrapped) == 1 and (isinstance(goal, Wind) or wrapped[goal.around] == goal.swept)
+                whole = "" if is_alone else " with the wraps before"
                 expected = f"an angle for which {1e3 * length:.3g} mm of thread are enough{goal.in_radians}"
                 raise ConfigurationError(
                     f"{where}.angle", f"{goal.angle:g} rad, {1e3 * needed:.3g} mm of thread{whole}", expected
                 )
         elif isinstance(goal, Tighten):
             _check_tighten(planner, where, goal, limits, required, wrapped)
-        elif index < first:
+        elif index < first or isinstance(goal, Unwind | TakeOff | Wait):
             continue
+        elif isinstance(goal, Lay):
+            _check_line(planner, where, goal)
+        elif isinstance(goal, BringEnd):
+            _check_free(planner, f"{where}.position", shapely.Point(goal.position), goal.position)
         elif isinstance(goal, PassThrough):
             _check_gap(planner, where, goal, required)
         elif isinstance(goal, GoTo):
@@ -564,6 +858,27 @@ def _check_tighten(
     if away > left:
         expected = f"a place within {1e3 * (left + planner.lever):.3g} mm of {around}, which the thread reaches"
         raise ConfigurationError(f"{where}.toward", list(goal.toward), expected)
+
+
+def _check_line(planner: NeedlePlanner, where: str, goal: Lay) -> None:
+    line = shapely.LineString(np.reshape(goal.along, (-1, 2)))
+    _check_free(planner, f"{where}.along", line, goal.along)
+    length, own = 1e3 * line.length, 1e3 * planner.thread_length
+    if length > own + 2e3 * goal.tolerance or max(goal.stretch, default=0.0) > planner.thread_length:
+        expected = f"a line and a stretch within the length of the thread, {own:.3g} mm"
+        raise ConfigurationError(f"{where}.along", f"{length:.3g} mm", expected)
+    if goal.stretch and abs(length - 1e3 * (goal.stretch[1] - goal.stretch[0])) > 2e3 * goal.tolerance:
+        expected = f"one as long as the line, {length:.3g} mm, within twice the tolerance"
+        raise ConfigurationError(f"{where}.stretch", list(goal.stretch), expected)
+
+
+def _check_free(planner: NeedlePlanner, where: str, part: shapely.Geometry, given: tuple[float, ...]) -> None:
+    """Refuse where the thread cannot lie."""
+    within = [name for name in planner.scene.names if solid_of(planner.scene, name).intersects(part)]
+    if np.hypot(*shapely.get_coordinates(part).T).max() >= planner.scene.dish.radius:
+        within.append(WALL_NAME)
+    if within:
+        raise ConfigurationError(where, list(given), f"what is clear of {' and '.join(within)}")
 
 
 def _check_gap(planner: NeedlePlanner, where: str, goal: PassThrough, required: float) -> None:

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from magnetosuture_thread.configuration import (
     Configuration,
@@ -34,6 +34,7 @@ from magnetosuture_thread.scene import WALL_NAME
 MAX_GOALS = 100
 HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
 KEYS = {"setup", "scene", "goals", "limits"}
+_SENSES = ("clockwise", "counterclockwise")
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
 
 
@@ -90,14 +91,12 @@ class PassThrough(Configuration):
 
 
 @dataclass(frozen=True)
-class Wrap(Configuration):
-    """Drive around a shape until the thread winds about it by an angle, with that of the wraps before."""
-
-    GROUP: ClassVar[str] = "wrap"
+class _Turns(Configuration):
+    """An angle about a shape, in a sense."""
 
     around: str = quantity("", "name of the shape")
     angle: float = quantity(0.0, "that the thread winds about it", unit="rad", minimum=0.0, maximum=3600.0)
-    sense: str = quantity("counterclockwise", "of the way", choices=("clockwise", "counterclockwise"))
+    sense: str = quantity("counterclockwise", "of the way", choices=_SENSES)
 
     def check(self) -> None:
         """Refuse a wrap by no angle, or by more than ten turns."""
@@ -113,6 +112,13 @@ class Wrap(Configuration):
     def swept(self) -> float:
         """The angle, positive counterclockwise [rad]."""
         return self.angle if self.sense == "counterclockwise" else -self.angle
+
+
+@dataclass(frozen=True)
+class Wrap(_Turns):
+    """Drive around a shape until the thread winds about it by an angle, with that of the wraps before."""
+
+    GROUP: ClassVar[str] = "wrap"
 
 
 @dataclass(frozen=True)
@@ -153,8 +159,104 @@ class Withdraw(Configuration):
             raise self.refused("to", "x and y [m], or nothing")
 
 
-Goal = GoTo | PassThrough | Wrap | Tighten | Withdraw
-GOALS: dict[str, type[Goal]] = {kind.GROUP: kind for kind in (GoTo, PassThrough, Wrap, Tighten, Withdraw)}
+@dataclass(frozen=True)
+class Wind(_Turns):
+    """Bring the angle by which the thread winds about a shape to a value, whatever it was before."""
+
+    GROUP: ClassVar[str] = "wind"
+
+    tolerance: float = quantity(0.5, "of the angle", unit="rad", minimum=0.05, maximum=2.0)
+
+
+@dataclass(frozen=True)
+class Unwind(Configuration):
+    """Drive around a shape until the thread winds about it by no more than an angle, in either sense."""
+
+    GROUP: ClassVar[str] = "unwind"
+
+    around: str = quantity("", "name of the shape")
+    angle: float = quantity(
+        math.pi, "that may be left, as a straight thread beside a shape has", unit="rad", minimum=0.2, maximum=62.9
+    )
+
+
+@dataclass(frozen=True)
+class TakeOff(Configuration):
+    """Take the thread off a shape: it winds by less than half a turn about it, and no part is near it."""
+
+    GROUP: ClassVar[str] = "take_off"
+
+    around: str = quantity("", "name of the shape")
+    clearance: float = quantity(1e-3, "of the thread from the shape", unit="m", minimum=1e-5, maximum=0.05)
+
+
+@dataclass(frozen=True)
+class KeepSide(Configuration):
+    """Bring the middle of the needle past a shape to a place, with the thread on one side of the shape."""
+
+    GROUP: ClassVar[str] = "keep_side"
+
+    around: str = quantity("", "name of the shape")
+    side: str = quantity("left", "of the shape that the thread is on, as seen along it", choices=("left", "right"))
+    to: tuple[float, ...] = quantity((), "x and y of the middle of the needle", **_PLACE)
+    tolerance: float = quantity(1e-3, "of the position", unit="m", minimum=5e-5, maximum=0.05)
+
+    def check(self) -> None:
+        """Refuse half a place."""
+        if len(self.to) != 2:
+            raise self.refused("to", "x and y [m]")
+
+
+@dataclass(frozen=True)
+class Lay(Configuration):
+    """Lay the thread, or a stretch of it, along a line, with either end first."""
+
+    GROUP: ClassVar[str] = "lay"
+
+    along: tuple[float, ...] = quantity((), "x and y of two or more points of the line, one after the other",
+                                        unit="m", minimum=-0.5, maximum=0.5, multiple=2)  # fmt: skip
+    tolerance: float = quantity(1e-3, "of the thread from the line", unit="m", minimum=5e-5, maximum=0.05)
+    stretch: tuple[float, ...] = quantity((), "begin and end of the part of the thread, from the needle on; empty for "
+                                          "any", unit="m", minimum=0.0, maximum=1.0, multiple=2)  # fmt: skip
+
+    def check(self) -> None:
+        """Refuse a line of one point, or a stretch of no length."""
+        if len(self.along) < 4 or not math.dist(self.along[:2], self.along[2:4]) > 0.0:
+            raise self.refused("along", "two or more points, as [[0.0, 0.0], [0.01, 0.0]]")
+        if self.stretch and (len(self.stretch) != 2 or not self.stretch[0] < self.stretch[1]):
+            raise self.refused("stretch", "where it begins and ends, as [0.01, 0.03]")
+
+
+@dataclass(frozen=True)
+class BringEnd(Configuration):
+    """Bring the free end of the thread to a place."""
+
+    GROUP: ClassVar[str] = "bring_end"
+
+    position: tuple[float, ...] = quantity((), "x and y of the free end", **_PLACE)
+    tolerance: float = quantity(2e-3, "of the position", unit="m", minimum=5e-5, maximum=0.05)
+
+    def check(self) -> None:
+        """Refuse half a place."""
+        if len(self.position) != 2:
+            raise self.refused("position", "x and y [m]")
+
+
+@dataclass(frozen=True)
+class Wait(Configuration):
+    """Keep the needle where it is."""
+
+    GROUP: ClassVar[str] = "wait"
+
+    time: float = quantity(1.0, "for which it is kept", unit="s", minimum=0.1, maximum=3600.0)
+
+
+WindingGoal = Wrap | Wind | Unwind | TakeOff | KeepSide
+"""Goals by which the thread is to wind about a shape by an angle within an interval, see `Procedure.windings`."""
+ThreadGoal = Wind | Unwind | TakeOff | KeepSide | Lay | BringEnd
+"""Goals of the thread whose ways are found by forecasts."""
+Goal = GoTo | PassThrough | Wrap | Tighten | Withdraw | ThreadGoal | Wait
+GOALS: dict[str, type[Goal]] = {kind.GROUP: kind for kind in get_args(Goal)}
 
 
 @dataclass(frozen=True)
@@ -182,20 +284,45 @@ class Procedure:
         for goal in self.goals:
             if isinstance(goal, PassThrough):
                 names.update(name for name in goal.between if name != WALL_NAME)
-            elif isinstance(goal, Wrap | Tighten) and goal.around:
+            elif isinstance(goal, WindingGoal | Tighten) and goal.around:
                 names.add(goal.around)
         return frozenset(names)
 
     @cached_property
-    def windings(self) -> tuple[float, ...]:
-        """What the thread is to wind about its shape after each wrap, positive counterclockwise [rad]; else 0."""
+    def windings(self) -> tuple[tuple[float, float], ...]:
+        """What the thread may wind about its shape once each `WindingGoal` is met, else anything [rad].
+
+        Least and greatest angle from the free end to the needle, positive counterclockwise. A wrap adds to the wraps
+        before, and to what `wind` has set. A thread that is straight, but for its ends, winds by up to half a turn.
+        """
         wound: defaultdict[str, float] = defaultdict(float)
         found = []
         for goal in self.goals:
+            allowed = -math.inf, math.inf
             if isinstance(goal, Wrap):
                 wound[goal.around] += goal.swept
-            found.append(wound[goal.around] if isinstance(goal, Wrap) else 0.0)
+                allowed = (wound[goal.around], math.inf) if goal.swept > 0.0 else (-math.inf, wound[goal.around])
+            elif isinstance(goal, Wind):
+                wound[goal.around] = goal.swept
+                allowed = goal.swept - goal.tolerance, goal.swept + goal.tolerance
+            elif isinstance(goal, Unwind | TakeOff):
+                wound[goal.around] = 0.0
+                left = goal.angle if isinstance(goal, Unwind) else math.pi
+                allowed = -left, left
+            elif isinstance(goal, KeepSide):
+                wound[goal.around] = 0.0
+                allowed = (0.0, 2.0 * math.pi) if goal.side == "right" else (-2.0 * math.pi, 0.0)
+            found.append(allowed)
         return tuple(found)
+
+    def lasting(self, goal: int) -> dict[str, int]:
+        """Return the last `WindingGoal` before a goal about each shape, by the shape's name, in their order."""
+        last: dict[str, int] = {}
+        for index, each in enumerate(self.goals[:goal]):
+            if isinstance(each, WindingGoal):
+                last.pop(each.around, None)
+                last[each.around] = index
+        return last
 
 
 def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
@@ -218,28 +345,46 @@ def parse_procedure(content: Any, name: str, source: str = "") -> Procedure:
     for key, value in (("setup", setup), ("scene", scene)):
         if not isinstance(value, str):
             raise ConfigurationError(f"procedure.{key}", value, f"the name of a {key}", source)
-    goals, common = content["goals"], _mapping(content.get("limits", {}), "limits", source)
+    common = _mapping(content.get("limits", {}), "limits", source)
     from_mapping(ProcedureLimits, common, source)  # else each goal would be blamed for them
+    goals = content["goals"]
+    found = list(_goals_of(goals, common, "goals", source))
+    if len(found) > MAX_GOALS:
+        raise ConfigurationError(
+            "procedure.goals", len(found), f"1 to {MAX_GOALS} goals, repeated ones counted", source
+        )
+    return Procedure(name, setup, scene, *map(tuple, zip(*found, strict=True)))
+
+
+def _goals_of(goals: Any, common: Mapping[str, Any], where: str, source: str) -> Iterator[tuple[Goal, ProcedureLimits]]:
+    """Return goals with their limits, those of `repeat` as often as they are repeated."""
     if not isinstance(goals, list) or not 0 < len(goals) <= MAX_GOALS:
         given = len(goals) if isinstance(goals, list) else type(goals).__name__
-        raise ConfigurationError("procedure.goals", given, f"a list of 1 to {MAX_GOALS} goals", source)
-    found: list[Goal] = []
-    limits: list[ProcedureLimits] = []
+        raise ConfigurationError(
+            where if "." in where else "procedure.goals", given, f"a list of 1 to {MAX_GOALS} goals", source
+        )
     for index, entry in enumerate(goals):
-        where = f"goals[{index}]"
-        kinds = [key for key in _mapping(entry, where, source) if key != "limits"]
-        if len(kinds) != 1 or kinds[0] not in GOALS:
-            expected = suggest_names(str(kinds[0]), list(GOALS)) if len(kinds) == 1 else "one kind of goal"
-            raise ConfigurationError(where, kinds, expected, source)
+        at = f"{where}[{index}]"
+        kinds = [key for key in _mapping(entry, at, source) if key != "limits"]
+        known = [*GOALS, "repeat"] if where == "goals" else [*GOALS]  # one that repeats a repeat is asked for by no one
+        if len(kinds) != 1 or kinds[0] not in known:
+            expected = suggest_names(str(kinds[0]), known) if len(kinds) == 1 else "one kind of goal"
+            raise ConfigurationError(at, kinds, expected, source)
+        content = _mapping(entry[kinds[0]], f"{at}.{kinds[0]}", source)
+        own = {**common, **_mapping(entry.get("limits", {}), f"{at}.limits", source)}
+        if kinds[0] == "repeat":
+            times = content.get("times")
+            if set(content) != {"times", "goals"} or type(times) is not int or not 1 <= times <= MAX_GOALS:
+                raise ConfigurationError(f"{at}.repeat", content, "times, from 1 on, and goals", source)
+            yield from times * list(_goals_of(content["goals"], own, f"{at}.repeat.goals", source))
+            continue
+        if isinstance(points := content.get("along"), list) and all(isinstance(point, list) for point in points):
+            content["along"] = [value for point in points for value in point]
         try:
-            goal: Goal = from_mapping(GOALS[kinds[0]], _mapping(entry[kinds[0]], f"{where}.{kinds[0]}", source), source)
-            own = {**common, **_mapping(entry.get("limits", {}), f"{where}.limits", source)}
-            limits.append(from_mapping(ProcedureLimits, own, source))
+            yield from_mapping(GOALS[kinds[0]], content, source), from_mapping(ProcedureLimits, own, source)
         except ConfigurationError as error:
-            prefix = "" if error.name.startswith("goals[") else f"{where}."
+            prefix = "" if error.name.startswith("goals[") else f"{at}."
             raise ConfigurationError(f"{prefix}{error.name}", error.value, error.expectation, source) from None
-        found.append(goal)
-    return Procedure(name, setup, scene, tuple(found), tuple(limits))
 
 
 def read_procedure(name: str) -> Procedure:

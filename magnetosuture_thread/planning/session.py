@@ -31,6 +31,7 @@ from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.scene import Dish, Scene
 from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 NO_POSE = "no needle pose yet"
 
@@ -96,12 +97,14 @@ class NeedlePlannerSettings(Configuration):
         """Reject a coiled needle."""
         check_needle(self.GROUP, self.needle_length, self.needle_curvature)
 
-    def planner(self, scene: Scene, coils: CoilBridgeSettings | None = None) -> NeedlePlanner:
-        """Return a planner for a scene, that knows the axes of the coil bridge's coils."""
+    def planner(
+        self, scene: Scene, coils: CoilBridgeSettings | None = None, model: ThreadModelSettings | None = None
+    ) -> NeedlePlanner:
+        """Return a planner for a scene, that knows the axes of the coil bridge's coils, and the thread model."""
         kinematics = NeedleKinematics(self.needle_length, self.needle_curvature)
         clearance = self.keep_out + self.pose_margin  # as the bridge's filter
         axes = coils.allocation().axes() if coils else ()
-        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, axes)
+        return NeedlePlanner(scene, kinematics, clearance, self.thread_length, axes, model)
 
 
 class _Margins(NamedTuple):
@@ -308,6 +311,7 @@ class ProcedureSession:
         scene: dish and shapes; None until one is known.
         submit: begins to plan a path while the needle is moved; see `ProcedureExecutor`.
         coils: settings of the coil bridge that follows.
+        model: settings of the thread model, for forecasts.
 
     Attributes:
         known: what the loop's nodes report.
@@ -320,8 +324,9 @@ class ProcedureSession:
         scene: Scene | None,
         submit: PathSubmitter = plan_now,
         coils: CoilBridgeSettings | None = None,
+        model: ThreadModelSettings | None = None,
     ) -> None:
-        self._settings, self._submit, self._coils = settings, submit, coils
+        self._settings, self._submit, self._coils, self._model = settings, submit, coils, model
         self.known = LoopState(settings)
         self.planned_duration = 0.0
         self._planner: NeedlePlanner | None = None
@@ -374,7 +379,7 @@ class ProcedureSession:
         Raises:
             ConfigurationError: the needle has no room in it; the scene of before stays.
         """
-        self._planner = self._settings.planner(scene, self._coils)
+        self._planner = self._settings.planner(scene, self._coils, self._model)
         self.known.scene_version = scene.version
         del self._planned[1:]  # paths of later goals, by the scene of before
         self._shown = None

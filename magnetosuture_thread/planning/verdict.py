@@ -8,8 +8,17 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.planning.procedure import PassThrough, Procedure, Wrap
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.planning.procedure import (
+    BringEnd,
+    Lay,
+    PassThrough,
+    Procedure,
+    TakeOff,
+    ThreadGoal,
+    WindingGoal,
+    Wrap,
+)
 from magnetosuture_thread.scene import WALL_NAME, Scene
 
 Vector = NDArray[np.float64]
@@ -78,12 +87,68 @@ def winding(thread: Points, centre: Vector) -> float:
     return float(turns[0] - turns[-1])
 
 
+def left_to_wind(allowed: tuple[float, float], now: float) -> float:
+    """Return the least angle by which a winding has to change to be within an interval [rad]; NaN of one unknown."""
+    least, greatest = allowed
+    return max(least - now, 0.0) + min(greatest - now, 0.0)
+
+
+def part_along(thread: Points, line: Points, stretch: tuple[float, ...]) -> Points:
+    """Return the part of a thread that is to lie along a line, in the order of the line's points, shape (k, 2) [m].
+
+    Args:
+        thread: the tail first, shape (n + 1, 2) [m].
+        line: shape (m, 2) [m].
+        stretch: arc lengths of the part from the tail on [m]; empty for what is between the points of the thread that
+            are nearest to the line's ends.
+    """
+    curve = shapely.LineString(thread)
+    begin, end = stretch or (curve.line_locate_point(shapely.Point(point)) for point in (line[0], line[-1]))
+    part = points_at(thread, np.linspace(begin, end, 40))
+    if stretch and math.dist(part[0], line[0]) + math.dist(part[-1], line[-1]) > (
+        math.dist(part[0], line[-1]) + math.dist(part[-1], line[0])
+    ):
+        part = part[::-1]
+    return part
+
+
+def miss(goal: ThreadGoal, allowed: tuple[float, float], thread: Points, solid: shapely.Geometry | None) -> float:
+    """Return by how much a thread misses a goal, as a share of what the goal tolerates: 1 or less is met.
+
+    Of a line the greatest distance of points at equal shares of its length and of that of the thread along it, of the
+    free end its distance, of a winding how far it is from the middle of its
+    interval; of a thread that is to be taken off also its clearance over its distance from the shape.
+
+    Args:
+        goal: of the thread.
+        allowed: interval of the winding, see `Procedure.windings` [rad].
+        thread: the tail first, shape (n + 1, 2) [m].
+        solid: the goal's shape; None where it has none.
+    """
+    if isinstance(goal, Lay):
+        line = np.reshape(goal.along, (-1, 2))
+        part, along = (
+            part_along(thread, line, goal.stretch),
+            points_at(line, np.linspace(0.0, arc_lengths(line)[-1], 40)),
+        )
+        return float(np.linalg.norm(part - along, axis=1).max()) / goal.tolerance
+    if isinstance(goal, BringEnd):
+        return math.dist(thread[-1], goal.position) / goal.tolerance
+    assert solid is not None
+    middle, half = 0.5 * (allowed[0] + allowed[1]), 0.5 * (allowed[1] - allowed[0])
+    off = abs(winding(thread, np.array(solid.centroid.coords[0])) - middle) / half
+    if isinstance(goal, TakeOff):
+        off = max(off, goal.clearance / max(shapely.LineString(thread).distance(solid), 1e-9))
+    return off
+
+
 class GoalJudge:
     """Follows needle and thread through the goals of a procedure.
 
     A pass is met when the middle of the needle's chord has crossed the line across the gap once more in its direction
     than against it, since its goal began. A wrap is met when the thread, from its free end to the needle, winds about
-    the shape by the angles of all wraps about it so far; a thread that slips off undoes it.
+    the shape by the angles of all wraps about it so far; a thread that slips off undoes it. For the other goals of the
+    thread see `miss`.
 
     Args:
         procedure: its goals.
@@ -91,26 +156,28 @@ class GoalJudge:
 
     Attributes:
         crossed: net crossings of the present goal's gap.
-        windings: of the thread about each shape that is wrapped [rad]; NaN where no thread is known.
+        windings: of the thread about each shape of a `WindingGoal` [rad]; NaN where no thread is known.
+        thread: as it was known last, the tail first, shape (n + 1, 2) [m]; None before that.
     """
 
     def __init__(self, procedure: Procedure, scene: Scene) -> None:
-        self._procedure = procedure
+        self._procedure, self._scene = procedure, scene
         self._lines = {
             index: lines_of_pass(scene, goal)
             for index, goal in enumerate(procedure.goals)
             if isinstance(goal, PassThrough)
         }
-        wrapped = dict.fromkeys(goal.around for goal in procedure.goals if isinstance(goal, Wrap))
-        self._centres = {name: centre_of(scene, name) for name in wrapped}
+        self._solids = {name: solid_of(scene, name) for name in procedure.lasting(len(procedure.goals))}
         self._goal, self.crossed = 0, 0
         self._middle: Vector | None = None
-        self.windings = dict.fromkeys(self._centres, math.nan)
+        self.thread: Points | None = None
+        self.windings = dict.fromkeys(self._solids, math.nan)
 
     def in_scene(self, scene: Scene) -> GoalJudge:
         """Return a judge that goes on in another scene, which has the shapes of all goals."""
         other = GoalJudge(self._procedure, scene)
         other._goal, other.crossed, other._middle = self._goal, self.crossed, self._middle
+        other.thread = self.thread
         return other
 
     def begin(self, goal: int) -> None:
@@ -129,45 +196,65 @@ class GoalJudge:
             self.crossed += sum(crossings(line, *step) for line in lines)
         self._middle = middle
         if thread is not None and len(thread) > 1:
-            self.windings = {name: winding(thread, centre) for name, centre in self._centres.items()}
+            self.thread = thread
+            self.windings = {name: winding(thread, centre_of(self._scene, name)) for name in self._solids}
 
     @property
     def is_met(self) -> bool:
-        """Whether the present goal is met, as far as it is a pass or a wrap."""
+        """Whether the present goal is met, as far as it is a pass or one of the thread."""
         goal = self._procedure.goals[self._goal]
         if isinstance(goal, PassThrough):
             return self.crossed >= 1
-        return not isinstance(goal, Wrap) or self.left_to_wind <= 0.02  # rad; it trembles with the measured thread
+        if isinstance(goal, Wrap):  # the angle trembles with the measured thread, in rad
+            return abs(self.left_to_wind) <= 0.02
+        return not isinstance(goal, ThreadGoal) or self.miss <= 1.0
+
+    @property
+    def miss(self) -> float:
+        """By how much the present goal of the thread is missed, see `miss`; inf where no thread is known."""
+        goal = self._procedure.goals[self._goal]
+        assert isinstance(goal, ThreadGoal)
+        solid = self._solids[goal.around] if isinstance(goal, WindingGoal) else None
+        allowed = self._procedure.windings[self._goal]
+        return math.inf if self.thread is None else miss(goal, allowed, self.thread, solid)
 
     @property
     def left_to_wind(self) -> float:
-        """Angle that the thread winds less than the present goal, a wrap, asks for [rad]; NaN where it is not known."""
-        return self._short_by(self._goal)
+        """By how much the winding of the present goal has to change, see `left_to_wind` [rad]; NaN of one unknown."""
+        return self._left(self._goal)
 
     def missing(self, goal: int) -> str:
-        """Return in words what is missing of a pass or a wrap."""
-        wanted = self._procedure.goals[goal]
+        """Return in words what is missing of a pass or a goal of the thread."""
+        wanted, allowed = self._procedure.goals[goal], self._procedure.windings[goal]
         if isinstance(wanted, PassThrough):
             return f"the needle did not pass between {' and '.join(wanted.between)}"
-        assert isinstance(wanted, Wrap)
-        now, needed = self.windings[wanted.around], abs(self._procedure.windings[goal])
-        if math.isnan(now):
+        if self.thread is None:
             return "the thread is not known"
-        wound = math.degrees(math.copysign(1.0, wanted.swept) * now)
-        return f"the thread slips on {wanted.around}: it winds {wound:.0f} of {math.degrees(needed):.0f} degrees"
+        if isinstance(wanted, Lay | BringEnd):
+            what = "thread is off its line" if isinstance(wanted, Lay) else "free end is off its place"
+            off = 1e3 * wanted.tolerance * miss(wanted, allowed, self.thread, None)
+            return f"the {what} by {off:.2f} mm, with a tolerance of {1e3 * wanted.tolerance:.2f} mm"
+        assert isinstance(wanted, WindingGoal)
+        if isinstance(wanted, TakeOff) and not self._left(goal):
+            away = 1e3 * shapely.LineString(self.thread).distance(self._solids[wanted.around])
+            return f"the thread is {away:.2f} mm from {wanted.around}, not {1e3 * wanted.clearance:.2f} mm"
+        now = math.degrees(self.windings[wanted.around])
+        if isinstance(wanted, Wrap):
+            sense, needed = math.copysign(1.0, wanted.swept), math.degrees(min(map(abs, allowed)))
+            return f"the thread slips on {wanted.around}: it winds {sense * now:.0f} of {needed:.0f} degrees"
+        least, greatest = map(math.degrees, allowed)
+        return f"the thread winds {now:.0f} degrees about {wanted.around}, not {least:.0f} to {greatest:.0f}"
 
-    def lost_wrap(self) -> str:
-        """Return in words which wrap the thread has slipped off; empty for none.
+    def lost_winding(self) -> str:
+        """Return in words about which shape the thread does not wind any more as it is to; empty for none.
 
         A thread that is led off straight may wind by half a turn less.
         """
-        last = {goal.around: index for index, goal in enumerate(self._procedure.goals) if isinstance(goal, Wrap)}
-        lost = [index for index in last.values() if self._short_by(index) > math.pi]
+        last = self._procedure.lasting(len(self._procedure.goals)).values()
+        lost = [index for index in last if abs(self._left(index)) > math.pi]
         return self.missing(lost[0]) if lost else ""
 
-    def _short_by(self, index: int) -> float:
-        """Return the angle that the thread winds less than a wrap asks for [rad]; NaN where it is not known."""
-        wrap = self._procedure.goals[index]
-        assert isinstance(wrap, Wrap)
-        missing = self._procedure.windings[index] - self.windings[wrap.around]
-        return math.copysign(1.0, wrap.swept) * missing
+    def _left(self, index: int) -> float:
+        goal = self._procedure.goals[index]
+        assert isinstance(goal, WindingGoal)
+        return left_to_wind(self._procedure.windings[index], self.windings[goal.around])

@@ -66,7 +66,7 @@ def test_a_wrap_is_of_the_thread_when_it_is_met_and_at_the_end(then: float, last
     found = judged(goals, [(0, at, around(then)), (1, at, around(then)), (2, at, around(last))])
     assert len(found) == failures
     assert all(
-        "winds 300 of 344 degrees" in text or "100 degrees of thread are left around b" in text for text in found
+        "winds 300 of 344 degrees" in text or "at the end, the thread winds 100 of 344" in text for text in found
     )
 
 
