@@ -321,11 +321,23 @@ class BodyPath:
     leeway: NDArray[np.float64]
     ends: NDArray[np.float64]
 
+    @classmethod
+    def through(cls, poses: Points, lever: float) -> BodyPath:
+        """Return a path of poses as they are, shape (m, 3), whose leeway is not known."""
+        angles = np.unwrap(poses[:, 2])
+        found = cls(poses[:, :2].copy(), angles, lever, np.zeros(len(poses)), np.zeros(0))
+        return replace(found, ends=np.array([found.length]))
+
     @cached_property
     def travel(self) -> NDArray[np.float64]:
         """Way of the tip in the needle's frame up to each pose, |dx| + lever |dangle| summed up, shape (m,) [m]."""
         steps = np.hypot(*np.diff(self.middles, axis=0).T) + self.lever * np.abs(np.diff(self.angles))
         return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def poses(self) -> Points:
+        """Middles and angles, shape (m, 3)."""
+        return np.column_stack([self.middles, self.angles])
 
     @property
     def length(self) -> float:
@@ -365,7 +377,6 @@ def smooth_path(
     required: float,
     margin: float,
     near: ClearanceMap,
-    passes: int = PASSES,
 ) -> BodyPath:
     """Return the path through the states of the lattice, its corners rounded as far as the clearance allows.
 
@@ -377,16 +388,15 @@ def smooth_path(
         required: clearance of the body [m].
         margin: how much more than that is kept on the path [m].
         near: distances from wall and shapes.
-        passes: by which corners are rounded; none, and only the kinks of the lattice are filtered out.
     """
     poses, reached, first = [states[:1]], [], 0
     states = np.column_stack([states[:, :2], np.unwrap(states[:, 2])])
     for end in ends.tolist():
         part = states[first : end + 1]
-        coarse = BodyPath(part[:, :2], part[:, 2], lever, np.zeros(len(part)), np.zeros(0))
+        coarse = BodyPath.through(part, lever)
         at = np.linspace(0.0, coarse.length, max(2, math.ceil(coarse.length / SPACING) + 1))
         dense = np.column_stack([np.interp(at, coarse.travel, column) for column in part.T])
-        _relax(dense, body, required + margin, required + margin + PREFERRED, near, passes)
+        _relax(dense, body, required + margin, required + margin + PREFERRED, near)
         poses.append(_filtered(dense, body, required + margin, near)[1:])
         reached.append(sum(map(len, poses)) - 1)
         first = end
@@ -430,13 +440,13 @@ def _filtered(poses: Points, body: Points, required: float, near: ClearanceMap) 
 
 
 @compiled_without_gil
-def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap, passes: int) -> None:
+def _relax(poses: Points, body: Points, required: float, preferred: float, near: ClearanceMap) -> None:
     """Move each pose to the middle of its neighbours, and turn it along the way, where the clearance allows.
 
     A clearance may not fall below the one that is preferred; where it is less already, it may not fall at all.
     """
     count = len(poses)
-    for _ in range(passes):
+    for _ in range(PASSES):
         for k in range(1, count - 1):
             x, y, angle = poses[k, 0], poses[k, 1], poses[k, 2]
             nx = x + PULL * (0.5 * (poses[k - 1, 0] + poses[k + 1, 0]) - x)

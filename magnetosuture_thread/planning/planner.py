@@ -20,7 +20,6 @@ from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
-    PASSES,
     PREFERRED,
     STRIDE,
     BodyPath,
@@ -88,10 +87,30 @@ class PlanningError(MagnetosutureError):
 
 
 @dataclass(frozen=True, eq=False)
+class _Asked:
+    """A goal of the thread, and from where it is to be reached: pose of the chord, thread, and state of the lattice."""
+
+    procedure: Procedure
+    index: int
+    pose: Vector
+    thread: Points
+    required: float
+    margin: float
+    state: NDArray[np.int64]
+
+    @property
+    def goal(self) -> ThreadGoal:
+        goal = self.procedure.goals[self.index]
+        assert isinstance(goal, ThreadGoal)
+        return goal
+
+
+@dataclass(frozen=True, eq=False)
 class _Trial:
     """A candidate, its path up to where the thread comes nearest to the goal, by how much it misses, and the thread."""
 
     candidate: Candidate
+    whole: BodyPath
     path: BodyPath
     miss: float
     thread: Points
@@ -231,7 +250,7 @@ class NeedlePlanner:
     def rollout(self) -> ThreadRollout:
         """What forecasts the thread along a path; it raises a `PlanningError` where the thread model does not fit."""
         try:
-            return ThreadRollout(make_forecaster(self._model, self.scene), self.needle)
+            return ThreadRollout(make_forecaster(self._model, self.scene, step=0.1), self.needle)  # s
         except ConfigurationError as error:
             raise PlanningError(f"no forecast of the thread: {error}") from None
 
@@ -251,88 +270,67 @@ class NeedlePlanner:
     ) -> BodyPath:
         """Return the path from a pose of the chord by which the thread comes to lie as a goal asks; see `plan`.
 
-        Every candidate is forecast along its corners. The two that miss by the least are improved, and rounded. Of
+        Every candidate is forecast along its corners. The four that miss by the least are improved, and rounded. Of
         those that meet the goal well the shortest is chosen.
         """
-        goal = procedure.goals[index]
-        assert isinstance(goal, ThreadGoal)
         trials: list[_Trial] = []
-        if before is not None:
-            at = procedure, index, pose, thread, required, MARGINS[-1]
-            known = self._try(Candidate(path=np.column_stack([before.middles, before.angles])), *at, passes=0)
-            known = known and self._try(self._improved(known, *at).candidate, *at)
-            if known is not None and known.miss <= 1.0:
-                return known.path
         for margin in MARGINS:
+            state = self._nearest_free(pose[:2], float(pose[2]), required + margin)
+            if state is None:
+                continue
+            asked = _Asked(procedure, index, pose, thread, required, margin, state)
+            known = None if before is None else self._try(Candidate(path=before.poses), asked)
+            if known is not None and (trial := self._rounded(self._improved(known, asked), asked)).miss <= 1.0:
+                return trial.path
             reach = self.scene.dish.radius - required - margin - self.lever
-            at = procedure, index, pose, thread, required, margin
-            found = filter(None, [self._try(candidate, *at, passes=0) for candidate in candidates(goal, reach)])
-            first = sorted(found, key=lambda trial: max(trial.miss, WELL_MET))[:2]
-            for trial in first:
-                rounded = self._try(self._improved(trial, *at).candidate, *at)
-                trials += [rounded] if rounded is not None else []
-                if rounded is not None and rounded.miss <= WELL_MET:
+            found = filter(None, [self._try(candidate, asked) for candidate in candidates(asked.goal, reach)])
+            for trial in sorted(found, key=lambda trial: max(trial.miss, WELL_MET))[:4]:
+                trials.append(self._rounded(self._improved(trial, asked), asked))
+                if trials[-1].miss <= WELL_MET:
                     break
             if trials:
                 break
+        no_way = _no_way(procedure.goals[index], pose[:2], required)
         if not trials:
-            raise PlanningError(_no_way(goal, pose[:2], required))
+            raise PlanningError(no_way)
         best = min(trials, key=lambda trial: (max(trial.miss, WELL_MET), trial.path.length))
         if best.miss > 1.0:
             judge = GoalJudge(procedure, self.scene)
             judge.update(best.path.middles[-1], best.thread)
-            raise PlanningError(f"{_no_way(goal, pose[:2], required)}; at best, {judge.missing(index)}")
+            raise PlanningError(f"{no_way}; at best, {judge.missing(index)}")
         return best.path
 
-    def _improved(
-        self,
-        trial: _Trial,
-        procedure: Procedure,
-        index: int,
-        pose: Vector,
-        thread: Points,
-        required: float,
-        margin: float,
-    ) -> _Trial:
+    def _improved(self, trial: _Trial, asked: _Asked) -> _Trial:
         """Return the best of a candidate, what corrects it by its error, and of variations of the best so far.
 
         Source: the (1 + 1) evolution strategy with the rule of successes, Rechenberg 1973.
         """
-        goal, rng, scale, is_new = procedure.goals[index], np.random.default_rng(0), 1.0, True
-        assert isinstance(goal, ThreadGoal)
+        rng, scale, is_new = np.random.default_rng(0), 1.0, True
         for _ in range(32):
             if trial.miss <= WELL_MET:
                 break
-            left = self._left_to_wind(procedure, index, trial.thread)
-            moved = trial.candidate.corrected(goal, trial.thread, left) if is_new else None
-            moved = trial.candidate.varied(rng, scale) if moved is None else moved
-            latest = self._try(moved, procedure, index, pose, thread, required, margin, passes=0)
+            left = self._left_to_wind(asked.procedure, asked.index, trial.thread)
+            moved = trial.candidate.corrected(asked.goal, trial.thread, left) if is_new else None
+            latest = self._try(trial.candidate.varied(rng, scale) if moved is None else moved, asked)
             is_new = latest is not None and latest.miss < trial.miss
             trial = latest if latest is not None and is_new else trial
             scale *= 1.5 if is_new else 0.9
         return trial
 
-    def _try(
-        self,
-        candidate: Candidate,
-        procedure: Procedure,
-        index: int,
-        pose: Vector,
-        thread: Points,
-        required: float,
-        margin: float,
-        passes: int = PASSES,
-    ) -> _Trial | None:
-        """Return what a forecast makes of a candidate, see `smooth_path`; None where there is no way for it."""
-        states = self._states_of(candidate, procedure, index, pose, thread, required + margin)
+    def _try(self, candidate: Candidate, asked: _Asked) -> _Trial | None:
+        """Return what a forecast makes of a candidate; None where there is no way for it."""
+        states = self._states_of(candidate, asked)
         if states is None:
             return None
-        states = np.vstack([pose, states])
-        states[:, 2] = np.unwrap(states[:, 2])
-        ends = np.array([len(states) - 1])
-        path = smooth_path(states, ends, self.lever, self.body, required, margin, self.near, passes)
-        self.looked += passes * len(path.angles) // 6  # which takes as long
-        return self._foresee(candidate, path, procedure, index, thread)
+        path = BodyPath.through(np.vstack([asked.pose, states]), self.lever)
+        return self._foresee(candidate, path, asked.procedure, asked.index, asked.thread)
+
+    def _rounded(self, trial: _Trial, asked: _Asked) -> _Trial:
+        """Return what the forecast makes of a path whose corners are rounded; as it was where that cannot be."""
+        at = asked.required, asked.margin, self.near
+        path = smooth_path(trial.whole.poses, np.array([len(trial.whole.angles) - 1]), self.lever, self.body, *at)
+        self.looked += 60 * len(path.angles)  # which takes as long
+        return self._foresee(trial.candidate, path, asked.procedure, asked.index, asked.thread) or trial
 
     def _foresee(
         self, candidate: Candidate, path: BodyPath, procedure: Procedure, index: int, thread: Points
@@ -340,39 +338,35 @@ class NeedlePlanner:
         """Return what the forecast along a path makes of it; None where needle or thread lie where they cannot."""
         goal, judge, before = procedure.goals[index], GoalJudge(procedure, self.scene), self.rollout.steps
         judge.begin(index)
-        best: _Trial | None = None
+        best, reach, nearest = math.inf, 0.0, np.empty((0, 2))
         try:
             for way, lies in self.rollout.threads(path, procedure.limits[index].speed, thread):
                 judge.update(pose := path.at(way)[0], lies)
-                if isinstance(goal, KeepSide) and math.dist(pose, goal.to) > goal.tolerance:
-                    continue
-                if best is None or judge.miss < best.miss:
-                    best = _Trial(candidate, path.part(0.0, way), judge.miss, lies)
-                if judge.miss <= WELL_MET:
+                is_there = not isinstance(goal, KeepSide) or math.dist(pose, goal.to) <= goal.tolerance
+                if is_there and judge.miss < best:
+                    best, reach, nearest = judge.miss, way, lies
+                if best <= WELL_MET:
                     break
         except InvalidInputError:
             return None
-        # A step of a forecast, and what is compared with the goal, take as long as 30 states of the lattice.
-        self.looked += 30 * (self.rollout.steps - before)
-        return best
+        # A step of a forecast, and what is compared with the goal, take as long as 40 states of the lattice.
+        self.looked += 40 * (self.rollout.steps - before)
+        return _Trial(candidate, path, path.part(0.0, reach), best, nearest) if best < math.inf else None
 
-    def _states_of(
-        self, candidate: Candidate, procedure: Procedure, index: int, pose: Vector, thread: Points, kept: float
-    ) -> Points | None:
+    def _states_of(self, candidate: Candidate, asked: _Asked) -> Points | None:
         """Return the states on the way of a candidate, shape (k, 3); None where there is none."""
+        kept = asked.required + asked.margin
         if len(candidate.path):
             free = [body_clearance(x, y, angle, self.body, self.near) >= kept for x, y, angle in candidate.path[1:]]
             return candidate.path if all(free) else None
-        goal, at = procedure.goals[index], self._nearest_free(pose[:2], float(pose[2]), kept)
-        if at is None:
-            return None
-        parts = [self._pose_of(at)[None]]
+        parts = [self._pose_of(asked.state)[None]]
         if len(candidate.via):
             if (way := self._to_place(candidate.via, parts[-1][-1], kept)) is None:
                 return None
             parts.append(way)
         if not math.isnan(candidate.more):
-            found = self._way(procedure, index, goal, pose[:2], at, thread, 0, kept, candidate.more)
+            at = asked.pose[:2], asked.state, asked.thread, 0, kept, candidate.more
+            found = self._way(asked.procedure, asked.index, asked.goal, *at)
             if not len(found):
                 return None
             parts.append(found)
@@ -459,7 +453,7 @@ class NeedlePlanner:
             except PlanningError as error:
                 raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
             lies = np.empty((0, 2)) if thread is None else thread
-            thread = self.led(lies, np.column_stack([path.middles, path.angles]))
+            thread = self.led(lies, path.poses)
             if any(isinstance(goal, ThreadGoal) for goal in procedure.goals[index:]):
                 with suppress(InvalidInputError):  # of a thread that cannot lie as it is
                     *_, (_, thread) = self.rollout.threads(path, procedure.limits[index].speed, lies)

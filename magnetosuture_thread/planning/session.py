@@ -525,7 +525,7 @@ class ProcedureSession:
             ahead = [path for _, path in self._planned]
         else:
             ahead = [current, *(path for first, path in self._planned if first > executor.goal)]
-        return np.vstack([np.column_stack([path.middles, path.angles]) for path in ahead])
+        return np.vstack([path.poses for path in ahead])
 
 
 @cache

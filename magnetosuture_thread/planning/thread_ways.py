@@ -177,7 +177,7 @@ class ThreadRollout:
             InvalidInputError: needle or thread lie where they cannot.
         """
         step = self._forecaster.step
-        plan = np.column_stack([path.middles, path.angles])
+        plan = path.poses
         pose, start, way = plan[0], self._start(plan[0], thread), 0.0
         yield 0.0, start.vertices
         every = max(1, round(0.5 / step))
