@@ -328,9 +328,12 @@ class ProcedureExecutor:
             self._next_goal()
             return None
         if isinstance(goal, ThreadGoal) and self._strays():
-            rest, index = self.path.part(self.travel, self.path.length), self.goal
-            self._at_end(goal, middle)
-            self._left = rest if self.goal == index else None
+            if self.judge.is_met and not isinstance(goal, KeepSide):
+                self._next_goal()
+                return None
+            rest = self.path.part(self.travel, self.path.length)
+            self._replan(stamp, np.zeros(2), "")
+            self._left = rest
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
             self._plan_ahead(goal)

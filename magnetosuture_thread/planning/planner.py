@@ -51,7 +51,7 @@ from magnetosuture_thread.planning.procedure import (
     Withdraw,
     Wrap,
 )
-from magnetosuture_thread.planning.thread_ways import Candidate, ThreadRollout, candidates, line_states
+from magnetosuture_thread.planning.thread_ways import Candidate, ThreadRollout, candidates
 from magnetosuture_thread.planning.verdict import (
     GoalJudge,
     centre_of,
@@ -360,55 +360,33 @@ class NeedlePlanner:
             free = [body_clearance(x, y, angle, self.body, self.near) >= kept for x, y, angle in candidate.path[1:]]
             return candidate.path if all(free) else None
         parts = [self._pose_of(asked.state)[None]]
-        if len(candidate.via):
-            if (way := self._to_place(candidate.via, parts[-1][-1], kept)) is None:
-                return None
-            parts.append(way)
         if not math.isnan(candidate.more):
             at = asked.pose[:2], asked.state, asked.thread, 0, kept, candidate.more
             found = self._way(asked.procedure, asked.index, asked.goal, *at)
             if not len(found):
                 return None
             parts.append(found)
-        if len(candidate.line):
-            # Straight on before and beyond as far as there is room, as a thread lies straight that is pulled straight.
-            line = line_states(candidate.line, self.lever, self.thread_length, self.thread_length)
-            free = [body_clearance(x, y, angle, self.body, self.near) >= kept for x, y, angle in line]
-            ends = np.linalg.norm(line[:, None, :2] - candidate.line[[0, -1]], axis=2).argmin(axis=0)
-            first, last = ends[0], ends[1]
-            while first > 0 and free[first - 1]:
-                first -= 1
-            while not len(candidate.onward) and last + 1 < len(line) and free[last + 1]:
-                last += 1
-            line = line[first : last + 1]
-            if not all(free[first : last + 1]):
-                return None
-            back = np.add(line[::-1], (0.0, 0.0, math.pi))
-            for k in range(candidate.passes, 0, -1):
-                states = line if k % 2 else back
-                if (way := self._to_place(states[0, :2], parts[-1][-1], kept, states[0, 2])) is None:
-                    return None
-                parts += [way, states]
-        for place in candidate.onward:
+        # Straight on before and beyond a line, as a thread lies straight that is pulled straight.
+        beyond = 0.0 if len(candidate.onward) else self.thread_length
+        for place in candidate.places(self.lever, self.thread_length, beyond):
             way = self._to_place(place, parts[-1][-1], kept)
-            parts += [way] if way is not None else []
+            parts += [way] if way is not None else []  # where the needle has no room it goes past
         return np.vstack(parts)
 
-    def _to_place(self, place: Vector, state: Vector, kept: float, heading: float | None = None) -> Points | None:
-        """Return the states on the way to a place, in a direction if one is given; None where there is none."""
+    def _to_place(self, place: Vector, state: Vector, kept: float) -> Points | None:
+        """Return the states on the way to a place, straight if that is free; None where there is none."""
         x, y = place.tolist()
         if not any(body_clearance(x, y, angle, self.body, self.near) >= kept for angle in DIRECTIONS):
             return None
         direction = math.atan2(y - state[1], x - state[0])
-        first, then, last = np.unwrap([state[2], direction, direction if heading is None else heading]).tolist()
-        way = np.linspace(state[:2], place, 100)
-        here, along, there = np.linspace(first, then, 16), np.full(len(way), then), np.linspace(then, last, 16)
-        middles = np.vstack([np.tile(state[:2], (16, 1)), way, np.tile(place, (16, 1))])
-        straight = np.column_stack([middles, np.concatenate([here, along, there])])
+        turns = np.linspace(state[2], state[2] + math.remainder(direction - state[2], 2.0 * math.pi), 32)
+        way = np.linspace(state[:2], place, max(2, math.ceil(math.dist(state[:2], place) / self.near.step)))
+        middles, angles = np.vstack([np.tile(state[:2], (32, 1)), way]), np.append(turns, np.full(len(way), turns[-1]))
+        straight = np.column_stack([middles, angles])
         if all(body_clearance(u, v, angle, self.body, self.near) >= kept for u, v, angle in straight):
             return straight
-        goal = GoTo(position=(x, y), heading=() if heading is None else (math.remainder(heading, 2.0 * math.pi),))
-        found = self._search(self._place_goal(goal, place, np.empty((0, 4))), kept, self._state_of(state))
+        goal = self._place_goal(GoTo(position=(x, y)), place, np.empty((0, 4)))
+        found = self._search(goal, kept, self._state_of(state))
         return found if len(found) else None
 
     def led(self, thread: Points, poses: Points) -> Points:

@@ -26,8 +26,8 @@ Vector = NDArray[np.float64]
 class Candidate:
     """A way of the needle, which is corrected by what a forecast makes of it.
 
-    The needle goes to a place, then winds the thread, leads it along a line, and goes on from place to place, whichever
-    is given; or a path that is known.
+    The needle winds the thread, or goes to a place, leads the thread along a line, and goes on from place to place,
+    whichever is given; or it goes a path that is known.
 
     Attributes:
         path: x, y [m] and angle [rad] of the chord, shape (k, 3); empty for none.
@@ -44,6 +44,13 @@ class Candidate:
     line: Points = field(default_factory=lambda: np.empty((0, 2)))
     passes: int = 1
     onward: Points = field(default_factory=lambda: np.empty((0, 2)))
+
+    def places(self, lever: float, before: float, beyond: float) -> Points:
+        """Return all places that the middle of the needle goes to, see `line_places`, shape (k, 2) [m]."""
+        parts = [self.via.reshape(-1, 2)]
+        for k in range(self.passes if len(self.line) else 0, 0, -1):
+            parts.append(line_places(self.line if k % 2 else self.line[::-1], lever, before, beyond))
+        return np.vstack([*parts, self.onward])
 
     def corrected(self, goal: ThreadGoal, thread: Points, left: float) -> Candidate | None:
         """Return the candidate moved against the error that a forecast of it shows; None where that is not possible.
@@ -130,25 +137,20 @@ def candidates(goal: ThreadGoal, reach: float) -> Iterator[Candidate]:
             yield from (Candidate(more=0.0, onward=ring) for ring in rings[:8])
 
 
-def line_states(line: Points, lever: float, before: float, beyond: float) -> Points:
-    """Return poses of a needle's chord whose tail follows a line, shape (k, 3).
+def line_places(line: Points, lever: float, before: float, beyond: float) -> Points:
+    """Return where the middle of a needle is to go, 2 mm apart, so that its tail follows a line, shape (k, 2) [m].
 
     Args:
         line: shape (m, 2) [m].
-        lever: half of the chord [m].
+        lever: half of the needle's chord [m].
         before: by how much the line is led on straight at its begin [m].
         beyond: the same at its end [m].
     """
     steps = np.diff(line, axis=0)
     along = steps / np.linalg.norm(steps, axis=1)[:, None]
-    whole = np.vstack([line[:1] - before * along[0], line, line[-1:] + beyond * along[-1]])
-    at = np.linspace(0.0, arc_lengths(whole)[-1], max(3, math.ceil(arc_lengths(whole)[-1] / 5e-4)))  # m
-    points = points_at(whole, at)
-    tangents = np.gradient(points, axis=0)
-    tangents /= np.maximum(np.linalg.norm(tangents, axis=1)[:, None], 1e-12)
-    middles = points + lever * tangents
-    turns = np.gradient(middles, axis=0)
-    return np.column_stack([middles, np.unwrap(np.arctan2(turns[:, 1], turns[:, 0]))])
+    whole = np.vstack([line[:1] - before * along[0], line, line[-1:] + (beyond + lever) * along[-1]])
+    length = float(arc_lengths(whole)[-1])
+    return points_at(whole, np.linspace(lever, length, max(2, math.ceil(length / 2e-3))))
 
 
 class ThreadRollout:
