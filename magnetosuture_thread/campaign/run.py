@@ -20,7 +20,7 @@ from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning import executor
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError, planned_duration
-from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, Wait, Wrap
+from magnetosuture_thread.planning.procedure import Procedure, ProcedureLimits, ThreadGoal, Wait, Wrap
 from magnetosuture_thread.planning.verdict import centre_of, winding
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.scene import Scene
@@ -104,7 +104,8 @@ class RunFigures:
 
     Attributes:
         time_s: from the start of the procedure to its end.
-        ideal_time_s: of the path planned at the start, at the allowed speed, slowed by friction as it was in the run.
+        ideal_time_s: of the path planned at the start, and of what a new one to a goal of the thread is longer than the
+            rest of the old one, at the allowed speed, slowed by friction as it was in the run.
         min_needle_clearance_m: of the needle's axis from wall and shapes.
         max_thread_penetration_m: of a node of the thread into wall or shapes.
         longest_rest_s: for which the needle did not move, while it had a path to follow.
@@ -322,6 +323,7 @@ def run_procedure(
     extremes = RunExtremes(planner, setup.scene, procedure.limits, wraps[0] if wraps else None)
     figures, truth_of_goals = extremes.figures, GoalTruth(procedure, setup.scene)
     began, planned, weighted, way, before = math.nan, 0.0, 0.0, 0.0, 0.0
+    pursued: tuple[int, BodyPath | None, float] = 0, None, 0.0  # goal, path, and what is left of it [m]
     reason = f"not done after {MAX_TIME:g} s"
     try:
         while rig.time < MAX_TIME:
@@ -336,6 +338,12 @@ def run_procedure(
             truth_of_goals.update(met, middle, frame.tail, frame.thread)
             if math.isnan(began) and running:
                 began, planned = frame.time, _planned_time(execution, frame)
+            goal, known, left = pursued
+            is_anew = path is not known and execution.goal == goal and isinstance(procedure.goals[goal], ThreadGoal)
+            if is_anew and path is not None and known is not None:
+                planned += max(0.0, path.length - left) / procedure.limits[goal].speed
+            if execution.is_tracking and path is not None:
+                pursued = execution.goal, path, path.length - execution.travel
             ahead = max(0.0, execution.travel - before)
             before = execution.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown

@@ -19,13 +19,12 @@ from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import WELL_MET, NeedlePlanner, PlanningError, place_of
 from magnetosuture_thread.planning.procedure import (
     Goal,
-    GoTo,
     KeepSide,
+    PlaceGoal,
     Procedure,
     ThreadGoal,
     Tighten,
     Wait,
-    Withdraw,
     Wrap,
 )
 from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
@@ -54,7 +53,6 @@ class ProcedureState(Enum):
 
 
 ENDED = (ProcedureState.DONE, ProcedureState.FAILED)
-PLACES = GoTo | Withdraw | KeepSide  # goals that end where the middle of the needle is at a place
 
 
 @dataclass(frozen=True)
@@ -378,7 +376,7 @@ class ProcedureExecutor:
             self.abort(f"the thread is not tight at the end of goal {self.goal + 1}")
             return
         assert self._begin is not None
-        is_there = not isinstance(goal, PLACES) or math.dist(middle, place_of(goal, self._begin)) <= goal.tolerance
+        is_there = not isinstance(goal, PlaceGoal) or math.dist(middle, place_of(goal, self._begin)) <= goal.tolerance
         if is_there and self.judge.is_met:
             self._next_goal()
         else:
@@ -389,13 +387,13 @@ class ProcedureExecutor:
         self.pursuit.misses += 1
         off = np.zeros(2)
         assert self._begin is not None
-        if isinstance(goal, PLACES):
+        if isinstance(goal, PlaceGoal):
             off = place_of(goal, self._begin) - middle
         if self.pursuit.misses > MAX_MISSES:
             if not self.judge.is_met:
                 missing = self.judge.missing(self.goal)
             else:
-                assert isinstance(goal, PLACES)
+                assert isinstance(goal, PlaceGoal)
                 by = f"by {1e3 * math.hypot(*off):.2f} mm, with a tolerance of {1e3 * goal.tolerance:.2f} mm"
                 missing = f"the needle misses its place {by}"
             self.abort(f"goal {self.goal + 1} is given up: {missing}, however it is planned")

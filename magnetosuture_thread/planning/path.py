@@ -296,7 +296,6 @@ def search_lattice(
     return _way_to(last, parent, size, near.origin, step, directions), looked
 
 
-PASSES = 400  # of the smoothing
 SPACING = 1.0e-4  # m; of the tip's way between two poses
 PULL = 0.4  # share by which a pose moves towards the middle of its neighbours in a pass
 PREFERRED = 5e-4  # m; beyond the required clearance, more is not worth a longer way
@@ -446,7 +445,8 @@ def _relax(poses: Points, body: Points, required: float, preferred: float, near:
     A clearance may not fall below the one that is preferred; where it is less already, it may not fall at all.
     """
     count = len(poses)
-    for _ in range(PASSES):
+    # Passes of the smoothing.
+    for _ in range(400):
         for k in range(1, count - 1):
             x, y, angle = poses[k, 0], poses[k, 1], poses[k, 2]
             nx = x + PULL * (0.5 * (poses[k - 1, 0] + poses[k + 1, 0]) - x)

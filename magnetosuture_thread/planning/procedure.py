@@ -34,7 +34,6 @@ from magnetosuture_thread.scene import WALL_NAME
 MAX_GOALS = 100
 HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`
 KEYS = {"setup", "scene", "goals", "limits"}
-_SENSES = ("clockwise", "counterclockwise")
 _PLACE: dict[str, Any] = {"unit": "m", "minimum": -0.5, "maximum": 0.5, "multiple": 2}
 
 
@@ -96,7 +95,7 @@ class _Turns(Configuration):
 
     around: str = quantity("", "name of the shape")
     angle: float = quantity(0.0, "that the thread winds about it", unit="rad", minimum=0.0, maximum=3600.0)
-    sense: str = quantity("counterclockwise", "of the way", choices=_SENSES)
+    sense: str = quantity("counterclockwise", "of the way", choices=("clockwise", "counterclockwise"))
 
     def check(self) -> None:
         """Refuse a wrap by no angle, or by more than ten turns."""
@@ -255,6 +254,8 @@ WindingGoal = Wrap | Wind | Unwind | TakeOff | KeepSide
 """Goals by which the thread is to wind about a shape by an angle within an interval, see `Procedure.windings`."""
 ThreadGoal = Wind | Unwind | TakeOff | KeepSide | Lay | BringEnd
 """Goals of the thread whose ways are found by forecasts."""
+PlaceGoal = GoTo | Withdraw | KeepSide
+"""Goals that end where the middle of the needle is at a place."""
 Goal = GoTo | PassThrough | Wrap | Tighten | Withdraw | ThreadGoal | Wait
 GOALS: dict[str, type[Goal]] = {kind.GROUP: kind for kind in get_args(Goal)}
 
