@@ -85,10 +85,9 @@ class GoalTruth:
             ended: whether the nodes take all goals for met; then no wrap may have slipped off either.
         """
         found = [f"goal {index + 1} in truth: {problem}" for index, problem in sorted(self._problems.items())]
-        for name in {goal.around for goal in self._procedure.goals if isinstance(goal, WindingGoal)} if ended else ():
-            index = max(k for k, goal in enumerate(self._procedure.goals) if getattr(goal, "around", "") == name)
-            while not isinstance(self._procedure.goals[index], WindingGoal):
-                index -= 1
+        goals = self._procedure.goals
+        last = {goal.around: k for k, goal in enumerate(goals) if isinstance(goal, WindingGoal)}
+        for index in last.values() if ended else ():
             if problem := self._unwound(index, math.pi):
                 found.append(f"at the end, {problem} in truth")
         return found

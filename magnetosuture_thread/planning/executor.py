@@ -456,7 +456,7 @@ class ProcedureExecutor:
     def _drop_path(self) -> None:
         """Forget the path that is tracked or planned; the next pose is where a new one begins."""
         self._tracker, self._pending, self._foreseen, self._left = None, None, None, None
-        self._rest = RestDetector()
+        self._rest, self._goal_since = RestDetector(), math.nan
         self._back_off_until = -math.inf
 
     def _hold(self, stamp: float, middle: Vector, angle: float, thread: ThreadCondition) -> Vector:

@@ -274,6 +274,7 @@ class NeedlePlanner:
         those that meet the goal well the shortest is chosen.
         """
         trials: list[_Trial] = []
+        began = self.looked
         for margin in MARGINS:
             state = self._nearest_free(pose[:2], float(pose[2]), required + margin)
             if state is None:
@@ -286,7 +287,7 @@ class NeedlePlanner:
             found = filter(None, [self._try(candidate, asked) for candidate in candidates(asked.goal, reach)])
             for trial in sorted(found, key=lambda trial: max(trial.miss, WELL_MET))[:4]:
                 trials.append(self._rounded(self._improved(trial, asked), asked))
-                if trials[-1].miss <= WELL_MET:
+                if trials[-1].miss <= WELL_MET or self.looked - began > 10_000_000:  # about 20 s
                     break
             if trials:
                 break
@@ -342,7 +343,7 @@ class NeedlePlanner:
         try:
             for way, lies in self.rollout.threads(path, procedure.limits[index].speed, thread):
                 judge.update(pose := path.at(way)[0], lies)
-                is_there = not isinstance(goal, KeepSide) or math.dist(pose, goal.to) <= goal.tolerance
+                is_there = not isinstance(goal, KeepSide) or math.dist(pose, goal.to) <= PLACE_SHARE * goal.tolerance
                 if is_there and judge.miss < best:
                     best, reach, nearest = judge.miss, way, lies
                 if best <= WELL_MET:
@@ -778,7 +779,8 @@ def _check_procedure(procedure: Procedure, planner: NeedlePlanner, first: int) -
                 sense = "clockwise" if goal.swept > 0.0 else "counterclockwise"
                 raise ConfigurationError(f"{where}.sense", goal.sense, f"{sense}, as {goal.around} is wrapped before")
         if isinstance(goal, Wrap | Wind):
-            wrapped[goal.around] = min(procedure.windings[index], key=abs)
+            least = abs(before + goal.swept) if isinstance(goal, Wrap) else max(0.0, goal.angle - goal.tolerance)
+            wrapped[goal.around] = math.copysign(least, goal.swept)
             needed, length = planner.length_around(wrapped), planner.thread_length
             if needed > length:
                 is_alone = len(wrapped) == 1 and (isinstance(goal, Wind) or wrapped[goal.around] == goal.swept)
@@ -835,6 +837,11 @@ def _check_tighten(
 def _check_line(planner: NeedlePlanner, where: str, goal: Lay) -> None:
     line = shapely.LineString(np.reshape(goal.along, (-1, 2)))
     _check_free(planner, f"{where}.along", line, goal.along)
+    if not goal.stretch and math.dist(goal.along[:2], goal.along[-2:]) <= 2.0 * goal.tolerance:
+        expected = (
+            "from and to along the thread, as the ends of the line are as near to each other as twice its tolerance"
+        )
+        raise ConfigurationError(f"{where}.stretch", [], expected)
     length, own = 1e3 * line.length, 1e3 * planner.thread_length
     if length > own + 2e3 * goal.tolerance or max(goal.stretch, default=0.0) > planner.thread_length:
         expected = f"a line and a stretch within the length of the thread, {own:.3g} mm"

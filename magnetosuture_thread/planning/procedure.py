@@ -219,9 +219,10 @@ class Lay(Configuration):
                                           "any", unit="m", minimum=0.0, maximum=1.0, multiple=2)  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a line of one point, or a stretch of no length."""
-        if len(self.along) < 4 or not math.dist(self.along[:2], self.along[2:4]) > 0.0:
-            raise self.refused("along", "two or more points, as [[0.0, 0.0], [0.01, 0.0]]")
+        """Refuse a line of no length, or such a stretch."""
+        points = [self.along[k : k + 2] for k in range(0, len(self.along), 2)]
+        if sum(map(math.dist, points, points[1:])) <= self.tolerance:
+            raise self.refused("along", "a line that is longer than its tolerance, as [[0.0, 0.0], [0.01, 0.0]]")
         if self.stretch and (len(self.stretch) != 2 or not self.stretch[0] < self.stretch[1]):
             raise self.refused("stretch", "where it begins and ends, as [0.01, 0.03]")
 
@@ -379,7 +380,8 @@ def _goals_of(goals: Any, common: Mapping[str, Any], where: str, source: str) ->
                 raise ConfigurationError(f"{at}.repeat", content, "times, from 1 on, and goals", source)
             yield from times * list(_goals_of(content["goals"], own, f"{at}.repeat.goals", source))
             continue
-        if isinstance(points := content.get("along"), list) and all(isinstance(point, list) for point in points):
+        points = content.get("along")
+        if isinstance(points, list) and all(isinstance(point, list) and len(point) == 2 for point in points):
             content["along"] = [value for point in points for value in point]
         try:
             yield from_mapping(GOALS[kinds[0]], content, source), from_mapping(ProcedureLimits, own, source)

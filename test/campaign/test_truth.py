@@ -20,6 +20,7 @@ UP = {"pass_through": {"between": ["a", "b"], "direction": [0.0, 1.0]}}
 WALL = {"pass_through": {"between": ["wall", "b"], "direction": [0.0, 1.0]}}
 AROUND = {"wrap": {"around": "b", "angle": 6.0}}
 PLACE = {"go_to": {"position": [0.0, 0.008], "heading": [0.0]}}
+LINE: dict[str, Any] = {"lay": {"along": [[0.0062, 0.0], [0.004, 0.0022]]}}
 STRAIGHT = np.array([[0.0, 0.0], [0.0, 0.0]])
 
 
@@ -68,6 +69,46 @@ def test_a_wrap_is_of_the_thread_when_it_is_met_and_at_the_end(then: float, last
     assert all(
         "winds 300 of 344 degrees" in text or "at the end, the thread winds 100 of 344" in text for text in found
     )
+
+
+def test_a_lost_wrap_is_named_whatever_follows_it():
+    both: list[dict[str, Any]] = [{"wrap": {"around": name, "angle": 6.0}} for name in ("a", "b")]
+    tight = {"tighten": {"clearance": 0.05, "around": "a", "toward": [0.0, 0.015]}}
+    on_a = around(350.0) - (8e-3, 0.0)
+    frames = [(0, (0.0, 0.008), on_a), (1, (0.0, 0.008), on_a), (2, (0.0, 0.008), around(350.0))]
+    found = judged([*both, tight], [*frames, (3, (0.0, 0.008), around(350.0))])
+    assert [text for text in found if "at the end" in text] == [
+        "at the end, the thread winds -2 of 344 degrees about a in truth"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("goal", "thread", "words"),
+    [
+        ({"wind": {"around": "b", "angle": 5.0}}, around(290.0), ""),
+        ({"wind": {"around": "b", "angle": 5.0}}, around(350.0), "winds 350 of"),
+        ({"unwind": {"around": "b"}}, around(170.0), ""),
+        ({"unwind": {"around": "b"}}, around(200.0), "winds 200 of -180 to 180"),
+        ({"take_off": {"around": "b"}}, around(90.0), "0.20 mm from b"),
+        ({"keep_side": {"around": "b", "side": "right", "to": [0.0, 0.008]}}, around(90.0), ""),
+        ({"keep_side": {"around": "b", "side": "left", "to": [0.0, 0.008]}}, around(90.0), "winds 90 of"),
+        ({"keep_side": {"around": "b", "side": "right", "to": [0.0, 0.004]}}, around(90.0), "4.00 mm from its place"),
+        ({"lay": {"along": [[0.0062, 0.0], [0.004, 0.0022]]}}, around(90.0), ""),
+        ({"lay": {"along": [[0.0062, 0.0], [0.004, 0.0022]], "tolerance": 3e-4}}, around(90.0), "mm off its line"),
+        (
+            {"lay": {"along": [[0.0062, 0.0], [0.004, 0.0022]], "stretch": [0.0, 0.002]}},
+            around(90.0),
+            "mm off its line",
+        ),
+        ({"bring_end": {"position": [0.004, 0.0022]}}, around(90.0), "mm from its place"),
+        ({"bring_end": {"position": [0.0062, 0.0]}}, around(90.0), ""),
+        ({"wait": {"time": 1.0}}, around(90.0), ""),
+    ],
+)
+def test_goals_of_the_thread_are_compared_with_the_thread(goal: dict[str, Any], thread: np.ndarray, words: str):
+    at = (0.0, 0.008)
+    found = judged([goal, PLACE], [(0, at, thread), (1, at, thread)])
+    assert (len(found) == 0) if not words else (words in found[0])
 
 
 def test_a_place_and_its_heading_are_compared_with_the_needle():

@@ -131,7 +131,9 @@ def test_repeat_is_its_goals_as_often_and_counts_against_the_limit():
         ([laid([[0.0, 0.02], [0.0, 0.03]])], "clear of wall"),
         ([laid([[-0.015, 0.005], [0.015, 0.005], [0.015, 0.01], [-0.015, 0.01]])], "length of the thread, 50 mm"),
         ([laid([[0.0, 0.005], [0.01, 0.005]], stretch=[0.0, 0.02])], "as long as the line, 10 mm"),
-        ([laid([[0.0, 0.005]])], "two or more points"),
+        ([laid([[0.0, 0.005]])], "longer than its tolerance"),
+        ([laid([[0.0], [0.005, 0.01, 0.005]])], "along"),
+        ([laid([[0.0, 0.005], [0.01, 0.005], [0.0, 0.0051]])], "stretch"),
         ([{"bring_end": {"position": [0.001, 0.0]}}], "clear of post"),
         ([{"keep_side": {"around": "post", "to": [0.001, 0.0]}}], "around the needle"),
         ([{"keep_side": {"around": "posts", "to": [0.01, 0.0]}}], "a shape of the scene: post"),
@@ -155,6 +157,10 @@ def test_a_wrap_that_was_taken_off_may_be_made_the_other_way(planner: NeedlePlan
     with pytest.raises(ConfigurationError, match="as post is wrapped before"):
         planner.check(procedure(first, then))
     planner.check(procedure(first, {"unwind": {"around": "post"}}, then))
+    little = {"wind": {"around": "post", "angle": 0.9, "sense": "clockwise"}}
+    planner.check(procedure(little, first))
+    with pytest.raises(ConfigurationError, match="as post is wrapped before"):
+        planner.check(procedure(little, then))
 
 
 AROUND_THE_POST = [[0.002, -0.008], [0.0023, 0.0], [0.0016, 0.0017], [0.0, 0.0023], [-0.006, 0.0025]]
@@ -215,6 +221,35 @@ def test_a_wait_keeps_the_needle_for_its_time_and_goes_on(planner: NeedlePlanner
     assert (executor.goal, executor.state) == (1, ProcedureState.RUNNING)
     assert np.linalg.norm(command) > 1e-4
     assert isinstance(executor.procedure.goals[0], Wait)
+
+
+def test_a_fast_needle_is_planned_as_a_slow_one(planner: NeedlePlanner):
+    goal = past("left")
+    lengths = []
+    for speed in (1e-4, 2e-3, 0.1):
+        wanted = procedure({**goal, "limits": {"speed": speed}})
+        path = planner.plan(wanted, 0, *start_of(planner), np.zeros(2))
+        assert math.dist(path.middles[-1], (0.0, 0.012)) <= 0.75e-3  # well within the tolerance
+        lengths.append(path.length)
+    assert max(lengths) - min(lengths) < 1e-3
+
+
+def test_a_wait_begins_anew_after_a_pause_by_a_person(planner: NeedlePlanner):
+    executor = ProcedureExecutor(procedure({"wait": {"time": 1.0}}, {"go_to": {"position": [0.012, 0.0]}}), planner)
+    tail, heading = np.array([0.012, -0.012]), np.array([0.0, 1.0])
+    thread = ThreadCondition(between((0.012, -0.012), (0.012, -0.02)))
+    executor.start()
+    for k in range(10):
+        executor.update(0.05 * k, tail, heading, thread)
+    executor.pause("by hand")
+    executor.update(3.0, tail, heading, thread)
+    executor.start()
+    for k in range(18):
+        executor.update(3.1 + 0.05 * k, tail, heading, thread)
+    assert executor.goal == 0
+    for k in range(18, 24):
+        executor.update(3.1 + 0.05 * k, tail, heading, thread)
+    assert executor.goal == 1
 
 
 @pytest.mark.slow
