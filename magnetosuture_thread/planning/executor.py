@@ -443,7 +443,7 @@ class ProcedureExecutor:
         self._handover = self.travel + PROGRESS
         ways = np.linspace(self.travel, self._handover, 5)
         poses = np.array([[*middle, angle] for middle, angle in map(self.path.at, ways)])
-        swept = winding(self.planner.led(np.empty((0, 2)), poses), centre_of(self.planner.scene, goal.around))
+        swept = winding(self.planner.led(np.empty((0, 2)), poses, 0.0), centre_of(self.planner.scene, goal.around))
         if self.judge.left_to_wind <= math.copysign(1.0, goal.swept) * swept:
             self._ask_for_path(self.goal + 1, *self.path.at(self._handover))
 

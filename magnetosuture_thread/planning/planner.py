@@ -233,7 +233,7 @@ class NeedlePlanner:
                     break
                 states = np.vstack([states, found])
                 ends.append(len(states))
-                lies = self.led(lies, found)
+                lies = self.led(lies, found, limits.speed)
                 at = self._state_of(found[-1])
             if at is not None and (last := self._end_of(goals[-1], start, states[-1], required + margin)) is not None:
                 states = np.vstack([states, last])
@@ -390,13 +390,22 @@ class NeedlePlanner:
         found = self._search(goal, kept, self._state_of(state))
         return found if len(found) else None
 
-    def led(self, thread: Points, poses: Points) -> Points:
-        """Return where a thread lies after the needle has led it: along the tail's way, and then where it lay before.
+    def led(self, thread: Points, poses: Points, speed: float) -> Points:
+        """Return where a thread lies after the needle has led it, by a forecast.
+
+        Where that cannot be, as of a thread that is not known, it lies where the tail has been, and then as before.
 
         Args:
             thread: before, the tail first, shape (n, 2) [m].
             poses: x, y [m] and angle [rad] of the needle's chord on the way, shape (k, 3).
+            speed: of the tip [m/s].
         """
+        if len(thread):
+            with suppress(InvalidInputError, PlanningError):
+                before = self.rollout.steps
+                *_, (_, lies) = self.rollout.threads(BodyPath.through(poses, self.lever), speed, thread)
+                self.looked += 40 * (self.rollout.steps - before)
+                return lies
         tails = poses[:, :2] - self.lever * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
         line = np.vstack([tails[::-1], thread])
         return line[: int(np.searchsorted(arc_lengths(line), self.thread_length)) + 1]
@@ -432,10 +441,7 @@ class NeedlePlanner:
             except PlanningError as error:
                 raise PlanningError(f"goals[{index + error.goal}]: {error}", index + error.goal) from None
             lies = np.empty((0, 2)) if thread is None else thread
-            thread = self.led(lies, path.poses)
-            if any(isinstance(goal, ThreadGoal) for goal in procedure.goals[index:]):
-                with suppress(InvalidInputError):  # of a thread that cannot lie as it is
-                    *_, (_, thread) = self.rollout.threads(path, procedure.limits[index].speed, lies)
+            thread = self.led(lies, path.poses, procedure.limits[index].speed)
             middle, angle = path.middles[-1], float(path.angles[-1])
             paths.append(path)
         return tuple(paths)
@@ -511,21 +517,21 @@ class NeedlePlanner:
         A thread that is led around a shape loses what its free end wound about it before: the angle that a wrap sweeps
         is corrected by that of the thread as it will lie.
         """
-        before = np.empty((0, 3))
+        before, speed = np.empty((0, 3)), procedure.limits[index].speed
         target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
         if not target.allowed[state[1], state[0]]:  # first to where the shape of a wrap is in view
             there = target._replace(places=target.allowed, allowed=target.places, cuts=np.empty((0, 4)), crossings=0)
             before = self._search(there, kept, state)
             if not len(before):
                 return before
-            state, thread = self._state_of(before[-1]), self.led(thread, before)
+            state, thread = self._state_of(before[-1]), self.led(thread, before, speed)
         found = before
         for _ in range(3):
             target = self._lattice_goal(procedure, index, goal, start, state, thread, crossed, more)
             found = self._search(target, kept, state)
             if not isinstance(goal, Wrap) or not len(found):
                 break
-            short = self._left_to_wind(procedure, index, self.led(thread, found))
+            short = self._left_to_wind(procedure, index, self.led(thread, found, speed))
             if abs(short) <= WRAP_LEAD:
                 break
             more += short

@@ -73,7 +73,7 @@ def test_the_hernia_repair_is_planned_clear_of_everything(hernia: Setup, planner
     poses = np.column_stack([paths[0].middles, paths[0].angles])
     chosen = (paths[0].travel >= paths[0].ends[0]) & (paths[0].travel <= paths[0].ends[1])
     inside = paths[0].middles[chosen]
-    thread = planner.led(np.empty((0, 2)), poses[: np.flatnonzero(chosen)[-1] + 1])
+    thread = planner.led(np.empty((0, 2)), poses[: np.flatnonzero(chosen)[-1] + 1], 0.002)
     assert -2.0 * math.pi - 0.35 < winding(thread, np.array([0.0, 0.005])) < -2.0 * math.pi + 0.1
     # Between ring and tissue, and not around all of it.
     assert np.hypot(*(inside - [0.0, 0.005]).T).max() < 0.0125
