@@ -28,7 +28,7 @@ from magnetosuture_thread.planning.procedure import (
     Wrap,
 )
 from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
-from magnetosuture_thread.planning.verdict import GoalJudge, centre_of, winding
+from magnetosuture_thread.planning.verdict import GoalJudge, centre_of, left_to_wind, winding
 
 Vector = NDArray[np.float64]
 
@@ -175,7 +175,7 @@ class ProcedureExecutor:
         self._speed = math.inf
         self._unwrapped: float | None = None
         self._reached = 0  # goals on the path
-        self._handover = math.inf  # way on the present path, at which that of the next goal begins [m]
+        self._handover = 0.0  # way on the present path at which that of the next goal begins, or is asked for [m]
         self._waits_since = 0.0  # for the thread, since this stamp [s]
         self._judge: GoalJudge | None = None
         self._thread: Points | None = None  # as it was known last
@@ -334,10 +334,11 @@ class ProcedureExecutor:
             self._left = rest
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
-            self._plan_ahead(goal)
+            if self.travel >= self._handover:
+                self._plan_ahead(goal)
         elif self._pending is not None and self.travel >= self._handover:
             if not self.judge.is_met:
-                self._pending = None
+                self._pending, self._handover = None, self.travel + PROGRESS
             else:
                 self._begin_goal(self.goal + 1)
                 self._tracker = None
@@ -431,7 +432,7 @@ class ProcedureExecutor:
                 raise
             self.path, self._foresees_at = self._left, math.inf
         self._left = None
-        self._tracker, self._reached = PathTracker(self.path, self.planner.axes), 0
+        self._tracker, self._reached, self._handover = PathTracker(self.path, self.planner.axes), 0, 0.0
         return True
 
     def _plan_ahead(self, goal: Wrap) -> None:
@@ -440,12 +441,16 @@ class ProcedureExecutor:
         A needle that waits for its path close to a coil's axis is pulled aside.
         """
         assert self.path is not None
-        self._handover = self.travel + PROGRESS
-        ways = np.linspace(self.travel, self._handover, 5)
-        poses = np.array([[*middle, angle] for middle, angle in map(self.path.at, ways)])
-        swept = winding(self.planner.led(np.empty((0, 2)), poses, 0.0), centre_of(self.planner.scene, goal.around))
-        if self.judge.left_to_wind <= math.copysign(1.0, goal.swept) * swept:
-            self._ask_for_path(self.goal + 1, *self.path.at(self._handover))
+        at = self.travel + PROGRESS
+        poses = np.array([[*middle, angle] for middle, angle in map(self.path.at, np.linspace(self.travel, at, 5))])
+        centre, led = centre_of(self.planner.scene, goal.around), self.planner.led
+        swept = winding(led(np.empty((0, 2)), poses, 0.0), centre)  # more than which the thread does not wind meanwhile
+        if self._thread is None or self.judge.left_to_wind * math.copysign(1.0, goal.swept) > abs(swept):
+            return
+        then = winding(led(self._thread, poses, self.procedure.limits[self.goal].speed), centre)
+        if left_to_wind(self.procedure.windings[self.goal], then) == 0.0:
+            self._handover = at
+            self._ask_for_path(self.goal + 1, *self.path.at(at))
 
     def _ask_for_path(self, goal: int, middle: Vector, angle: float) -> None:
         assert self._begin is not None

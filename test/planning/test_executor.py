@@ -309,6 +309,7 @@ def test_a_wrap_that_is_unwound_by_hand_in_a_pause_does_not_count(pauses: bool):
     assert (needle.way > 1.9 * way) == pauses  # all of the way again, or what was left of it
 
 
+@pytest.mark.slow
 def test_a_thread_that_slips_off_is_wound_again_and_given_up_in_the_end():
     """The needle goes round, and the thread stays straight: what counts is the thread."""
     run, needle = executor({"wrap": {"around": "post", "angle": 6.2}}), Needle()

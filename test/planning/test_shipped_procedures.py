@@ -15,6 +15,7 @@ from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureS
 from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, read_procedure
 from magnetosuture_thread.resources import share_directory
 from magnetosuture_thread.setups import read_procedure_setup
+from magnetosuture_thread.thread.prediction import NeedlePose
 
 FOLDER = share_directory("magnetosuture_thread") / "config" / "procedures"
 SHIPPED = sorted(path.stem for path in FOLDER.glob("*.yaml"))
@@ -26,7 +27,7 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
     procedure = read_procedure(name)
     setup = read_procedure_setup(procedure)
     setup.rig.check_scene(setup.scene)
-    setup.model.predictor(setup.scene)  # refuses a shape that the thread would pass through
+    predictor = setup.model.predictor(setup.scene)  # refuses a shape that the thread would pass through
     planner, keep_out = setup.planner.planner(setup.scene), setup.coils.keep_out
     executor = ProcedureExecutor(procedure, planner)
     safety = setup.coils.safety_filter(setup.scene)
@@ -34,17 +35,17 @@ def test_an_ideal_needle_gets_to_the_end_through_the_filter(name: str):
     tail, heading, time = np.array([x, y]), np.array([math.cos(angle), math.sin(angle)]), 0.0
     executor.start()
     clearance, tight_at = math.inf, math.inf
-    trail = [tail - setup.model.thread_length * heading]  # the thread lies where the tail has been
+    predictor.start(NeedlePose(0.0, tail, heading), setup.rig.thread_at_start(np.linspace(0.0, 1.0, 100)))
     while executor.state is ProcedureState.RUNNING and time < 300.0:
         # The thread is tight half a second after it is pulled, by its tension or close to the shape.
-        trail.append(tail)
-        goal, condition = procedure.goals[executor.goal], ThreadCondition(np.array(trail[::-1]))
+        thread = predictor.step(NeedlePose(time + PERIOD, tail, heading)).positions
+        goal, condition = procedure.goals[executor.goal], ThreadCondition(thread)
         if isinstance(goal, Tighten):
             tight_at = min(tight_at, time + 0.5)
             if time >= tight_at:
                 at = [shape.solid.centroid.coords[0] for shape in setup.scene.shapes if shape.name == goal.around]
                 centre = np.array(at[0]) if at else np.zeros(2)
-                drawn = centre + 0.1 * (np.array(trail[::-1]) - centre)  # which winds as before
+                drawn = centre + 0.1 * (thread - centre)  # which winds as before
                 condition = replace(condition, tension=goal.tension, vertices=drawn)
         velocity = executor.update(time, tail, heading, condition)
         if velocity.any():
