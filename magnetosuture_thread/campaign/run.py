@@ -108,7 +108,7 @@ class RunFigures:
             rest of the old one, at the allowed speed, slowed by friction as it was in the run.
         min_needle_clearance_m: of the needle's axis from wall and shapes.
         max_thread_penetration_m: of a node of the thread into wall or shapes.
-        longest_rest_s: for which the needle did not move, while it had a path to follow.
+        longest_rest_s: for which the needle did not move, but in a `wait` and while a goal of the thread is planned.
         wrap_degrees: that the thread swept at the most about the shape of the first wrap; 0 without one.
         max_tension_n: peak of the thread.
         max_friction_nodes: under friction at once, by the model.
@@ -201,7 +201,7 @@ class RunExtremes:
 
         Args:
             frame: of the loop.
-            running: whether the needle has a path to follow.
+            running: whether the needle is to move.
             goal: index of the goal.
             path: of the needle's middle as planned, shape (m, 2) [m]; None without one.
         """
@@ -331,17 +331,19 @@ def run_procedure(
             if frame is None:
                 continue
             running, path = execution.state is executor.ProcedureState.RUNNING, execution.path
-            is_moving = running and execution.is_tracking and not isinstance(procedure.goals[execution.goal], Wait)
+            goal = procedure.goals[execution.goal]
+            is_planned = isinstance(goal, ThreadGoal) and not execution.is_tracking
+            is_moving = running and not is_planned and not isinstance(goal, Wait)
             extremes.update(frame, is_moving, execution.goal, None if path is None else path.middles)
             middle, _ = planner.pose(frame.tail, np.array([math.cos(frame.heading), math.sin(frame.heading)]))
             met = execution.goal if execution.state is not executor.ProcedureState.DONE else len(procedure.goals)
             truth_of_goals.update(met, middle, frame.tail, frame.thread)
             if math.isnan(began) and running:
                 began, planned = frame.time, _planned_time(execution, frame)
-            goal, known, left = pursued
-            is_anew = path is not known and execution.goal == goal and isinstance(procedure.goals[goal], ThreadGoal)
+            last, known, left = pursued
+            is_anew = path is not known and execution.goal == last and isinstance(procedure.goals[last], ThreadGoal)
             if is_anew and path is not None and known is not None:
-                planned += max(0.0, path.length - left) / procedure.limits[goal].speed
+                planned += max(0.0, path.length - left) / procedure.limits[last].speed
             if execution.is_tracking and path is not None:
                 pursued = execution.goal, path, path.length - execution.travel
             ahead = max(0.0, execution.travel - before)
@@ -361,9 +363,9 @@ def run_procedure(
         *figures.beyond_limits(setup.coils.keep_out).values(),
     ]
     met = len(procedure.goals) if reached else execution.goal
-    last, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
+    instants, closest = extremes.last_instants() if reasons else (), extremes.closest if reasons else None
     words = "; ".join(reasons)
-    return RunResult(variation.seed, not reasons, words, reached, met, figures, rig.time, last, closest)
+    return RunResult(variation.seed, not reasons, words, reached, met, figures, rig.time, instants, closest)
 
 
 def _planned_time(execution: executor.ProcedureExecutor, frame: LoopFrame) -> float:

@@ -27,14 +27,7 @@ from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import (
-    MAX_REASON_CHARS,
-    GuardedNode,
-    ManagedNode,
-    SceneFollower,
-    give_way,
-    reason_of,
-)
+from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.path import BodyPath
@@ -63,7 +56,7 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
         super().__init__(interface.PLANNER, NeedlePlannerSettings, **options)
         self._coils = settings_of(self, CoilBridgeSettings, options)
         self._model = settings_of(self, ThreadModelSettings, options)
-        self._planning = ThreadPoolExecutor(1, initializer=give_way)
+        self._planning = ThreadPoolExecutor(1)
         self._moving = False  # whether the last command was not zero
         self._scene = SceneFollower(self, self.on_scene)
         self.start()

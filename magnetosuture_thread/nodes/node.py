@@ -8,8 +8,6 @@ configuration class, and are in force once all of the node's callbacks have agre
 from __future__ import annotations
 
 import gc
-import os
-import sys
 import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,15 +51,6 @@ MAX_REASON_CHARS = 400  # of a reason, a status or a value, whatever is in it
 MAX_REQUEST_ENTRIES = 1000  # of a list in a request: each takes its time, and nothing else runs meanwhile
 SUCCESS = TransitionCallbackReturn.SUCCESS
 INACTIVE = "inactive: messages are not used until the node is activated"
-
-
-def give_way() -> None:
-    """Let all other work of this machine go before that of the calling thread, where the system tells threads apart.
-
-    Plans and forecasts take a processor for seconds: with two of them a frame would wait.
-    """
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, 0, 10)
 
 
 class Health:

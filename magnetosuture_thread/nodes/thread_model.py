@@ -33,7 +33,7 @@ from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.markers import packed_forecast_markers, packed_thread_markers
 from magnetosuture_thread.messages.packing import estimate_outputs, packed_forecast, prediction_outputs
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower, give_way
+from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.thread.prediction import STARTED
@@ -377,7 +377,6 @@ class ThreadForecasts:
         self._waiting.put((result.stamp, self._generation, make))
 
     def _work(self) -> None:
-        give_way()
         while self._error is None and (task := self._waiting.get()) is not None:
             try:
                 if self._waiting.empty():

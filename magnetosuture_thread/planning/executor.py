@@ -330,7 +330,7 @@ class ProcedureExecutor:
                 self._next_goal()
                 return None
             rest = self.path.part(self.travel, self.path.length)
-            self._replan(stamp, np.zeros(2), "")
+            self._replan(stamp, np.zeros(2), self.judge.missing(self.goal))
             self._left = rest
             return None
         if self._pending is None and is_far and isinstance(goal, Wrap) and not is_last:
@@ -367,7 +367,8 @@ class ProcedureExecutor:
         if rests or command.error > max(OFF_PATH, min(0.5 * self._tracker.leeway, MAX_OFF_PATH)):
             beside = self.planner.beside(middle, angle)
             pulled = "" if self._compensates else " with motion_compensation of the coil bridge off"
-            self._replan(stamp, command.velocity if rests else np.zeros(2), f"{beside}{pulled}")
+            stopped, what = (command.velocity, "rests") if rests else (np.zeros(2), "is off its path")
+            self._replan(stamp, stopped, f"the needle {what}{beside}{pulled}")
             return None
         return command.velocity
 
@@ -472,13 +473,12 @@ class ProcedureExecutor:
         at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
         return self._holder.compute_command(*at, hold=True).velocity
 
-    def _replan(self, stamp: float, stopped: Vector, where: str) -> None:
+    def _replan(self, stamp: float, stopped: Vector, why: str) -> None:
         """Plan the goal anew; where the needle was stopped, back off first, the way that it came."""
         self.pursuit.replans += 1
         self.pursuit.detours += 1
         if self.pursuit.replans > MAX_REPLANS or self.pursuit.detours > MAX_DETOURS:
-            what = "rests" if stopped.any() else "is off its path"
-            self.abort(f"goal {self.goal + 1} is given up: the needle {what}{where}, however it is planned")
+            self.abort(f"goal {self.goal + 1} is given up: {why}, however it is planned")
             return
         self._drop_path()
         if stopped.any():

@@ -844,9 +844,7 @@ def _check_line(planner: NeedlePlanner, where: str, goal: Lay) -> None:
     line = shapely.LineString(np.reshape(goal.along, (-1, 2)))
     _check_free(planner, f"{where}.along", line, goal.along)
     if not goal.stretch and math.dist(goal.along[:2], goal.along[-2:]) <= 2.0 * goal.tolerance:
-        expected = (
-            "from and to along the thread, as the ends of the line are as near to each other as twice its tolerance"
-        )
+        expected = "where it begins and ends along the thread, as both ends of the line are close to each other"
         raise ConfigurationError(f"{where}.stretch", [], expected)
     length, own = 1e3 * line.length, 1e3 * planner.thread_length
     if length > own + 2e3 * goal.tolerance or max(goal.stretch, default=0.0) > planner.thread_length:

@@ -368,7 +368,7 @@ def _goals_of(goals: Any, common: Mapping[str, Any], where: str, source: str) ->
     for index, entry in enumerate(goals):
         at = f"{where}[{index}]"
         kinds = [key for key in _mapping(entry, at, source) if key != "limits"]
-        known = [*GOALS, "repeat"] if where == "goals" else [*GOALS]  # one that repeats a repeat is asked for by no one
+        known = [*GOALS, "repeat"] if where == "goals" else [*GOALS]  # not nested: their number stays bounded
         if len(kinds) != 1 or kinds[0] not in known:
             expected = suggest_names(str(kinds[0]), known) if len(kinds) == 1 else "one kind of goal"
             raise ConfigurationError(at, kinds, expected, source)

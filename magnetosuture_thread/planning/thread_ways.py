@@ -15,7 +15,7 @@ from magnetosuture_thread.forecast.published import follow_plan
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, points_at
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import BringEnd, Lay, TakeOff, ThreadGoal, Unwind
-from magnetosuture_thread.planning.verdict import part_along
+from magnetosuture_thread.planning.verdict import part_along, resampled
 from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.thread.prediction import NeedlePose
 
@@ -92,11 +92,6 @@ class Candidate:
             line=self.line + 1e-3 * scale * share @ rng.standard_normal((3, 2)),
             onward=self.onward + 2e-3 * scale * rng.standard_normal(2),
         )
-
-
-def resampled(line: Points) -> Points:
-    """Return 40 points of a line, evenly spaced, from its first to its last one, shape (40, 2) [m]."""
-    return points_at(line, np.linspace(0.0, arc_lengths(line)[-1], 40))
 
 
 def candidates(goal: ThreadGoal, reach: float) -> Iterator[Candidate]:

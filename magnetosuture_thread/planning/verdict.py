@@ -93,6 +93,11 @@ def left_to_wind(allowed: tuple[float, float], now: float) -> float:
     return max(least - now, 0.0) + min(greatest - now, 0.0)
 
 
+def resampled(line: Points) -> Points:
+    """Return 40 points of a line, evenly spaced, from its first to its last one, shape (40, 2) [m]."""
+    return points_at(line, np.linspace(0.0, arc_lengths(line)[-1], 40))
+
+
 def part_along(thread: Points, line: Points, stretch: tuple[float, ...]) -> Points:
     """Return the part of a thread that is to lie along a line, in the order of the line's points, shape (k, 2) [m].
 
@@ -115,9 +120,9 @@ def part_along(thread: Points, line: Points, stretch: tuple[float, ...]) -> Poin
 def miss(goal: ThreadGoal, allowed: tuple[float, float], thread: Points, solid: shapely.Geometry | None) -> float:
     """Return by how much a thread misses a goal, as a share of what the goal tolerates: 1 or less is met.
 
-    Of a line the greatest distance of points at equal shares of its length and of that of the thread along it, of the
-    free end its distance, of a winding how far it is from the middle of its
-    interval; of a thread that is to be taken off also its clearance over its distance from the shape.
+    Of a line it is the greatest distance between points at equal shares of its length and of that of the thread along
+    it; of the free end its distance; of a winding how far it is from the middle of its interval; of a thread that is to
+    be taken off also its clearance over its distance from the shape.
 
     Args:
         goal: of the thread.
@@ -127,11 +132,8 @@ def miss(goal: ThreadGoal, allowed: tuple[float, float], thread: Points, solid: 
     """
     if isinstance(goal, Lay):
         line = np.reshape(goal.along, (-1, 2))
-        part, along = (
-            part_along(thread, line, goal.stretch),
-            points_at(line, np.linspace(0.0, arc_lengths(line)[-1], 40)),
-        )
-        return float(np.linalg.norm(part - along, axis=1).max()) / goal.tolerance
+        apart = np.linalg.norm(part_along(thread, line, goal.stretch) - resampled(line), axis=1)
+        return float(np.max(apart)) / goal.tolerance
     if isinstance(goal, BringEnd):
         return math.dist(thread[-1], goal.position) / goal.tolerance
     assert solid is not None
