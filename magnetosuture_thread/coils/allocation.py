@@ -276,8 +276,8 @@ class CoilAllocation:
         pull, mean = needle.pole * (at_tip - at_tail), 0.5 * (at_tail + at_tip)
         return np.vstack([e @ pull / needle.drag, n @ pull / needle.drag_across, n @ mean, e @ mean])
 
-    def axes(self) -> tuple[float, ...]:
-        """Return the directions, of half a turn, in which the coils hold no needle against a pull across it [rad].
+    def axes(self) -> tuple[tuple[float, float], ...]:
+        """Return the directions, of half a turn, in which the coils hold no needle against a pull across it.
 
         By currents of norm one that neither drive nor turn it nor change the field along it, a needle in the dish's
         middle is given across it at the most the velocity
@@ -285,7 +285,16 @@ class CoilAllocation:
             A(theta) = |(1 - P) w|
 
         with the row w of that velocity, and P the projection onto the rows of the other three. An axis is where A falls
-        to less than half of what it is elsewhere: four coils have two, six have none.
+        to less than half of what it is elsewhere: four coils have two, six have none. The error `COIL_ERROR` of a
+        current I turns the field, of strength B_0 and b for one ampere, and with it the needle. Currents that turn it
+        by no more than `DIRECTION_DEVIATION` hold it against
+
+            dA / dtheta I,    I = min(DIRECTION_DEVIATION B_0 / (COIL_ERROR b), max_current)
+
+        for each radian off an axis.
+
+        Returns:
+            Each axis [rad] with that velocity [m/s].
         """
 
         def authority(angle: float) -> float:
@@ -293,11 +302,14 @@ class CoilAllocation:
             kept = np.linalg.qr(rows[[0, 2, 3]].T)[0]
             return float(np.linalg.norm(rows[1] - kept @ (kept.T @ rows[1])))
 
+        field = float(np.linalg.norm(self._rows(np.zeros(2), np.array([1.0, 0.0]))[2:], axis=0).max())
+        current = min(DIRECTION_DEVIATION * self._field / (COIL_ERROR * field), self._max_current)
         found, axes = np.array([authority(angle) for angle in np.radians(np.arange(180.0))]), []
         minima = (found < np.roll(found, 1)) & (found <= np.roll(found, -1)) & (found < 0.5 * found.max())
         for angle in np.radians(np.flatnonzero(minima)).tolist():
             before, after = authority(angle - HEADING_STEP), authority(angle + HEADING_STEP)
-            axes.append(round(angle + HEADING_STEP * (before - after) / (before + after), 6))  # it grows alike beside
+            axis = round(angle + HEADING_STEP * (before - after) / (before + after), 6)  # it grows alike beside
+            axes.append((axis, 0.5 * (before + after) / HEADING_STEP * current))
         return tuple(axes)
 
     def _bounded_least_squares(self, system: Vector, target: Vector, lower: Vector, upper: Vector) -> Vector:

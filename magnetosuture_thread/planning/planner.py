@@ -124,7 +124,7 @@ class NeedlePlanner:
         needle: its kinematics.
         keep_out: least distance of the needle's axis from wall and shapes [m].
         thread_length: of the thread behind it [m].
-        axes: of the coils [rad], for `PathTracker`.
+        axes: of the coils, for `PathTracker`.
         model: settings of the thread model, for forecasts; None for those of the thread model's defaults.
 
     Attributes:
@@ -140,7 +140,7 @@ class NeedlePlanner:
         needle: NeedleKinematics,
         keep_out: float,
         thread_length: float,
-        axes: Sequence[float] = (),
+        axes: Sequence[tuple[float, float]] = (),
         model: ThreadModelSettings | None = None,
     ) -> None:
         least = needle.chord + 2.0 * keep_out

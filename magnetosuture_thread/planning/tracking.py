@@ -24,7 +24,6 @@ MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle th
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and across may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
-DRIFT_PER_ANGLE = 0.015  # m/s; drift across the body that coils compensate with ease, for each radian off their axes
 MAX_AXIS_ANGLE = 0.15  # rad; that is kept off them at the most
 MIN_SPEED_SHARE = 0.45  # to which the speed falls where the drift is more than they compensate
 ALWAYS_OFF = 0.05  # rad; off an axis at which a needle counts that is on it, as tracked directions tremble
@@ -78,10 +77,11 @@ class PathTracker:
     from it than `MAX_LAG` along the path or `MAX_ANGLE`.
 
     Along the axes of the coils no currents give a force across the needle. Where something pulls it across its chord at
-    the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off the axes by
-    min(|d| / `DRIFT_PER_ANGLE`, `MAX_AXIS_ANGLE`), on the side of theta_p, and jumps to the other side when theta_p
-    crosses, or while the needle is far off its path to the wrong side, as a ship tacks, but not within `MIN_TACK_TIME`
-    of a crossing. In a crossing the needle is turned faster, as nothing compensates the pull meanwhile: it is thrown
+    the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off an axis by
+    min(|d| / a, `MAX_AXIS_ANGLE`), with the velocity a that the coils hold for each radian, on the side of theta_p, and
+    jumps to the other side when theta_p crosses, or while the needle is far off its path to the wrong side, as a ship
+    tacks, but not within `MIN_TACK_TIME` of a crossing. In a crossing the needle is turned faster, as nothing
+    compensates the pull meanwhile: it is thrown
     aside by about `THROWN_FOR` times the present d. Before one, the path is followed as far to the other side, without
     the integral. All of theta - theta_p stays within what half of the path's leeway allows. Where d is more than the
     coils compensate at the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower,
@@ -93,10 +93,11 @@ class PathTracker:
 
     Args:
         path: to track.
-        axes: directions in which the coils give no force across the needle, see `CoilAllocation.axes` [rad].
+        axes: directions in which the coils give no force across the needle [rad], each with the velocity across it
+            that they hold for each radian off it [m/s], see `CoilAllocation.axes`.
     """
 
-    def __init__(self, path: BodyPath, axes: Sequence[float] = ()) -> None:
+    def __init__(self, path: BodyPath, axes: Sequence[tuple[float, float]] = ()) -> None:
         self.path, self._axes = path, tuple(axes)
         self.travel = 0.0
         turning = turning_points(path.middles, path.angles, path.lever)
@@ -194,8 +195,8 @@ class PathTracker:
         """
         if not self._axes:
             return course
-        planned = min((math.remainder(direction - axis, math.pi) for axis in self._axes), key=abs)
-        kept = min(MAX_AXIS_ANGLE, self._pull / DRIFT_PER_ANGLE)
+        planned, held = self._nearest(direction)
+        kept = min(MAX_AXIS_ANGLE, self._pull / held)
         if abs(planned) >= kept or across * self._tack <= 0.0:
             self._tack = 0.0
         is_off = abs(across) > min(MAX_TACK_ERROR, TACK_SHARE * self.leeway)
@@ -210,13 +211,13 @@ class PathTracker:
 
     def _lead(self, direction: float, drift: float) -> float:
         """Return the displacement to the left that is expected in the next crossing of an axis [m]; 0 far from one."""
-        if abs(drift) <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
+        if not self._axes or abs(drift) <= ALWAYS_OFF * self._nearest(direction)[1]:
             return 0.0
         leeway = self.leeway
         for way in np.linspace(self.travel, min(self.path.length, self.travel + LEAD_LOOKAHEAD), 8)[1:]:
             leeway = min(leeway, self.path.leeway_at(way))
             ahead = self.path.at(way)[1]
-            for axis in self._axes:
+            for axis, _ in self._axes:
                 first, then = math.remainder(direction - axis, math.pi), math.remainder(ahead - axis, math.pi)
                 if first * then < 0.0 and abs(first - then) < 1.0:
                     return math.copysign(min(abs(drift) * THROWN_FOR, LEAD_SHARE * leeway), drift)
@@ -224,18 +225,20 @@ class PathTracker:
 
     def _compensated_share(self, angle: float) -> float:
         """Return the share of the pull that coils compensate with ease, at a direction and those of the path ahead."""
-        if self._pull <= DRIFT_PER_ANGLE * ALWAYS_OFF or not self._axes:
+        if not self._axes or self._pull <= ALWAYS_OFF * self._nearest(angle)[1]:
             return 1.0
         ahead = min(
-            self._off_axis(self.path.at(min(self.path.length, self.travel + way))[1])
+            abs(self._nearest(self.path.at(min(self.path.length, self.travel + way))[1])[0])
             for way in np.linspace(0.0, AXIS_LOOKAHEAD, 5)
         )
-        off = min(max(self._off_axis(angle), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
-        return min(1.0, DRIFT_PER_ANGLE * off / self._pull)
+        here, held = self._nearest(angle)
+        off = min(max(abs(here), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
+        return min(1.0, held * off / self._pull)
 
-    def _off_axis(self, angle: float) -> float:
-        """Return the angle between a direction and the nearest axis [rad]."""
-        return min(abs(math.remainder(angle - axis, math.pi)) for axis in self._axes)
+    def _nearest(self, direction: float) -> tuple[float, float]:
+        """Return the angle from the nearest axis [rad], and the velocity that is held for each radian [m/s]."""
+        each = ((math.remainder(direction - axis, math.pi), held) for axis, held in self._axes)
+        return min(each, key=lambda one: abs(one[0]))
 
     def _rates(self, stop: float) -> tuple[float, float]:
         """Return how far the needle is driven along its chord, and turned [rad], for each metre of the tip's way."""

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magnetosuture_thread.coils.allocation import CoilAllocation, NeedleMechanics
+from magnetosuture_thread.coils.allocation import (
+    COIL_ERROR,
+    DIRECTION_DEVIATION,
+    CoilAllocation,
+    NeedleMechanics,
+)
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
@@ -124,13 +131,28 @@ def test_however_it_is_pulled_the_field_stays_along_the_needle_and_turns_it_as_c
 def test_along_the_axes_of_coils_no_currents_hold_the_needle_and_beside_them_they_do(turn: float):
     coils = LoopCoils(coils_around([turn + k * np.pi / 2 for k in range(4)], 0.05, 0.025, 1.2e-3))
     made, pull = CoilAllocation(coils, NEEDLE, 0.008, 10.0), MotionDisturbance(0.0, 1e-3)
-    assert made.axes() == pytest.approx([turn, turn + 0.5 * np.pi], abs=1e-3)
-    for axis in made.axes():
+    axes = [axis for axis, _ in made.axes()]
+    assert axes == pytest.approx([turn, turn + 0.5 * np.pi], abs=1e-3)
+    for axis in axes:
         drifts = []
         for angle in (axis - 0.3, axis, axis + 0.3):
             e = turned(EAST, angle)
             drifts.append(made.allocate(-pull.velocity(e), -0.5 * NEEDLE.chord * e, e, disturbance=pull).drift)
         assert drifts == pytest.approx([-1e-3, 0.0, -1e-3], abs=2e-4)
+
+
+@pytest.mark.parametrize("distance", [0.05, 0.08])
+def test_what_is_held_for_each_radian_off_an_axis_turns_the_field_by_no_more_than_a_direction_deviates(distance: float):
+    settings = replace(read_setup("hernia_ring").coils, coil_distance=distance)
+    made, off = settings.allocation(), 0.1
+    axis, held = made.axes()[0]
+    e = turned(EAST, axis + off)
+    tail, pull = -0.5 * settings.needle().chord * e, MotionDisturbance(0.0, off * held)
+    at_rest = made.allocate(1e-6 * e, tail, e, disturbance=MotionDisturbance())
+    against = made.allocate(-pull.velocity(e), tail, e, disturbance=pull)
+    assert against.drift == pytest.approx(-off * held, rel=0.1)
+    field = COIL_ERROR * settings.field_per_current * np.linalg.norm(against.currents - at_rest.currents)
+    assert field / settings.aligning_field == pytest.approx(DIRECTION_DEVIATION, rel=0.2)
 
 
 def test_six_coils_have_no_axis():
