@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os.path
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +10,12 @@ from pathlib import Path
 from typing import ClassVar
 
 from magnetosuture_thread.barrier import load_barriers
-from magnetosuture_thread.coils.allocation import CoilAllocation, CoilGainEstimator, NeedleMechanics
+from magnetosuture_thread.coils.allocation import (
+    MIN_ALIGNING_SHARE,
+    CoilAllocation,
+    CoilGainEstimator,
+    NeedleMechanics,
+)
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
 from magnetosuture_thread.configuration import Configuration, quantity
@@ -235,13 +241,26 @@ class CoilBridgeSettings(Configuration):
         """Maximum time for which a velocity may last without a step: driver timeout and one period [s]."""
         return self.driver_timeout + 1.0 / self.rate
 
+    @property
+    def turn_time(self) -> float:
+        """Maximum time for which the needle turns on while nobody looks [s].
+
+        The needle turns towards the field, which held currents hold, with the time constant of its turning drag by its
+        moment and the least field along it; two of these after a command that takes two periods to come into force. Not
+        known, and inf, where its drift is part of its turn.
+        """
+        if not self.motion_compensation:
+            return math.inf
+        torque = self.needle_moment * MIN_ALIGNING_SHARE * self.aligning_field
+        return 2.0 / self.rate + 2.0 * self.needle_turning_drag / torque
+
     def safety_filter(self, scene: Scene) -> NeedleSafetyFilter:
         """Return the safety filter for the wall and the shapes of a scene.
 
         Raises:
             ConfigurationError: the needle has no room in it, or a barrier cannot be used.
         """
-        return NeedleSafetyFilter(
+        made = NeedleSafetyFilter(
             scene,
             load_barriers(self.barriers, f"{self.GROUP}.barriers"),
             keep_out=self.keep_out + self.pose_margin,
@@ -252,6 +271,8 @@ class CoilBridgeSettings(Configuration):
             needle_length=self.needle_length,
             needle_curvature=self.needle_curvature,
         )
+        made.limit_turns(self.turn_time)
+        return made
 
     def check(self) -> None:
         """Reject too few coils, a coiled needle, and limits that cannot be kept."""

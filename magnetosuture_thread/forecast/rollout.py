@@ -12,12 +12,11 @@ from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceDat
 from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
 from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.certificate import FilterData
+from magnetosuture_thread.safety.certificate import FilterData, pose_needle
 from magnetosuture_thread.safety.motion import (
     filter_velocity,
     moved_needle,
     needle_margin,
-    pose_needle,
 )
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.banded import SolverBuffers

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData
+from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, WorkspaceData, measure
 from magnetosuture_thread.geometry.polyline import Points
 
 ROUNDING = 1e-13
@@ -63,6 +63,7 @@ class FilterData(NamedTuple):
     Attributes:
         body: of the needle.
         hold: for which a motion has to keep clear [s].
+        turn_time: for how much of it the needle goes on turning at the most [s].
         keep: minimum distance of a point of the needle from shapes [m].
         keep_wall: minimum distance of a point from the wall [m].
         keep_out: minimum distance of the needle's axis from both [m].
@@ -74,6 +75,7 @@ class FilterData(NamedTuple):
 
     body: BodyData
     hold: float
+    turn_time: float
     keep: float
     keep_wall: float
     keep_out: float
@@ -103,6 +105,24 @@ class PosedNeedle(NamedTuple):
     chord_y: float
     distances: NDArray[np.float64]
     normal: NDArray[np.float64]
+
+
+@compiled
+def pose_needle(data: FilterData, x: float, y: float, heading_x: float, heading_y: float) -> PosedNeedle:
+    """Return the needle with its tail at (x, y) [m] and a unit heading, its distances from all shapes measured."""
+    body = data.body
+    count, shapes = len(body.points), len(data.scene.shapes)
+    points, turning = np.empty((count, 2)), np.empty((count, 2))
+    for i in range(count):
+        px, py = body.points[i, 0], body.points[i, 1]
+        points[i, 0], points[i, 1] = px * heading_x - py * heading_y + x, px * heading_y + py * heading_x + y
+        px, py = body.turning[i, 0], body.turning[i, 1]
+        turning[i, 0], turning[i, 1] = px * heading_x - py * heading_y, px * heading_y + py * heading_x
+    distances, normal = np.empty((count, shapes)), np.empty((count, shapes, 2))
+    measure(points, data.scene, distances, normal)
+    chord_x = body.chord_x * heading_x - body.chord_y * heading_y
+    chord_y = body.chord_x * heading_y + body.chord_y * heading_x
+    return PosedNeedle(data, points, turning, chord_x, chord_y, distances, normal)
 
 
 @compiled
@@ -289,3 +309,65 @@ def safe_time(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.0) -> 
             if t < best:
                 best, what, where = t, int(scene.shapes[s]), i
     return best, what, where
+
+
+@compiled
+def is_clear_turned(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.0) -> bool:
+    """Return whether a needle keeps clear that turns for no longer than `turn_time`, and goes straight on after that.
+
+    It turns by some angle between 0 and Phi = omega `turn_time`, at any rate. With the velocity w of its middle, its
+    points are then, from when it begins, by no more than |w| `turn_time` Phi off
+
+        F(phi, t) = c + R(phi) (p - c + t w)
+
+    with c the middle now. F(0, t) and F(Phi, t) are straight, and asked by `safe_time` for the whole hold. The others
+    lie between them, on arcs of the radius r = |p - c| + |w| `hold` at most; so they are clear by k where both are by
+
+        sqrt((k + r Phi^2 / 8 + |w| `turn_time` Phi)^2 + (r Phi / 2)^2)
+
+    One that is closer than that at t = 0 is not clear here, nor one that turns by more than a radian.
+
+    Args:
+        vx: velocity of the tip [m/s].
+        vy: velocity of the tip [m/s].
+        needle: in its pose.
+        drift: part of the tip's velocity across the chord, to its left, that the whole needle has [m/s].
+    """
+    data, body = needle.data, needle.data.body
+    chord_x, chord_y = needle.chord_x, needle.chord_y
+    along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x - drift
+    turn = body.turn * across * data.turn_time
+    if not abs(turn) < 1.0:
+        return False
+    swiftest, lever, speed = 0.0, 0.5 * body.chord, math.hypot(along, drift)
+    for i in range(len(needle.points)):
+        swiftest = max(swiftest, math.hypot(needle.turning[i, 0], needle.turning[i, 1]))
+    reach = lever * swiftest + speed * data.hold
+    off = 0.125 * reach * turn * turn + speed * data.turn_time * abs(turn)
+    keep = math.hypot(data.keep + off, 0.5 * reach * turn)
+    keep_wall = math.hypot(data.keep_wall + off, 0.5 * reach * turn)
+    most = data.scene.wall_radius - keep_wall
+    wider = FilterData(
+        body,
+        data.hold,
+        data.turn_time,
+        keep,
+        keep_wall,
+        data.keep_out,
+        data.rate,
+        data.max_speed,
+        data.max_acceleration,
+        data.scene,
+    )
+    for angle in (0.0, turn):
+        cosine, sine = math.cos(angle), math.sin(angle)
+        ex, ey = cosine * chord_x - sine * chord_y, sine * chord_x + cosine * chord_y
+        x = needle.points[0, 0] + lever * (chord_x - ex)
+        y = needle.points[0, 1] + lever * (chord_y - ey)
+        turned = pose_needle(wider, x, y, body.chord_x * ex + body.chord_y * ey, body.chord_x * ey - body.chord_y * ex)
+        if (turned.distances < keep).any() or (np.hypot(turned.points[:, 0], turned.points[:, 1]) > most).any():
+            return False
+        wx, wy = along * ex - drift * ey, along * ey + drift * ex
+        if safe_time(wx, wy, turned, drift)[1] != NOTHING:
+            return False
+    return True

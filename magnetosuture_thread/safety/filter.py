@@ -17,7 +17,15 @@ from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.arrays import finite_array
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_points
 from magnetosuture_thread.geometry.obstacles.distances import pack_obstacles
-from magnetosuture_thread.safety.certificate import NOTHING, BodyData, FilterData, PosedNeedle, safe_time
+from magnetosuture_thread.safety.certificate import (
+    NOTHING,
+    BodyData,
+    FilterData,
+    PosedNeedle,
+    is_clear_turned,
+    pose_needle,
+    safe_time,
+)
 from magnetosuture_thread.safety.motion import (
     STUCK,
     SURE,
@@ -27,7 +35,6 @@ from magnetosuture_thread.safety.motion import (
     nearest_clear,
     needle_margin,
     no_rows,
-    pose_needle,
 )
 from magnetosuture_thread.scene import Scene
 
@@ -163,9 +170,10 @@ class NeedleSafetyFilter:
         h = distance of p from the wall or a shape - keep_out,    rate = min(approach_rate, 1 / hold_time)
 
     The guarantee is not in these rows but in `safe_share`: the share of a velocity that may be held, unchanged as the
-    needle sees it, for the whole of `hold_time` without any point of the axis getting closer than `keep_out`. It is
-    computed in closed form for the arcs on which the points move, not in steps. Whoever gives the needle another
-    velocity than the one filtered, as coil currents do, multiplies it by its own share.
+    needle sees it, for the whole of `hold_time` without any point of the axis getting closer than `keep_out`; or all of
+    it, where the needle turns for a limited time and may go straight on then, see `limit_turns`. It is computed in
+    closed form for the arcs on which the points move, not in steps. Whoever gives the needle another velocity than the
+    one filtered, as coil currents do, multiplies it by its own share.
 
     A needle that is closer already may leave or slide along, and gets no closer; zero is always allowed, and nothing
     but a command moves the needle, no faster than it was commanded. `sidestep` is for whoever can push it sideways.
@@ -235,6 +243,7 @@ class NeedleSafetyFilter:
         self._data = FilterData(
             BodyData(points, turning, is_straight, chord, x, y, turn),
             hold_time,
+            hold_time,
             math.sqrt(keep_out**2 + 0.25 * spacing**2 * (1.0 + bend * keep_out)),
             keep_out + 0.125 * bend * spacing**2,
             keep_out,
@@ -254,6 +263,16 @@ class NeedleSafetyFilter:
         self.safe_share(1e-3 * EAST, middle, EAST)
         self.kinematics.moved(middle, EAST, 1e-3, 0.0, hold_time)
         self._added.time = None
+
+    def limit_turns(self, turn_time: float) -> None:
+        """Certify motions from now on also as those of a needle that turns for no longer than a time.
+
+        Args:
+            turn_time: for which it goes on turning at the most while nobody looks, as a field that is held also holds
+                its direction; no more than `hold_time` counts [s].
+        """
+        self._data = self._data._replace(turn_time=min(turn_time, self.hold_time))
+        self._pose = None
 
     def compiled_data(self) -> FilterData:
         """Return the filter for compiled loops.
@@ -360,9 +379,11 @@ class NeedleSafetyFilter:
         Raises:
             InvalidInputError: something is not finite.
         """
-        velocity = _checked_velocity(velocity)
-        time, what, _ = safe_time(float(velocity[0]), float(velocity[1]), self._at(tail, heading), drift)
-        found = (1.0, "") if what == NOTHING else (SURE * time / self.hold_time, self._names[what])
+        velocity, needle = _checked_velocity(velocity), self._at(tail, heading)
+        x, y = velocity.tolist()
+        time, what, _ = safe_time(x, y, needle, drift)
+        is_clear = what == NOTHING or (self._data.turn_time < self.hold_time and is_clear_turned(x, y, needle, drift))
+        found = (1.0, "") if is_clear else (SURE * time / self.hold_time, self._names[what])
         if not self._added:
             return found
         return min(found, self._added.checked_share(velocity, tail, heading, drift), key=lambda share: share[0])

@@ -15,9 +15,16 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_chord
-from magnetosuture_thread.geometry.obstacles.distances import ContactRows, measure, polygon_rows, shape_distance
+from magnetosuture_thread.geometry.obstacles.distances import ContactRows, polygon_rows, shape_distance
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.certificate import NOTHING, WALL, FilterData, PosedNeedle, safe_time
+from magnetosuture_thread.safety.certificate import (
+    NOTHING,
+    WALL,
+    FilterData,
+    PosedNeedle,
+    is_clear_turned,
+    safe_time,
+)
 
 Vector = NDArray[np.float64]
 
@@ -130,24 +137,6 @@ class NeedleKinematics:
             turn_rate = (across - drift) / (0.5 * self.chord)
             move_pose(self._chord, pose, float(along), float(drift), float(turn_rate), float(duration))
         return pose[:2], pose[2:]
-
-
-@compiled
-def pose_needle(data: FilterData, x: float, y: float, heading_x: float, heading_y: float) -> PosedNeedle:
-    """Return the needle with its tail at (x, y) [m] and a unit heading, its distances from all shapes measured."""
-    body = data.body
-    count, shapes = len(body.points), len(data.scene.shapes)
-    points, turning = np.empty((count, 2)), np.empty((count, 2))
-    for i in range(count):
-        px, py = body.points[i, 0], body.points[i, 1]
-        points[i, 0], points[i, 1] = px * heading_x - py * heading_y + x, px * heading_y + py * heading_x + y
-        px, py = body.turning[i, 0], body.turning[i, 1]
-        turning[i, 0], turning[i, 1] = px * heading_x - py * heading_y, px * heading_y + py * heading_x
-    distances, normal = np.empty((count, shapes)), np.empty((count, shapes, 2))
-    measure(points, data.scene, distances, normal)
-    chord_x = body.chord_x * heading_x - body.chord_y * heading_y
-    chord_y = body.chord_x * heading_y + body.chord_y * heading_x
-    return PosedNeedle(data, points, turning, chord_x, chord_y, distances, normal)
 
 
 @compiled
@@ -380,6 +369,25 @@ def _tangent(x: float, y: float, what: int, needle: PosedNeedle) -> tuple[float,
 
 
 @compiled
+def _is_clear(
+    vx: float, vy: float, needle: PosedNeedle, rows: NDArray[np.float64], least: NDArray[np.float64], count: int
+) -> bool:
+    """Return whether rows @ v >= least and the motion is certified, as constant or as one that turns for a while.
+
+    In the first `count` rows, of wall and shapes, a motion of the second kind has as much less of its turn.
+    """
+    data = needle.data
+    holding = rows[:, 0] * vx + rows[:, 1] * vy >= least
+    if holding.all() and safe_time(vx, vy, needle)[0] >= data.hold:
+        return True
+    if data.turn_time >= data.hold or not holding[count:].all():
+        return False
+    across = (1.0 - data.turn_time / data.hold) * (-vx * needle.chord_y + vy * needle.chord_x)
+    x, y = vx + across * needle.chord_y, vy - across * needle.chord_x
+    return bool((rows[:count, 0] * x + rows[:count, 1] * y >= least[:count]).all()) and is_clear_turned(vx, vy, needle)
+
+
+@compiled
 def nearest_clear(
     vx: float, vy: float, needle: PosedNeedle, added: AddedRows, touched: NDArray[np.bool_]
 ) -> tuple[float, float]:
@@ -389,7 +397,8 @@ def nearest_clear(
 
     for points p of the needle, with h'' the second derivative of h along the motion of the pass before, so that
     the needle leans away from what its way bends into and does not have to be slowed down for it. Where that leaves
-    nothing but zero it is left out, and slowing down remains.
+    nothing but zero it is left out, and slowing down remains. A motion that turns for a part of the hold is let through
+    as it is where the rows hold with as much less of its turning, and where that is certified.
 
     Args:
         vx: velocity of the tip commanded [m/s].
@@ -400,7 +409,6 @@ def nearest_clear(
     """
     speed, hold, rate, turning = math.hypot(vx, vy), needle.data.hold, needle.data.rate, needle.turning
     points, chord_x, chord_y = needle.points, needle.chord_x, needle.chord_y
-    time, what, where = safe_time(vx, vy, needle)
     swiftest = 0.0
     for i in range(len(points)):
         swiftest = max(swiftest, math.hypot(turning[i, 0], turning[i, 1]))
@@ -419,9 +427,9 @@ def nearest_clear(
         least[k], depth[k] = -rate * max(margin[k], 0.0), -margin[k]
     rows[count:fixed], least[count:fixed] = added.rows, -added.rate * np.maximum(added.margin, 0.0) - added.drift
     depth[count:fixed], who[count:fixed] = -added.margin, added.barrier
-    holding = rows[:fixed, 0] * vx + rows[:fixed, 1] * vy >= least[:fixed]
-    if time >= hold and holding.all() and not (depth[:fixed] > 0.0).any():
+    if not (depth[:fixed] > 0.0).any() and _is_clear(vx, vy, needle, rows[:fixed], least[:fixed], count):
         return vx, vy
+    what = safe_time(vx, vy, needle)[1]
     bounded = least.copy()
     best, bx, by = speed * speed, 0.0, 0.0  # zero, that always is allowed
     ux, uy, total = vx, vy, fixed

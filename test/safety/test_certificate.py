@@ -18,11 +18,15 @@ EAST = np.array([1.0, 0.0])
 HOLD = 0.3
 
 
-def safety(scene: Scene, length: float, curvature: float = 0.0, keep: float = 5e-4) -> NeedleSafetyFilter:
+def safety(
+    scene: Scene, length: float, curvature: float = 0.0, keep: float = 5e-4, turn_time: float = math.inf
+) -> NeedleSafetyFilter:
     """Return a filter that holds for 0.3 s."""
-    return NeedleSafetyFilter(
+    made = NeedleSafetyFilter(
         scene, keep_out=keep, approach_rate=10.0, hold_time=HOLD, needle_length=length, needle_curvature=curvature
     )
+    made.limit_turns(turn_time)
+    return made
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -47,6 +51,40 @@ def test_what_is_certified_keeps_clear_and_little_more_would_not(seed: int):
                 end = needle.moved(velocity, HOLD * min(1.0, share + 0.01)).points()
                 tight += world.clearance([end]) < 3e-4 + 6e-5
     assert tight > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turn_that_ends_keeps_clear_whenever_it_ends_and_is_let_through_where_a_turn_that_lasts_is_not(seed: int):
+    random, found = np.random.default_rng(seed), 0
+    while found < 25:
+        scene, length = random_scene(random), float(random.uniform(0.001, 0.006))
+        curvature = float(random.choice([0.0, random.uniform(-2.0, 2.0) / length]))
+        turn_time = float(random.uniform(0.0, 0.08))
+        world = World(scene)
+        lasts = safety(scene, length, curvature, 3e-4)
+        ends = safety(scene, length, curvature, 3e-4, turn_time)
+        for _ in range(25):
+            r, angle = world.radius * math.sqrt(random.uniform()), float(random.uniform(-math.pi, math.pi))
+            needle = Needle(length, curvature, cmath.rect(r, float(random.uniform(-3.0, 3.0))), angle)
+            if not 3e-4 < world.clearance([needle.points()]) < 2e-3:
+                continue
+            forwards, sideways = random.uniform(-0.003, 0.003), random.uniform(-0.03, 0.03)
+            velocity = complex(forwards, sideways) * cmath.exp(1j * angle)
+            tip = np.array([velocity.real, velocity.imag])
+            allowed, without = ends.safe_share(tip, *needle.pose())[0], lasts.safe_share(tip, *needle.pose())[0]
+            assert allowed in {without, 1.0}
+            if allowed == without:
+                continue
+            found += 1
+            left, axes = turn_time, [needle.points()]
+            for part in random.uniform(0.0, 1.0, 4):  # it turns, more slowly too, and then no more
+                rate, duration = float(random.uniform(0.0, 1.0)), float(part * left)
+                turned = complex(forwards, rate * sideways) * cmath.exp(1j * needle.angle)
+                axes += [needle.moved(turned, duration * k / 5).points() for k in range(1, 6)]
+                needle, left = needle.moved(turned, duration), left - duration
+            straight = forwards * cmath.exp(1j * needle.angle)
+            axes += [needle.moved(straight, (HOLD - turn_time + left) * k / 60).points() for k in range(1, 61)]
+            assert world.clearance(axes) > 3e-4 - 1e-9
 
 
 def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
