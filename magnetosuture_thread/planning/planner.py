@@ -542,7 +542,7 @@ class NeedlePlanner:
         goal, (least, greatest) = procedure.goals[index], procedure.windings[index]
         if not isinstance(goal, WindingGoal):
             return 0.0
-        clear = WRAP_LEAD if isinstance(goal, Wrap) else 0.5 * WELL_MET * (greatest - least)
+        clear = 2.0 * WRAP_LEAD if isinstance(goal, Wrap) else 0.5 * WELL_MET * (greatest - least)
         return left_to_wind((least + clear, greatest - clear), winding(thread, centre_of(self.scene, goal.around)))
 
     def _lattice_goal(
