@@ -232,7 +232,7 @@ class ClosedLoop:
         margins = result.margins
         slowdown = margins.friction.slowdown if margins else 1.0
         self.bridge.on_margins(stamp, margins is not None, slowdown, result.scene_version, now)
-        self._condition = replace(condition_of(result), drift=self._drift)
+        self._condition = replace(condition_of(result), drift=self._drift, age=now - stamp)
         if self.setup.coils.friction_feedback != "all":
             self._condition = replace(self._condition, slowdown=1.0)
         self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)

@@ -147,12 +147,13 @@ class NeedlePlannerNode(ManagedNode[NeedlePlannerSettings]):
         """Publish the velocity command of the procedure, if one runs."""
         try:
             pose = reading.needle_pose(message)
-            reading.check_pose_age(
-                pose.stamp, self.get_clock().now().nanoseconds * 1e-9, self.configured_settings.pose_timeout
-            )
+            now = self.get_clock().now().nanoseconds * 1e-9
+            reading.check_pose_age(pose.stamp, now, self.configured_settings.pose_timeout)
         except InvalidInputError as error:
             return self.refuse(error)
-        velocity = self._session.on_pose(pose.stamp, pose.tail, pose.heading, time.monotonic())
+        velocity = self._session.on_pose(
+            pose.stamp, pose.tail, pose.heading, time.monotonic(), max(0.0, now - pose.stamp)
+        )
         if velocity is not None:
             self._commands.publish(packed_twist(self.get_clock().now().to_msg(), velocity))
             self._moving = bool(velocity.any())

@@ -68,6 +68,7 @@ class ThreadCondition:
         drift: velocity of the needle across its chord, to the left, by what pulls it, which the bridge measures and
             compensates [m/s]; 0 if unknown.
         may_hold: whether the needle may be kept in place by commands while there is a problem; else it is left alone.
+        age: of the needle's pose when a command comes into force [s]; 0 if unknown.
     """
 
     vertices: Points | None = None
@@ -77,6 +78,7 @@ class ThreadCondition:
     problem: str = ""
     drift: float = 0.0
     may_hold: bool = True
+    age: float = 0.0
 
 
 class PendingPath(Protocol):
@@ -314,8 +316,8 @@ class ProcedureExecutor:
             if stamp - self._goal_since >= goal.time:
                 self._next_goal()
                 return None
-            held = stamp, middle, angle, self.procedure.limits[self.goal].speed, thread.slowdown, thread.drift
-            return self._tracker.compute_command(*held, hold=True).velocity
+            held = stamp, middle, angle, self.procedure.limits[self.goal].speed
+            return self._tracker.compute_command(*held, thread.slowdown, thread.drift, thread.age, hold=True).velocity
         # A thread may be wound or tight long before the end of the path, as its free end moves too.
         is_far = self.path.ends[self._reached] > self.travel + 2.0 * PROGRESS
         if isinstance(goal, Tighten) or (isinstance(goal, Wrap) and is_last):
@@ -352,7 +354,7 @@ class ProcedureExecutor:
         if (left := self.path.length - self._tracker.travel) < self.pursuit.left - PROGRESS:
             self.pursuit.detours, self.pursuit.left = 0, left
         at = stamp, middle, angle, self._allowed_speed(thread)
-        command = self._tracker.compute_command(*at, thread.slowdown, thread.drift)
+        command = self._tracker.compute_command(*at, thread.slowdown, thread.drift, thread.age)
         if command.done:
             self._at_end(goal, middle)
             return None
@@ -470,7 +472,7 @@ class ProcedureExecutor:
         limits = self.procedure.limits[self.goal]
         if self._holder is None:
             self._holder = PathTracker(self.planner.standing_path(middle, angle, limits), self.planner.axes)
-        at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift
+        at = stamp, middle, angle, limits.speed, thread.slowdown, thread.drift, thread.age
         return self._holder.compute_command(*at, hold=True).velocity
 
     def _replan(self, stamp: float, stopped: Vector, why: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import ClassVar, NamedTuple
 
@@ -468,7 +468,7 @@ class ProcedureSession:
         if not armed and (self.is_running or (self._executor is not None and self._executor.resumes)):
             self.pause("the coil bridge is not armed")
 
-    def on_pose(self, stamp: float, tail: Vector, heading: Vector, now: float) -> Vector | None:
+    def on_pose(self, stamp: float, tail: Vector, heading: Vector, now: float, age: float = 0.0) -> Vector | None:
         """Return the velocity commanded of the tip at a needle pose, shape (2,) [m/s]; None where nothing is commanded.
 
         A procedure that is paused by itself, for the thread, keeps the needle in place.
@@ -478,6 +478,7 @@ class ProcedureSession:
             tail: shape (2,) [m].
             heading: unit vector at the tail, shape (2,).
             now: a monotonic time [s].
+            age: of the pose now [s].
         """
         planner, executor = self._planner, self._executor
         radius = math.inf if planner is None else planner.scene.dish.radius
@@ -488,7 +489,7 @@ class ProcedureSession:
         if executor.path is None and (self.is_running or executor.resumes):
             # The needle has not been moved yet: what is found only now was there when a person began.
             self.known.accept_disturbances()
-        velocity = executor.update(stamp, tail, heading, self.known.condition(now))
+        velocity = executor.update(stamp, tail, heading, replace(self.known.condition(now), age=age))
         if self.is_running:
             middle, angle = planner.pose(tail, heading)
             near = body_clearance(float(middle[0]), float(middle[1]), angle, planner.body, planner.near)

@@ -32,7 +32,6 @@ TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, fr
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 # s; after the course has changed to the other side of an axis, in which the needle is turned faster
 CROSSING_TIME = 0.3
-CROSSING_GAIN, MAX_CROSSING_RATIO = 12.0, 4.0  # 1/s, and of the allowed speed: in place of TURN_GAIN, MAX_TURN_RATIO
 LEAD_LOOKAHEAD = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side it is thrown from
 THROWN_FOR = 0.1  # s; for which the pull is not compensated in a crossing
 LEAD_SHARE = 0.4  # of the smallest leeway up to a crossing, that the needle is kept aside before it at the most
@@ -104,6 +103,7 @@ class PathTracker:
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]
         self._stamp: float | None = None
         self._speed = 0.0
+        self._turning = 0.0  # rate at which the last command turns the needle [rad/s]
         self._integral = 0.0
         self._pull = 0.0  # across the needle, as a velocity: its peak, which is forgotten slowly [m/s]
         self._tack = 0.0  # error across the path for which the needle lies on the other side [m]; 0 if it does not
@@ -123,6 +123,7 @@ class PathTracker:
         speed: float,
         slowdown: float = 1.0,
         drift: float = 0.0,
+        age: float = 0.0,
         *,
         hold: bool = False,
     ) -> TrackingCommand:
@@ -135,13 +136,15 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
+            age: of the pose when the command comes into force [s]; until then the command before turns the needle.
             hold: the setpoint stands still, and is never done. The command is at least `MIN_HOLD_SPEED`: at a zero
                 command the coils are off, and compensate nothing.
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
         if not 0.0 < interval <= MAX_INTERVAL:
-            interval, self._speed = 0.0, 0.0
+            interval, self._speed, self._turning = 0.0, 0.0, 0.0
         self._stamp = stamp
+        angle += min(age, interval) * self._turning
         e = np.array([math.cos(angle), math.sin(angle)])
         stop, sense = self._stops[0]
         wanted, direction = self.path.at(self.travel)
@@ -181,9 +184,12 @@ class PathTracker:
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
         v = self.path.lever * self._speed * turning
         crosses = 0.0 <= stamp - self._crossed < CROSSING_TIME
-        gain, ratio = (CROSSING_GAIN, MAX_CROSSING_RATIO) if crosses else (TURN_GAIN, MAX_TURN_RATIO)
-        limit = ratio * speed
-        v += min(limit, max(-limit, raised * gain * self.path.lever * turn))
+        if crosses and interval:  # all at once, at the speed that the bridge allows
+            v += self.path.lever * turn / interval
+        else:
+            limit = MAX_TURN_RATIO * speed
+            v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
+        self._turning = slowdown * v / max(self.path.lever, 1e-9)
         if hold and math.hypot(u, v) < MIN_HOLD_SPEED:
             u, v = MIN_HOLD_SPEED, 0.0
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)

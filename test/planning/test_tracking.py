@@ -29,22 +29,28 @@ def path(angles: np.ndarray, step: float = 1e-4) -> BodyPath:
 
 
 def headings(
-    tracker: PathTracker, drift: float | Callable[[float], float], slowdown: float = 1.0, seconds: float = 60.0
+    tracker: PathTracker,
+    drift: float | Callable[[float], float],
+    slowdown: float = 1.0,
+    age: float = 0.0,
 ) -> np.ndarray:
-    """Return the headings of an ideal needle on a path, whose drift, also by heading, the coils compensate [rad]."""
+    """Return the headings of an ideal needle on a path, whose drift, also by heading, the coils compensate [rad].
+
+    A command comes into force when the pose that it answers has an age [s].
+    """
     middle, angle = tracker.path.at(0.0)
     found: list[float] = []
-    for k in range(round(seconds * RATE)):
+    before = np.zeros(2)
+    for k in range(round(60.0 * RATE)):
         measured = drift(angle) if callable(drift) else drift
-        command = tracker.compute_command(k / RATE, middle, angle, 0.002, slowdown, measured)
+        command = tracker.compute_command(k / RATE, middle, angle, 0.002, slowdown, measured, age)
         if command.done:
             return np.array(found)
-        e = np.array([math.cos(angle), math.sin(angle)])
-        along, across = (
-            slowdown * command.velocity @ e,
-            slowdown * (e[0] * command.velocity[1] - e[1] * command.velocity[0]),
-        )
-        middle, angle = middle + along * e / RATE, angle + across / tracker.path.lever / RATE
+        for velocity, time in ((before, age), (command.velocity, 1.0 / RATE - age)):
+            e = np.array([math.cos(angle), math.sin(angle)])
+            along, across = slowdown * velocity @ e, slowdown * (e[0] * velocity[1] - e[1] * velocity[0])
+            middle, angle = middle + time * along * e, angle + time * across / tracker.path.lever
+        before = command.velocity
         found.append(angle)
     raise AssertionError("the end of the path is not reached")
 
@@ -67,6 +73,14 @@ def test_on_a_long_way_along_an_axis_it_tacks_and_stays_close_to_its_path(axis: 
     # The error across the path is the sum of its ways to the side.
     error = np.abs(np.cumsum(0.002 / RATE * np.sin(off)))
     assert np.ptp(error) < 2.5 * TACK_SHARE * LEEWAY
+
+
+@pytest.mark.parametrize("age", [0.0, 0.02, 0.045])
+def test_an_axis_is_crossed_within_two_frames_and_no_farther_than_the_needle_stays_off_it(age: float):
+    off = headings(PathTracker(path(np.linspace(0.4, -0.4, 80)), AXES), 3e-3, age=age)
+    before, after = np.flatnonzero(off > 0.99 * MAX_AXIS_ANGLE)[-1], np.flatnonzero(off < -0.95 * MAX_AXIS_ANGLE)[0]
+    assert after - before <= 2
+    assert off[after : after + 6].min() > -1.05 * MAX_AXIS_ANGLE
 
 
 def test_no_heading_off_an_axis_takes_more_than_half_of_the_leeway():
