@@ -68,7 +68,7 @@ class ThreadCondition:
         drift: velocity of the needle across its chord, to the left, by what pulls it, which the bridge measures and
             compensates [m/s]; 0 if unknown.
         may_hold: whether the needle may be kept in place by commands while there is a problem; else it is left alone.
-        age: of the needle's pose when a command comes into force [s]; 0 if unknown.
+        age: of the needle's pose when a command is sent [s]; 0 if unknown.
     """
 
     vertices: Points | None = None

@@ -532,7 +532,7 @@ class NeedlePlanner:
             if not isinstance(goal, Wrap) or not len(found):
                 break
             short = self._left_to_wind(procedure, index, self.led(thread, found, speed))
-            if abs(short) <= WRAP_LEAD:
+            if abs(short) <= 0.5 * WRAP_LEAD:
                 break
             more += short
         return np.vstack([before, found]) if len(found) else found
@@ -542,7 +542,7 @@ class NeedlePlanner:
         goal, (least, greatest) = procedure.goals[index], procedure.windings[index]
         if not isinstance(goal, WindingGoal):
             return 0.0
-        clear = 2.0 * WRAP_LEAD if isinstance(goal, Wrap) else 0.5 * WELL_MET * (greatest - least)
+        clear = WRAP_LEAD if isinstance(goal, Wrap) else 0.5 * WELL_MET * (greatest - least)
         return left_to_wind((least + clear, greatest - clear), winding(thread, centre_of(self.scene, goal.around)))
 
     def _lattice_goal(

@@ -32,6 +32,7 @@ TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, fr
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 # s; after the course has changed to the other side of an axis, in which the needle is turned faster
 CROSSING_TIME = 0.3
+CROSSING_STEP = 0.05  # s; in which it is turned by all of the angle, a frame of a slow camera
 LEAD_LOOKAHEAD = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side it is thrown from
 THROWN_FOR = 0.1  # s; for which the pull is not compensated in a crossing
 LEAD_SHARE = 0.4  # of the smallest leeway up to a crossing, that the needle is kept aside before it at the most
@@ -103,7 +104,7 @@ class PathTracker:
         self._stops = [(float(path.travel[index]), sense) for index, sense in turning]
         self._stamp: float | None = None
         self._speed = 0.0
-        self._turning = 0.0  # rate at which the last command turns the needle [rad/s]
+        self._turns: deque[tuple[float, float]] = deque()  # of commands: in force from [s], rate of turning [rad/s]
         self._integral = 0.0
         self._pull = 0.0  # across the needle, as a velocity: its peak, which is forgotten slowly [m/s]
         self._tack = 0.0  # error across the path for which the needle lies on the other side [m]; 0 if it does not
@@ -136,15 +137,16 @@ class PathTracker:
             speed: of the tip that is allowed now [m/s].
             slowdown: factor on every velocity that the bridge applies.
             drift: velocity across the chord, to the left, that the bridge measures and compensates [m/s].
-            age: of the pose when the command comes into force [s]; until then the command before turns the needle.
+            age: of the pose when the command is sent [s]; until then the commands before turn the needle.
             hold: the setpoint stands still, and is never done. The command is at least `MIN_HOLD_SPEED`: at a zero
                 command the coils are off, and compensate nothing.
         """
         interval = 0.0 if self._stamp is None else stamp - self._stamp
         if not 0.0 < interval <= MAX_INTERVAL:
-            interval, self._speed, self._turning = 0.0, 0.0, 0.0
+            interval, self._speed = 0.0, 0.0
+            self._turns.clear()
         self._stamp = stamp
-        angle += min(age, interval) * self._turning
+        angle += self._turned(stamp, stamp + age)
         e = np.array([math.cos(angle), math.sin(angle)])
         stop, sense = self._stops[0]
         wanted, direction = self.path.at(self.travel)
@@ -184,12 +186,12 @@ class PathTracker:
         u = self._speed * drive + min(limit, max(-limit, ALONG_GAIN * along))
         v = self.path.lever * self._speed * turning
         crosses = 0.0 <= stamp - self._crossed < CROSSING_TIME
-        if crosses and interval:  # all at once, at the speed that the bridge allows
-            v += self.path.lever * turn / interval
+        if crosses and interval:  # all at once: by the next pose, at the earliest within `CROSSING_STEP`
+            v += self.path.lever * min(MAX_ANGLE, max(-MAX_ANGLE, turn)) / max(interval, CROSSING_STEP)
         else:
             limit = MAX_TURN_RATIO * speed
             v += min(limit, max(-limit, raised * TURN_GAIN * self.path.lever * turn))
-        self._turning = slowdown * v / max(self.path.lever, 1e-9)
+        self._turns.append((stamp + age, slowdown * v / max(self.path.lever, 1e-9)))
         if hold and math.hypot(u, v) < MIN_HOLD_SPEED:
             u, v = MIN_HOLD_SPEED, 0.0
         return TrackingCommand(u * e + v * np.array([-e[1], e[0]]), self.travel, size, False)
@@ -240,6 +242,16 @@ class PathTracker:
         here, held = self._nearest(angle)
         off = min(max(abs(here), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
         return min(1.0, held * off / self._pull)
+
+    def _turned(self, begin: float, end: float) -> float:
+        """Return by how much the commands before turn the needle from one time to another [rad]."""
+        while len(self._turns) > 1 and self._turns[1][0] <= begin:
+            self._turns.popleft()
+        ends = [*(since for since, _ in self._turns), math.inf][1:]
+        return sum(
+            rate * max(0.0, min(until, end) - max(since, begin))
+            for (since, rate), until in zip(self._turns, ends, strict=True)
+        )
 
     def _nearest(self, direction: float) -> tuple[float, float]:
         """Return the angle from the nearest axis [rad], and the velocity that is held for each radian [m/s]."""

@@ -325,7 +325,7 @@ def is_clear_turned(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.
 
         sqrt((k + r Phi^2 / 8 + |w| `turn_time` Phi)^2 + (r Phi / 2)^2)
 
-    One that is closer than that at t = 0 is not clear here, nor one that turns by more than a radian.
+    One that is closer than that at t = 0 is not clear here, nor one that turns by more than a radian, or is a point.
 
     Args:
         vx: velocity of the tip [m/s].
@@ -337,7 +337,7 @@ def is_clear_turned(vx: float, vy: float, needle: PosedNeedle, drift: float = 0.
     chord_x, chord_y = needle.chord_x, needle.chord_y
     along, across = vx * chord_x + vy * chord_y, -vx * chord_y + vy * chord_x - drift
     turn = body.turn * across * data.turn_time
-    if not abs(turn) < 1.0:
+    if body.turn == 0.0 or not abs(turn) < 1.0:
         return False
     swiftest, lever, speed = 0.0, 0.5 * body.chord, math.hypot(along, drift)
     for i in range(len(needle.points)):

@@ -264,15 +264,22 @@ class NeedleSafetyFilter:
         self.kinematics.moved(middle, EAST, 1e-3, 0.0, hold_time)
         self._added.time = None
 
-    def limit_turns(self, turn_time: float) -> None:
+    @checked_arguments("safety filter")
+    def limit_turns(self, turn_time: Annotated[float, bounded("s", 0.0, unlimited=True)]) -> None:
         """Certify motions from now on also as those of a needle that turns for no longer than a time.
+
+        Barriers that a user adds are checked for the constant motion all the same.
 
         Args:
             turn_time: for which it goes on turning at the most while nobody looks, as a field that is held also holds
                 its direction; no more than `hold_time` counts [s].
+
+        Raises:
+            ConfigurationError: the time is out of bounds.
         """
         self._data = self._data._replace(turn_time=min(turn_time, self.hold_time))
         self._pose = None
+        is_clear_turned(1e-3, 0.0, self._at(np.zeros(2), EAST), 0.0)  # compiled now, not in the first step
 
     def compiled_data(self) -> FilterData:
         """Return the filter for compiled loops.
@@ -380,6 +387,7 @@ class NeedleSafetyFilter:
             InvalidInputError: something is not finite.
         """
         velocity, needle = _checked_velocity(velocity), self._at(tail, heading)
+        drift = float(finite_array("drift", [drift], (1,), FINITE)[0])
         x, y = velocity.tolist()
         time, what, _ = safe_time(x, y, needle, drift)
         is_clear = what == NOTHING or (self._data.turn_time < self.hold_time and is_clear_turned(x, y, needle, drift))
