@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.keep_out import Needle, World, random_scene
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
 from magnetosuture_thread.scene import Dish, Scene, SceneShape
@@ -85,6 +85,33 @@ def test_a_turn_that_ends_keeps_clear_whenever_it_ends_and_is_let_through_where_
             straight = forwards * cmath.exp(1j * needle.angle)
             axes += [needle.moved(straight, (HOLD - turn_time + left) * k / 60).points() for k in range(1, 61)]
             assert world.clearance(axes) > 3e-4 - 1e-9
+
+
+def test_what_lies_between_the_ends_of_a_turn_stops_it():
+    """A post before the needle's tip is clear of it where the turn begins and where it ends, and not between."""
+    turn, turn_time, at = 0.3, 0.05, 2.12e-3
+    post = Disc((at * math.cos(0.5 * turn), at * math.sin(0.5 * turn)), 2e-5)
+    filtered = safety(
+        Scene(Dish(0.03), (SceneShape("post", "instrument", post),)), 0.004, keep=3e-4, turn_time=turn_time
+    )
+    ends = [np.array([math.cos(angle), math.sin(angle)]) for angle in (0.0, turn)]
+    assert min(filtered.clearance(-0.002 * e, e) for e in ends) > 3e-4
+    velocity = np.array([0.0, 0.002 * turn / turn_time])
+    assert filtered.safe_share(velocity, -0.002 * EAST, EAST)[0] < 0.5
+    assert filtered.safe_share(-velocity, -0.002 * EAST, EAST)[0] == 1.0
+
+
+def test_a_point_is_not_taken_for_a_needle_that_turns():
+    scene, at, velocity = Scene(Dish(0.05)), np.array([0.0, 0.0244]), np.array([0.0, 0.02])
+    turns, lasts = safety(scene, 0.0, turn_time=0.05), safety(scene, 0.0)
+    assert turns.safe_share(velocity, at, EAST) == lasts.safe_share(velocity, at, EAST)
+    assert turns.safe_share(velocity, at, EAST)[0] < 0.1
+
+
+@pytest.mark.parametrize("bad", [-1.0, math.nan])
+def test_a_turn_time_that_is_none_is_refused(bad: float):
+    with pytest.raises(ConfigurationError, match="turn_time"):
+        safety(Scene(), 0.004).limit_turns(bad)
 
 
 def test_one_who_is_too_near_may_slide_and_leave_and_goes_no_deeper():
