@@ -32,7 +32,7 @@ TACK_SHARE, MAX_TACK_ERROR = 0.7, 6e-4  # of the leeway, and m; off the path, fr
 AXIS_LOOKAHEAD = 2e-3  # m; of the path, in which the needle is slowed for an axis
 # s; after the course has changed to the other side of an axis, in which the needle is turned faster
 CROSSING_TIME = 0.3
-CROSSING_STEP = 0.05  # s; in which it is turned by all of the angle, a frame of a slow camera
+CROSSING_STEP = 0.05  # s; in which it is turned by all of the angle at the earliest, also by poses that come in bursts
 LEAD_LOOKAHEAD = 4e-3  # m; of the path before a crossing, in which the needle is kept to the side it is thrown from
 THROWN_FOR = 0.1  # s; for which the pull is not compensated in a crossing
 LEAD_SHARE = 0.4  # of the smallest leeway up to a crossing, that the needle is kept aside before it at the most

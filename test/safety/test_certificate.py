@@ -69,9 +69,10 @@ def test_a_turn_that_ends_keeps_clear_whenever_it_ends_and_is_let_through_where_
             if not 3e-4 < world.clearance([needle.points()]) < 2e-3:
                 continue
             forwards, sideways = random.uniform(-0.003, 0.003), random.uniform(-0.03, 0.03)
-            velocity = complex(forwards, sideways) * cmath.exp(1j * angle)
+            drift = float(random.choice([0.0, random.uniform(-0.003, 0.003)]))
+            velocity = complex(forwards, sideways + drift) * cmath.exp(1j * angle)
             tip = np.array([velocity.real, velocity.imag])
-            allowed, without = ends.safe_share(tip, *needle.pose())[0], lasts.safe_share(tip, *needle.pose())[0]
+            allowed, without = (each.safe_share(tip, *needle.pose(), drift)[0] for each in (ends, lasts))
             assert allowed in {without, 1.0}
             if allowed == without:
                 continue
@@ -79,11 +80,16 @@ def test_a_turn_that_ends_keeps_clear_whenever_it_ends_and_is_let_through_where_
             left, axes = turn_time, [needle.points()]
             for part in random.uniform(0.0, 1.0, 4):  # it turns, more slowly too, and then no more
                 rate, duration = float(random.uniform(0.0, 1.0)), float(part * left)
-                turned = complex(forwards, rate * sideways) * cmath.exp(1j * needle.angle)
-                axes += [needle.moved(turned, duration * k / 5).points() for k in range(1, 6)]
-                needle, left = needle.moved(turned, duration), left - duration
-            straight = forwards * cmath.exp(1j * needle.angle)
-            axes += [needle.moved(straight, (HOLD - turn_time + left) * k / 60).points() for k in range(1, 61)]
+                for _ in range(5):
+                    turned = complex(forwards, rate * sideways) * cmath.exp(1j * needle.angle)
+                    after = needle.moved(turned, duration / 5)
+                    after.middle += drift * duration / 5 * 1j * cmath.exp(0.5j * (needle.angle + after.angle))
+                    needle = after
+                    axes.append(needle.points())
+                left -= duration
+            straight = complex(forwards, drift) * cmath.exp(1j * needle.angle) * (HOLD - turn_time + left)
+            shift = np.array([straight.real, straight.imag])
+            axes += [needle.points() + k / 60 * shift for k in range(1, 61)]
             assert world.clearance(axes) > 3e-4 - 1e-9
 
 
