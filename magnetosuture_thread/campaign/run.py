@@ -349,8 +349,9 @@ def run_procedure(
             ahead = max(0.0, execution.travel - before)
             before = execution.travel
             way, weighted = way + ahead, weighted + ahead / frame.condition.slowdown
-            if execution.state in executor.ENDED:
-                reason = execution.reason
+            fault = loop.bridge.latch.latched_reason  # after which the needle rests for good
+            if fault or execution.state in executor.ENDED:
+                reason = fault or execution.reason
                 break
     except SolverError as error:
         reason = f"{type(error).__name__}: {error}"

@@ -193,10 +193,11 @@ class FollowMonitor:
 
     With the expected displacement E and the measured one M of the needle's middle, the poses are not the needle's where
 
-        |M - s E| > max(MAX_ERROR d, MAX_ERROR_SHARE |E|)    for every s from 0 (held) to the slack ratio,
+        |M - s E| > max(MAX_ERROR d, MAX_ERROR_SHARE |E|) + b    for every s from 0 (held) to the slack ratio,
 
     with the minimum distance d, or where the heading turns `MAX_TURN` farther than the field; both within
-    `MIN_WINDOW`. The needle stands still where
+    `MIN_WINDOW`. By b, the turn that both field and heading make times half of the chord, a needle moves that turns
+    about its tail, as its thread holds it. The needle stands still where
 
         M . E < MIN_SHARE |E|^2
 
@@ -210,10 +211,11 @@ class FollowMonitor:
     Args:
         min_distance: shorter displacements are not judged [m].
         slack_ratio: how many times as fast as expected the needle moves when the thread is slack.
+        lever: half of the needle's chord [m].
     """
 
-    def __init__(self, min_distance: float, slack_ratio: float = 1.0) -> None:
-        self._min_distance, self._slack_ratio = max(min_distance, MIN_DISTANCE), slack_ratio
+    def __init__(self, min_distance: float, slack_ratio: float = 1.0, lever: float = 0.0) -> None:
+        self._min_distance, self._slack_ratio, self._lever = max(min_distance, MIN_DISTANCE), slack_ratio, lever
         self._steps: deque[MotionStep] = deque()
         self._probed: float | None = None  # stamp of the pose that began the probe
         self._turned = 0.0  # by which the field was turned since
@@ -275,12 +277,13 @@ class FollowMonitor:
             f"needle does not follow: {1e3 * distance:.2g} mm expected, {1e3 * moved:.2g} mm measured in {span:.2g} s"
         )
         is_straight = abs(field_turn) < 0.5 * MAX_TURN  # else the direction of E depends on when the needle turned
-        if is_straight and error > max(MAX_ERROR * min_distance, MAX_ERROR_SHARE * distance):
+        about_tail = self._lever * min(abs(field_turn), abs(turn))
+        if is_straight and error > max(MAX_ERROR * min_distance, MAX_ERROR_SHARE * distance) + about_tail:
             return f"{text}, elsewhere"
         enough = span >= MIN_WINDOW and distance >= min_distance and bool(step.expected.any())
         if not enough or measured @ expected >= MIN_SHARE * distance**2:
             return ""
-        if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance:
+        if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance + about_tail:
             return f"{text}, elsewhere"
         self._suspicion, self._probed, self._turned = text, step.stamp, 0.0
         self._direction = math.copysign(1.0, field_turn)

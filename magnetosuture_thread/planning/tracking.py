@@ -20,7 +20,7 @@ LOOKAHEAD = 8e-4  # m; how far ahead on the path the needle is directed
 INTEGRAL_GAIN = 1.5  # 1/s; on the error across the path, for what makes the needle slip aside
 MAX_INTEGRAL = 8e-4  # m; of it
 ACCELERATION = 0.008  # m/s^2
-MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther from it
+MAX_LAG, MAX_ANGLE = 4e-4, 0.35  # m and rad; the setpoint waits for a needle that is farther behind, or off it
 ARRIVED, ALIGNED = 1.5e-4, 0.1  # m and rad; an end of the path, or a change of direction on it, is reached this close
 MAX_ALONG_RATIO, MAX_TURN_RATIO = 0.5, 2.0  # of the allowed speed, that corrections along and across may take
 MIN_SLOWDOWN = 0.3  # for which the gain on the direction is raised, so that the bridge's factor does not lower it
@@ -42,7 +42,7 @@ MIN_HOLD_SPEED = 1e-6  # m/s
 REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
 REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 STALL_TIME = 4.0  # s; for which the setpoint may wait for a needle that moves
-MAX_INTERVAL = 0.2  # s; after a longer gap between poses the setpoint has waited
+MAX_INTERVAL = 0.3  # s; for which a bridge follows a command at the most: after a longer gap the setpoint has waited
 
 
 @dataclass(frozen=True)
@@ -74,19 +74,20 @@ class PathTracker:
 
     and the tip's velocity is u along the chord and omega l / 2 across it. The setpoint's speed has a trapezoidal
     profile between the places where the needle changes between ahead and back. It waits while the needle is farther
-    from it than `MAX_LAG` along the path or `MAX_ANGLE`.
+    behind it than `MAX_LAG`, or `MAX_ANGLE` off its direction.
 
     Along the axes of the coils no currents give a force across the needle. Where something pulls it across its chord at
     the velocity d, by its peak of the last second or so (`PULL_DECAY`), theta stays off an axis by
     min(|d| / a, `MAX_AXIS_ANGLE`), with the velocity a that the coils hold for each radian, on the side of theta_p, and
     jumps to the other side when theta_p crosses, or while the needle is far off its path to the wrong side, as a ship
     tacks, but not within `MIN_TACK_TIME` of a crossing. In a crossing the needle is turned faster, as nothing
-    compensates the pull meanwhile: it is thrown
-    aside by about `THROWN_FOR` times the present d. Before one, the path is followed as far to the other side, without
-    the integral. All of theta - theta_p stays within what half of the path's leeway allows. Where d is more than the
-    coils compensate at the needle's direction, or at one of the path's within `AXIS_LOOKAHEAD`, the setpoint is slower,
-    down to `MIN_SPEED_SHARE`: a thread in a liquid pulls less when it is pulled slowly. Corrections of the direction
-    are raised by as much as the bridge slows them, within the same limits.
+    compensates the pull meanwhile: it is thrown aside by about `THROWN_FOR` times the present d. Before one, the path
+    is followed as far to the other side, without the integral. All of theta - theta_p stays within what half of the
+    path's leeway allows. Where d is more than the coils compensate at the needle's direction, or at one of the path's
+    within `AXIS_LOOKAHEAD`, and the rest, before the needle is steered back over `LOOKAHEAD`, displaces it by more than
+    `LEAD_SHARE` of the leeway there, the setpoint is slower, down to `MIN_SPEED_SHARE`: a thread in a liquid pulls less
+    when it is pulled slowly. Corrections of the direction are raised by as much as the bridge slows them, within the
+    same limits.
 
     Source: integral line-of-sight guidance of ships in a current, Borhaug, Pavlov and Pettersen 2008. Deviation: the
     integral is bounded, not saturated by its error; a turn on the spot does not correct the error across the path.
@@ -167,9 +168,9 @@ class PathTracker:
         off_axis = min(allowed, max(-allowed, self._off_axes(stamp, direction, course, across - lead)))
         turning = rate if off_axis == course else 0.0  # kept off an axis, the needle does not turn with the path
         course = off_axis
-        waits = hold or abs(along) > MAX_LAG or abs(turn + course) > MAX_ANGLE
+        waits = hold or sense * along > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
-        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle))
+        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle, speed))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, slower, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
         if not hold and stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):
@@ -231,17 +232,21 @@ class PathTracker:
                     return math.copysign(min(abs(drift) * THROWN_FOR, LEAD_SHARE * leeway), drift)
         return 0.0
 
-    def _compensated_share(self, angle: float) -> float:
-        """Return the share of the pull that coils compensate with ease, at a direction and those of the path ahead."""
+    def _compensated_share(self, angle: float, speed: float) -> float:
+        """Return the share of the pull that coils compensate with ease, at a direction and those of the path ahead.
+
+        It is 1 where the path is wide enough for what they do not compensate.
+        """
         if not self._axes or self._pull <= ALWAYS_OFF * self._nearest(angle)[1]:
             return 1.0
-        ahead = min(
-            abs(self._nearest(self.path.at(min(self.path.length, self.travel + way))[1])[0])
-            for way in np.linspace(0.0, AXIS_LOOKAHEAD, 5)
-        )
         here, held = self._nearest(angle)
-        off = min(max(abs(here), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
-        return min(1.0, held * off / self._pull)
+        ways = [min(self.path.length, self.travel + way) for way in np.linspace(0.0, AXIS_LOOKAHEAD, 5)]
+        ahead = min(abs(self._nearest(self.path.at(way)[1])[0]) for way in ways)
+        compensated = held * min(max(abs(here), ALWAYS_OFF), max(ahead, MAX_AXIS_ANGLE))
+        aside = (self._pull - compensated) * LOOKAHEAD / max(speed, 1e-9)
+        if aside <= LEAD_SHARE * min(map(self.path.leeway_at, ways)):
+            return 1.0
+        return min(1.0, compensated / self._pull)
 
     def _turned(self, begin: float, end: float) -> float:
         """Return by how much the commands before turn the needle from one time to another [rad]."""

@@ -23,6 +23,8 @@ from magnetosuture_thread.scene import WALL_NAME, Scene
 
 Vector = NDArray[np.float64]
 
+BEYOND = 1e-4  # m; of a gap's line, five times the noise of a tracked middle, at which nobody doubts the pass
+
 
 def solid_of(scene: Scene, name: str) -> shapely.Geometry:
     """Return a shape of a scene, or its wall, as a geometry [m]."""
@@ -68,6 +70,12 @@ def lines_of_pass(scene: Scene, goal: PassThrough) -> list[Points]:
         if abs(share := float(x * along[1] - y * along[0])) >= 0.5:
             found.append(line if share > 0.0 else line[::-1])
     return found
+
+
+def _ahead(line: Points) -> Vector:
+    """Return the unit vector to the left of a line, shape (2,)."""
+    x, y = (line[1] - line[0]) / math.dist(*line)
+    return np.array([-y, x])
 
 
 def crossings(line: Points, before: Vector, after: Vector) -> int:
@@ -148,9 +156,9 @@ class GoalJudge:
     """Follows needle and thread through the goals of a procedure.
 
     A pass is met when the middle of the needle's chord has crossed the line across the gap once more in its direction
-    than against it, since its goal began. A wrap is met when the thread, from its free end to the needle, winds about
-    the shape by the angles of all wraps about it so far; a thread that slips off undoes it. For the other goals of the
-    thread see `miss`.
+    than against it, since its goal began, and is beyond it by `BEYOND`. A wrap is met when the thread, from its free
+    end to the needle, winds about the shape by the angles of all wraps about it so far; a thread that slips off undoes
+    it. For the other goals of the thread see `miss`.
 
     Args:
         procedure: its goals.
@@ -165,7 +173,7 @@ class GoalJudge:
     def __init__(self, procedure: Procedure, scene: Scene) -> None:
         self._procedure, self._scene = procedure, scene
         self._lines = {
-            index: lines_of_pass(scene, goal)
+            index: [line + BEYOND * _ahead(line) for line in lines_of_pass(scene, goal)]
             for index, goal in enumerate(procedure.goals)
             if isinstance(goal, PassThrough)
         }

@@ -46,6 +46,15 @@ def test_poses_that_move_elsewhere_are_not_the_needles(moved: NDArray[np.float64
     assert watch(FollowMonitor(5e-4, slack_ratio=3.9), moved, follows_turns=True).endswith("elsewhere")
 
 
+@pytest.mark.parametrize(("share", "turns", "is_fault"), [(1.0, True, False), (2.5, True, True), (1.0, False, True)])
+def test_a_needle_may_turn_about_its_tail_and_not_move_farther(share: float, turns: bool, is_fault: bool):
+    """Half of its chord is 6 mm, and in 0.2 s its middle moves by 2.4 mm across what is expected."""
+    monitor, turn = FollowMonitor(5e-4, lever=6e-3), 0.1
+    aside = np.array([0.0, share * 6e-3 * turn])
+    steps = [MotionStep(0.05 * k, 0.05, EAST, turn, EAST + aside, turn * turns) for k in range(4)]
+    assert any(monitor.update(step).endswith("elsewhere") for step in steps) is is_fault
+
+
 def test_a_heading_that_turns_farther_than_the_field_is_not_the_needles():
     monitor = FollowMonitor(5e-4)
     faults = [monitor.update(MotionStep(1.0 + 0.05 * k, 0.05, EAST, -0.1, EAST, 0.4)) for k in range(4)]

@@ -98,6 +98,15 @@ def test_a_goal_is_met_by_how_the_thread_lies(goal: dict[str, Any], thread: np.n
     assert is_met or "mm" in judge.missing(0) or "degrees" in judge.missing(0)
 
 
+def test_a_needle_whose_measured_middle_trembles_on_the_line_has_not_passed_the_gap():
+    posts = [SceneShape(name, "instrument", Disc((x, 0.0), 0.002)) for name, x in (("left", -0.005), ("right", 0.005))]
+    goal = {"pass_through": {"between": ["left", "right"], "direction": [0.0, 1.0]}}
+    judge = GoalJudge(procedure(goal), Scene(Dish(0.05), tuple(posts)))
+    for y, is_met in ((-1e-3, False), (3e-5, False), (-3e-5, False), (2e-4, True), (5e-5, False)):
+        judge.update(np.array([0.0, y]), None)
+        assert judge.is_met is is_met
+
+
 def test_no_goal_of_the_thread_is_met_before_the_thread_is_known():
     judge = GoalJudge(procedure({"unwind": {"around": "post"}}), POST)
     judge.update(np.zeros(2), None)

@@ -101,6 +101,30 @@ def test_poses_at_uneven_intervals_do_not_throw_the_needle_about_in_a_crossing(i
     assert np.count_nonzero(np.diff(np.sign(off))) == 1
 
 
+def test_a_pull_slows_the_needle_only_where_its_path_is_narrow():
+    """The coils compensate a third of it, and the rest takes the needle 1.6 mm aside before it is steered back."""
+    made = path(np.full(60, 0.0))
+    wide = BodyPath(made.middles, made.angles, made.lever, np.full(60, 5e-3), made.ends)
+    times = [len(headings(PathTracker(each, AXES), 6e-3)) for each in (made, wide)]
+    assert times[0] >= 1.5 * times[1]
+    assert times[1] <= 1.3 * len(headings(PathTracker(wide), 6e-3))
+
+
+@pytest.mark.parametrize(("gap", "goes_on"), [(0.25, True), (0.5, False)])
+def test_the_setpoint_goes_on_while_frames_are_lost_for_as_long_as_a_command_lasts(gap: float, goes_on: bool):
+    """One that has stood still would call back a needle that has gone on."""
+    tracker = PathTracker(path(np.full(60, 0.3)))
+    for frame in range(20):
+        setpoint, angle = tracker.path.at(tracker.travel)
+        tracker.compute_command(frame / RATE, setpoint, angle, 0.002)
+    setpoint, angle = tracker.path.at(tracker.travel)
+    before = tracker.travel
+    carried = setpoint + 0.002 * gap * np.array([math.cos(angle), math.sin(angle)])
+    command = tracker.compute_command(19 / RATE + gap, carried, angle, 0.002)
+    assert (tracker.travel - before > 0.9 * 0.002 * gap) is goes_on
+    assert (float(command.velocity @ (carried - setpoint)) > 0.0) is goes_on
+
+
 def test_no_heading_off_an_axis_takes_more_than_half_of_the_leeway():
     narrow = path(np.full(80, 0.0))
     narrow = BodyPath(narrow.middles, narrow.angles, narrow.lever, np.full(80, 1e-4), narrow.ends)
