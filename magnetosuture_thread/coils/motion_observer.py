@@ -277,7 +277,7 @@ class FollowMonitor:
             f"needle does not follow: {1e3 * distance:.2g} mm expected, {1e3 * moved:.2g} mm measured in {span:.2g} s"
         )
         is_straight = abs(field_turn) < 0.5 * MAX_TURN  # else the direction of E depends on when the needle turned
-        about_tail = self._lever * min(abs(field_turn), abs(turn))
+        about_tail = self._lever * max(0.0, min(field_turn * math.copysign(1.0, turn), abs(turn)))
         if is_straight and error > max(MAX_ERROR * min_distance, MAX_ERROR_SHARE * distance) + about_tail:
             return f"{text}, elsewhere"
         enough = span >= MIN_WINDOW and distance >= min_distance and bool(step.expected.any())

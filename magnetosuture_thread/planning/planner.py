@@ -53,6 +53,7 @@ from magnetosuture_thread.planning.procedure import (
 )
 from magnetosuture_thread.planning.thread_ways import Candidate, ThreadRollout, candidates
 from magnetosuture_thread.planning.verdict import (
+    PASSED,
     GoalJudge,
     centre_of,
     gap_lines,
@@ -591,7 +592,7 @@ class NeedlePlanner:
                 dx, dy = x - 0.5 * (first[0] + second[0]), y - 0.5 * (first[1] + second[1])
                 ahead, aside = dy * across_x - dx * across_y, dx * across_x + dy * across_y
                 # Beyond the line by a step, so that nobody doubts the pass.
-                places |= (ahead >= self._step) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * width)
+                places |= (ahead >= self._step + PASSED) & (ahead <= 4.0 * self._step) & (np.abs(aside) <= 0.5 * width)
                 # The needle may be 0.8 rad off the direction of a gap while it passes.
                 headings |= np.abs(turn_of(DIRECTIONS - math.atan2(across_x, -across_y))) <= 0.8
             cuts = np.reshape(lines, (-1, 4))

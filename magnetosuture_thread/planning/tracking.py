@@ -42,7 +42,9 @@ MIN_HOLD_SPEED = 1e-6  # m/s
 REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
 REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 STALL_TIME = 4.0  # s; for which the setpoint may wait for a needle that moves
-MAX_INTERVAL = 0.3  # s; for which a bridge follows a command at the most: after a longer gap the setpoint has waited
+MAX_INTERVAL = (
+    0.3  # s; after a longer gap between poses the setpoint has waited: no shipped bridge follows a command longer
+)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ class PathTracker:
         course = off_axis
         waits = hold or sense * along > MAX_LAG or abs(turn + course) > MAX_ANGLE
         braked = math.sqrt(2.0 * ACCELERATION * max(stop - self.travel, 0.0))
-        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle, speed))
+        slower = speed * max(MIN_SPEED_SHARE, self._compensated_share(angle, slowdown * speed))
         self._speed = 0.0 if waits else min(self._speed + ACCELERATION * interval, slower, braked)
         self.travel = min(stop, self.travel + slowdown * self._speed * interval)
         if not hold and stop - self.travel < 1e-6 and abs(along) < ARRIVED and abs(turn) < ALIGNED + abs(course):

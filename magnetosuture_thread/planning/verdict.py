@@ -23,7 +23,7 @@ from magnetosuture_thread.scene import WALL_NAME, Scene
 
 Vector = NDArray[np.float64]
 
-BEYOND = 1e-4  # m; of a gap's line, five times the noise of a tracked middle, at which nobody doubts the pass
+PASSED = 4e-5  # m; off a gap's line, three times the noise of a tracked middle, from which on nobody doubts the pass
 
 
 def solid_of(scene: Scene, name: str) -> shapely.Geometry:
@@ -70,12 +70,6 @@ def lines_of_pass(scene: Scene, goal: PassThrough) -> list[Points]:
         if abs(share := float(x * along[1] - y * along[0])) >= 0.5:
             found.append(line if share > 0.0 else line[::-1])
     return found
-
-
-def _ahead(line: Points) -> Vector:
-    """Return the unit vector to the left of a line, shape (2,)."""
-    x, y = (line[1] - line[0]) / math.dist(*line)
-    return np.array([-y, x])
 
 
 def crossings(line: Points, before: Vector, after: Vector) -> int:
@@ -156,9 +150,9 @@ class GoalJudge:
     """Follows needle and thread through the goals of a procedure.
 
     A pass is met when the middle of the needle's chord has crossed the line across the gap once more in its direction
-    than against it, since its goal began, and is beyond it by `BEYOND`. A wrap is met when the thread, from its free
-    end to the needle, winds about the shape by the angles of all wraps about it so far; a thread that slips off undoes
-    it. For the other goals of the thread see `miss`.
+    than against it, since its goal began, and is off it by `PASSED`. A wrap is met when the thread, from its free end
+    to the needle, winds about the shape by the angles of all wraps about it so far; a thread that slips off undoes it.
+    For the other goals of the thread see `miss`.
 
     Args:
         procedure: its goals.
@@ -173,12 +167,12 @@ class GoalJudge:
     def __init__(self, procedure: Procedure, scene: Scene) -> None:
         self._procedure, self._scene = procedure, scene
         self._lines = {
-            index: [line + BEYOND * _ahead(line) for line in lines_of_pass(scene, goal)]
+            index: lines_of_pass(scene, goal)
             for index, goal in enumerate(procedure.goals)
             if isinstance(goal, PassThrough)
         }
         self._solids = {name: solid_of(scene, name) for name in procedure.lasting(len(procedure.goals))}
-        self._goal, self.crossed = 0, 0
+        self._goal, self.crossed, self._off_line = 0, 0, math.inf
         self._middle: Vector | None = None
         self.thread: Points | None = None
         self.windings = dict.fromkeys(self._solids, math.nan)
@@ -187,6 +181,7 @@ class GoalJudge:
         """Return a judge that goes on in another scene, which has the shapes of all goals."""
         other = GoalJudge(self._procedure, scene)
         other._goal, other.crossed, other._middle = self._goal, self.crossed, self._middle
+        other._off_line = self._off_line
         other.thread = self.thread
         return other
 
@@ -204,6 +199,9 @@ class GoalJudge:
         if self._middle is not None:
             lines, step = self._lines.get(self._goal, ()), (self._middle, middle)
             self.crossed += sum(crossings(line, *step) for line in lines)
+            self._off_line = min(
+                (shapely.LineString(line).distance(shapely.Point(middle)) for line in lines), default=math.inf
+            )
         self._middle = middle
         if thread is not None and len(thread) > 1:
             self.thread = thread
@@ -214,7 +212,7 @@ class GoalJudge:
         """Whether the present goal is met, as far as it is a pass or one of the thread."""
         goal = self._procedure.goals[self._goal]
         if isinstance(goal, PassThrough):
-            return self.crossed >= 1
+            return self.crossed >= 1 and self._off_line >= PASSED
         if isinstance(goal, Wrap):  # the angle trembles with the measured thread, in rad
             return abs(self.left_to_wind) <= 0.02
         return not isinstance(goal, ThreadGoal) or self.miss <= 1.0

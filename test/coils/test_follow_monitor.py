@@ -46,12 +46,14 @@ def test_poses_that_move_elsewhere_are_not_the_needles(moved: NDArray[np.float64
     assert watch(FollowMonitor(5e-4, slack_ratio=3.9), moved, follows_turns=True).endswith("elsewhere")
 
 
-@pytest.mark.parametrize(("share", "turns", "is_fault"), [(1.0, True, False), (2.5, True, True), (1.0, False, True)])
-def test_a_needle_may_turn_about_its_tail_and_not_move_farther(share: float, turns: bool, is_fault: bool):
+@pytest.mark.parametrize(
+    ("share", "turned", "is_fault"), [(1.0, 1.0, False), (2.5, 1.0, True), (1.0, 0.0, True), (1.0, -1.0, True)]
+)
+def test_a_needle_may_turn_about_its_tail_and_not_move_farther(share: float, turned: float, is_fault: bool):
     """Half of its chord is 6 mm, and in 0.2 s its middle moves by 2.4 mm across what is expected."""
     monitor, turn = FollowMonitor(5e-4, lever=6e-3), 0.1
     aside = np.array([0.0, share * 6e-3 * turn])
-    steps = [MotionStep(0.05 * k, 0.05, EAST, turn, EAST + aside, turn * turns) for k in range(4)]
+    steps = [MotionStep(0.05 * k, 0.05, EAST, turn, EAST + aside, turn * turned) for k in range(4)]
     assert any(monitor.update(step).endswith("elsewhere") for step in steps) is is_fault
 
 

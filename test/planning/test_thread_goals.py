@@ -102,7 +102,7 @@ def test_a_needle_whose_measured_middle_trembles_on_the_line_has_not_passed_the_
     posts = [SceneShape(name, "instrument", Disc((x, 0.0), 0.002)) for name, x in (("left", -0.005), ("right", 0.005))]
     goal = {"pass_through": {"between": ["left", "right"], "direction": [0.0, 1.0]}}
     judge = GoalJudge(procedure(goal), Scene(Dish(0.05), tuple(posts)))
-    for y, is_met in ((-1e-3, False), (3e-5, False), (-3e-5, False), (2e-4, True), (5e-5, False)):
+    for y, is_met in ((-1e-3, False), (3e-5, False), (-3e-5, False), (2e-5, False), (6e-5, True)):
         judge.update(np.array([0.0, y]), None)
         assert judge.is_met is is_met
 
