@@ -196,8 +196,8 @@ class FollowMonitor:
         |M - s E| > max(MAX_ERROR d, MAX_ERROR_SHARE |E|) + b    for every s from 0 (held) to the slack ratio,
 
     with the minimum distance d, or where the heading turns `MAX_TURN` farther than the field; both within
-    `MIN_WINDOW`. By b, the turn that both field and heading make times half of the chord, a needle moves that turns
-    about its tail, as its thread holds it. The needle stands still where
+    `MIN_WINDOW`. A needle that its thread holds turns about its tail: b is half of its chord times the turn that field
+    and heading share. The needle stands still where
 
         M . E < MIN_SHARE |E|^2
 

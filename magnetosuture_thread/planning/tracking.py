@@ -42,9 +42,7 @@ MIN_HOLD_SPEED = 1e-6  # m/s
 REST_TIME = 1.0  # s; a needle that is commanded and has not moved for this long rests
 REST_WAY = 5e-5  # m; of the tip, which a needle that moves covers in that time
 STALL_TIME = 4.0  # s; for which the setpoint may wait for a needle that moves
-MAX_INTERVAL = (
-    0.3  # s; after a longer gap between poses the setpoint has waited: no shipped bridge follows a command longer
-)
+MAX_INTERVAL = 0.3  # s; the longest `command_timeout` of shipped setups: after a longer gap the setpoint has waited
 
 
 @dataclass(frozen=True)

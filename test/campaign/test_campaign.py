@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,15 @@ def test_a_near_place_is_reached_by_the_whole_loop(first: RunResult):
     assert (first.figures.max_thread_penetration_m, first.figures.wrap_degrees) == (0.0, 0.0)
     assert first.figures.max_tension_n > 0.0
     assert (first.last_instants, first.closest_instant) == ((), None)
+
+
+def test_a_run_ends_at_a_fault_of_the_coil_bridge_and_names_it(hernia: Setup, short: Procedure):
+    """All coils are connected the wrong way round, so that the needle moves oppositely."""
+    drawn = vary(hernia, 3)
+    result = run_procedure(short, hernia, replace(drawn, coil_gains=-drawn.coil_gains))
+    assert not result.success
+    assert result.reason.startswith("needle does not follow")
+    assert result.simulated_s < 10.0
 
 
 def test_what_varies_stays_within_its_bounds_and_what_nodes_believe_does_not_vary(hernia: Setup):

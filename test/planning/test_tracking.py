@@ -102,7 +102,7 @@ def test_poses_at_uneven_intervals_do_not_throw_the_needle_about_in_a_crossing(i
 
 
 def test_a_pull_slows_the_needle_only_where_its_path_is_narrow():
-    """The coils compensate a third of it, and the rest takes the needle 1.6 mm aside before it is steered back."""
+    """The coils compensate a third of it, and the rest takes the needle 1.5 mm aside before it is steered back."""
     made = path(np.full(60, 0.0))
     wide = BodyPath(made.middles, made.angles, made.lever, np.full(60, 5e-3), made.ends)
     times = [len(headings(PathTracker(each, AXES), 6e-3)) for each in (made, wide)]
