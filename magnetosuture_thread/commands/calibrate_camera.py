@@ -44,15 +44,18 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     """
     source = FrameSource(options, terminal.log)
     every = max(1, -(-source.count // 50))  # evenly over a long bag or video
-    images = []
+    images, unused = [], ""
     for index, frame in enumerate(source):
         if index % every or frame.image is None:
             continue
         problem = frame.lens.problem_with(frame.image.shape) if frame.lens is not None else None
         if problem is not None and options.camera_info is not None:
             raise problem
+        unused = f"{problem}; it is not used" if problem is not None else unused
         images.append(np.asarray(frame.image if frame.lens is None or problem else frame.lens.undistorted(frame.image)))
     source.log_refused(terminal.log)
+    if unused:
+        terminal.log(unused)
     if not images:
         why = "; ".join(problem for problem, _ in source.problems.most_common(3))
         raise BagError(options.frames[0], f"holds no frame that can be read: {why}")

@@ -136,7 +136,9 @@ def test_a_picture_of_12_megapixels_is_measured_in_its_own_pixels(tmp_path: Path
     assert cli.main(["track", str(picture), "--json", str(file), *given]) == 0
     truth = json.loads((SAMPLES / "truth.json").read_text())["frames"][0]
     np.testing.assert_allclose(json.loads(file.read_text())[0]["tail_m"], np.array(truth["tail_mm"]) * 1e-3, atol=5e-5)
-    assert cv2.imread(str(overlay / "large.png")).shape == (3000, 4000, 3)
+    drawn = cv2.imread(str(overlay / "large.png"))
+    assert drawn is not None
+    assert drawn.shape == (3000, 4000, 3)
 
 
 @pytest.mark.parametrize(

@@ -131,6 +131,7 @@ def test_frames_of_a_topic_that_is_rectified_are_not_undistorted_again(graph):
             super().__init__(cli_args=["--ros-args", "--remap", rule], **options)
 
     case, _ = frame_of("distortion", 2, 31)
+    assert case.lens is not None
     node = graph.add(Remapped, scene="dish_35mm", confirm_frames=1)
     graph.publish(topics.CAMERA_INFO, camera_info(case.lens))
     graph.wait(lambda: node._lens is not None, "the lens")

@@ -71,7 +71,8 @@ def test_raw_images_of_every_encoding_have_their_colours(encoding: str, square: 
     rows = (planes * scale).astype(kind).view(np.uint8)
     padded = np.pad(rows, ((0, 0), (0, 6)), constant_values=255)
     image = unpack_image(padded.tobytes(), 8, 8, padded.shape[1], encoding, big_endian=kind[0] == ">")
-    assert (image.shape, image.dtype) == ((8, 8, 3), np.uint8)
+    assert image.shape == (8, 8, 3)
+    assert image.dtype == np.uint8
     np.testing.assert_allclose(image[3:5, 3:5].reshape(-1, 3), [np.multiply((BLUE, GREEN, RED), shown)] * 4, atol=3)
 
 
