@@ -74,7 +74,7 @@ def count_frame() -> Counter[tuple[str, str]]:
             message = CompressedImage(format="jpeg", data=jpeg.tobytes())
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(10**9 + 33_000_000 * k, 10**9)
             sys.setprofile(count if k == FRAMES else None)
-            nodes[0].on_compressed(message)
+            nodes[0].on_image(message)
             sys.setprofile(None)
         for node in nodes:
             node.destroy_node()

@@ -9,6 +9,7 @@ of the actuators.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import Enum
 
@@ -232,3 +233,8 @@ GROUND_TRUTH = (GROUND_TRUTH_NEEDLE, GROUND_TRUTH_THREAD, GROUND_TRUTH_PULL)
 SIMULATED = (*GROUND_TRUTH, TIP_SETPOINT, FAULT_REQUEST)
 ON_REQUEST = (FORECAST,)  # outputs that nobody publishes unless a parameter asks for them
 PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle planner, where there is one
+
+
+def is_rectified(topic: str) -> bool:
+    """Return whether a camera's topic is named as one of frames without distortion, as image_proc's image_rect."""
+    return re.search("(?:^|[/_])rect(?:ified)?(?:[/_]|$)", topic) is not None

@@ -2,7 +2,7 @@
 
 A file of a few bytes may ask for hours or gigabytes: compressed zeros, lists in lists, types in types, aliases. Every
 reader takes its bounds from here, and what is past them is refused in one line. With them the command reads or refuses
-each such file within 5 s and 300 MB.
+each such file within 5 s and 300 MB; a picture of `MAX_PIXELS` may take 550 MB where it has 16 bits a colour.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MAX_TABLE_BYTES = 20_000_000  # of measurements in a CSV file
 MAX_FILE_BYTES = 1 << 26  # of a picture or reference trajectory
 MAX_BLOCK_BYTES = 1 << 26  # of a message, or of a chunk of messages, packed or not
 MAX_BLOCK_RECORDS = 500_000  # of a chunk
-MAX_PIXELS = 10_000_000  # of a picture: one of 3840 x 2160 has 8.3 million
+MAX_PIXELS = 25_000_000  # of a picture: with 16 bits for each of three colours 150 MB
 MAX_YAML_DEPTH = 20
 MAX_YAML_EVENTS = 500_000  # values, keys, beginnings and ends of lists
 MAX_NESTING = 32  # of message types in each other

@@ -39,6 +39,7 @@ OWNED = (
     ("upath", {"files"}),
     ("shapely", {"geometry", "scene", "planning", "campaign"}),
     ("jinja2 plotly", {"evaluation"}),
+    ("simplejpeg", {"vision"}),
     ("matplotlib", {"evaluation", "calibration", "reproduce"}),
     ("rich", {"commands", "evaluation", "calibration", "reproduce"}),
     (f"{OF_ROS} nav_msgs rosgraph_msgs sensor_msgs std_msgs std_srvs visualization_msgs", {"nodes"}),

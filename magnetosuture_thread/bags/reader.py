@@ -398,6 +398,10 @@ class Bag:
         """Return the remapped topic of a connection."""
         return self._names[connection.topic]
 
+    def recorded_name(self, topic: str) -> str:
+        """Return the name that a topic was recorded under."""
+        return next(recorded for recorded, name in self._names.items() if name == topic)
+
     def _load(self, item: StoredMessage, refused: Counter[str] | None, only: str = "") -> RecordedMessage | None:
         """Return a message; None, and count it, if it cannot be decompressed or has another serialization."""
         connection = item.connection

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.interface import CAMERA, DISH_FRAME, Channel
+from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DISH_FRAME, Channel, is_rectified
 from magnetosuture_thread.messages.cdr import is_in_dish_frame, pack, stamp_and_frame
 from magnetosuture_thread.messages.markers import ADD, LINE_STRIP
 
@@ -62,14 +62,16 @@ class Recording:
         damage: as the bag's.
         unchecked: as the bag's.
         unverified: as the bag's.
-        remarks: as the bag's.
+        remarks: as the bag's, and that frames are rectified.
+        rectified: the camera's recorded topic where its frames are rectified, as by image_proc: then no lens is to be
+            undone, and the bag's camera_info is left out; else empty.
     """
 
     def __init__(self, bag: Bag, *, dish_frame: str = DISH_FRAME) -> None:
         self.path = bag.path
         self.notes, self.start, self.duration = bag.notes, bag.start, bag.duration
         self.damage, self.unchecked = bag.damage, bag.unchecked
-        self.unverified, self.remarks = bag.unverified, bag.remarks
+        self.unverified, self.remarks = bag.unverified, list(bag.remarks)
         self.refused: Counter[str] = Counter()
         self.unfit: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
@@ -83,6 +85,11 @@ class Recording:
             self.counts[channel.recorded] = bag.counts[topic]
         cameras = [channel for channel in CAMERA.values() if self.counts.get(channel.recorded)]
         self.camera: Channel | None = max(cameras, key=lambda c: self.counts[c.recorded], default=None)
+        topic = bag.recorded_name(self._topics[self.camera]) if self.camera is not None else ""
+        self.rectified = topic if is_rectified(topic) else ""
+        if self.rectified and self._topics.pop(CAMERA_INFO, None) is not None:
+            del self.counts[CAMERA_INFO.recorded]
+            self.remarks.append(f"{topic} is rectified: the lens of {CAMERA_INFO.recorded} is not undone again")
 
     def require(self, channel: Channel) -> None:
         """Raise `BagError` unless the bag has messages for a channel."""

@@ -13,7 +13,6 @@ from magnetosuture_thread.commands.track import FrameSource
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.texts import one_line
 from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
-from magnetosuture_thread.vision.lens import read_lens
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -43,21 +42,23 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
     node.
     """
-    given = read_lens(options.camera_info) if options.camera_info is not None else None
-    source = FrameSource(options.frames, dict(options.remap), terminal.log)
-    every = -(-source.count // 50)  # evenly over a long bag
-    images = []
+    source = FrameSource(options, terminal.log)
+    every = max(1, -(-source.count // 50))  # evenly over a long bag or video
+    images, unused = [], ""
     for index, frame in enumerate(source):
         if index % every or frame.image is None:
             continue
-        lens = given or frame.lens
-        problem = lens.problem_with(frame.image.shape) if lens is not None else None
-        if problem is not None and given is not None:
+        problem = frame.lens.problem_with(frame.image.shape) if frame.lens is not None else None
+        if problem is not None and options.camera_info is not None:
             raise problem
-        images.append(np.asarray(frame.image if lens is None or problem else lens.undistorted(frame.image)))
+        unused = f"{problem}; it is not used" if problem is not None else unused
+        images.append(np.asarray(frame.image if frame.lens is None or problem else frame.lens.undistorted(frame.image)))
     source.log_refused(terminal.log)
+    if unused:
+        terminal.log(unused)
     if not images:
-        raise BagError(options.frames[0], "holds no frame that can be read")
+        why = "; ".join(problem for problem, _ in source.problems.most_common(3))
+        raise BagError(options.frames[0], f"holds no frame that can be read: {why}")
     by_markers = options.markers is not None
     if by_markers:
         found = calibrate_by_markers(images, options.dish_diameter, *options.markers)

@@ -143,9 +143,13 @@ def add_workers(parser: argparse._ActionsContainer, default: int = 1, note: str 
 
 
 def add_frames(parser: argparse.ArgumentParser) -> None:
-    """Add the argument FRAMES, --remap for those of a bag, and the camera's lens."""
-    parser.add_argument("frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, or a bag")
+    """Add the argument FRAMES, --remap for those of a bag, --rate for those of a video, and the camera's lens."""
+    parser.add_argument(
+        "frames", type=Path, nargs="+", metavar="FRAMES", help="pictures, a folder of them, a video, or a bag"
+    )
     add_remap(parser)
+    rate = "frames a second of a video (default: its own) or of a folder (default: 30)"
+    parser.add_argument("--rate", type=number_argument(0.01, 1e4), metavar="HZ", help=rate)
     lens = "the lens, as ROS's camera_calibration_parsers writes it (YAML; default: a bag's camera_info)"
     parser.add_argument("--camera-info", type=Path, metavar="FILE", help=lens)
 

@@ -42,7 +42,7 @@ from magnetosuture_thread.setups import Setup, read_setup
 from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings, parse_material
 from magnetosuture_thread.thread_observation import ThreadObservation
-from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
 from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up
 from magnetosuture_thread.workers import Log, Progress
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 MAX_LENGTH_RATIO, MIN_LENGTH_RATIO = 3.0, 0.2  # of the setup's thread; a seen one beyond is not of this setup
 # Why frames and poses are refused, as it is counted.
-NOT_FOUND, BROKEN, NOT_NEWER = "no needle for sure", "a broken picture", "a stamp not newer than the last"
+NOT_FOUND, NOT_NEWER = "no needle for sure", "a stamp not newer than the last"
 CHANGING = (interface.SCENE, interface.MATERIAL)  # channels on which a bag records changes of scene and thread
 _NOTHING, _NO_FORCE = np.empty((0, 2)), np.empty(0)
 _TRUE, _SEEN = interface.GROUND_TRUTH_THREAD.recorded, interface.MEASURED_THREAD.recorded
@@ -73,10 +73,7 @@ def read_image(record: RecordedMessage) -> NDArray[np.uint8]:
         BagError: the message cannot be decoded.
         InvalidInputError: the image is broken.
     """
-    message = record.decode()
-    if record.type_name == interface.COMPRESSED_IMAGE.type_name:
-        return decode_image(message.data)
-    return np.asarray(unpack_image(message.data, message.height, message.width, message.step, message.encoding))
+    return image_of(record.decode())
 
 
 def chosen_source(recording: Recording, source: str) -> str:
@@ -276,21 +273,20 @@ class ObservationReader(Iterator[Observation]):
     def _frame(self, record: RecordedMessage, tracker: TrackerSession) -> Observation:
         """Return what a camera frame says, as `thread_model` would get it."""
         self.count += 1
-        stamp, kind = stamp_of(record), NOT_FOUND
+        stamp = stamp_of(record)
         try:
             image = read_image(record)
         except InvalidInputError as error:
             began = time.perf_counter()
-            seen, kind = tracker.on_broken(error), BROKEN
+            seen = tracker.on_broken(error)
         else:
             began = time.perf_counter()
             seen = tracker.on_image(stamp * 1e-9, image)
-            if seen.problem is not None:
-                kind = NOT_NEWER if seen.problem.field == "image.stamp" else BROKEN
         taken = time.perf_counter() - began
         self.on_frame(stamp, seen)
         if not seen.tracked:
-            self.refused[kind] += 1
+            kind = NOT_FOUND if seen.problem is None else str(seen.problem)
+            self.refused[NOT_NEWER if kind.startswith("image.stamp") else kind] += 1
             return Observation(stamp, reason=seen.track.reason, processing=taken)
         self.found += 1
         return Observation(

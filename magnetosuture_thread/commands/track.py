@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,7 @@ from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
 from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
+from magnetosuture_thread.vision.video import VIDEOS, Video
 from magnetosuture_thread.workers import Log
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -59,24 +62,28 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find needle and thread in camera frames, without a graph.
 
-    FRAMES are pictures, a folder of them, or a bag. Pictures are searched one by one; a bag's frames are followed
-    over time, as the node vision_tracker does.
+    FRAMES are pictures, a folder of them, a video, or a bag. Pictures that are named are searched one by one; the
+    frames of a bag, a video or a folder are followed over time, as the node vision_tracker does.
 
-    --json writes a list with an entry for each frame: file (for a bag, topic and stamp), status (tracked, lost
-    or searching) and its reason, tail_m, tip_m and heading_rad (the tangent at the tail), curvature_per_m
-    (positive to the left), thread_m from the tail on, all in the dish frame, needle_length_m as measured over
-    the first frames of a bag, pieces of the thread (points_m, deviation_m across, why their ends are ends,
-    arc_length_m of the first point at least and at most) and whether they are complete, confidence from 0 to 1,
-    stamp_s, and time_s, the processor time to search the frame, on one core, without reading and decoding it;
-    all is compiled before. What has no value is null.
+    --json writes a list with an entry for each frame: file (for a bag or video, with the stamp), status (tracked,
+    lost or searching) and its reason, warning (of the dish's scale and tilt, and of the lens), tail_m, tip_m and
+    heading_rad (the tangent at the tail), curvature_per_m (positive to the left), thread_m from the tail on, all
+    in the dish frame, needle_length_m as measured over the first frames that follow one another, pieces of the
+    thread (points_m, deviation_m across, why their ends are ends, arc_length_m of the first point at least and at
+    most) and whether they are complete, confidence from 0 to 1, stamp_s, and time_s, the processor time to search
+    the frame, on one core, without reading and decoding it; all is compiled before. What has no value is null.
+
+    Where no frame gives a pose the command fails.
     """
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
     if options.centre is not None:
         view["dish_centre_px"] = tuple(options.centre)
     settings = replace(setup.vision, **view)
-    given = read_lens(options.camera_info) if options.camera_info is not None else None
-    source = FrameSource(options.frames, dict(options.remap), terminal.log)
+    source = FrameSource(options, terminal.log)
+    if source.is_sequence and source.names:
+        how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
+        terminal.log(f"{options.frames[0]} is {how}")
     tracker = VisionTracker(settings, setup.scene)
     warm_up()
     rows = []
@@ -87,29 +94,30 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
         nullcontext() if options.overlay is None else OverlayWriter(options.overlay, source.rate()) as writer,
     ):
         for index, frame in enumerate(source):
-            lens = given or frame.lens
-            tracker.set_lens(lens)
+            tracker.set_lens(frame.lens)
             began = time.thread_time()
             seen = _look(tracker, frame, source.is_sequence)
             unverified = {"unverified": source.unverified} if source.unverified else {}
             rows.append(_row(frame, seen, time.thread_time() - began) | unverified)
             if writer is not None and frame.image is not None:
                 picture = frame.image
-                if lens is not None and lens.problem_with(picture.shape) is None:
-                    picture = lens.undistorted(picture)
+                if frame.lens is not None and frame.lens.problem_with(picture.shape) is None:
+                    picture = frame.lens.undistorted(picture)
                 drawn = draw_overlay(picture, seen, settings.needle_length, frame.name)
                 if seen.view is not None:
                     draw_dish(drawn, seen.view.centre_px, setup.scene.dish.radius / seen.view.metres_per_pixel)
-                writer.write(f"frame_{index:06d}" if source.is_sequence else files[index], drawn)
+                writer.write(files[index] if files else f"frame_{index:06d}", drawn)
             advance((index + 1) / max(source.count, 1))
     source.log_refused(terminal.log)
     terminal.print(_table(rows))
+    for warning, count in Counter(row["warning"] for row in rows if row["warning"]).most_common():
+        terminal.log(f"{warning}: {pluralize(count, 'frame')}")
     if rows:
         counts = ", ".join(f"{n} {status}" for status, n in Counter(row["status"] for row in rows).most_common())
         median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
         terminal.log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
     command.write_json(options.json, rows)
-    return command.DONE
+    return command.DONE if any(row["status"] == State.TRACKED.value for row in rows) else command.FAILED
 
 
 @dataclass(frozen=True)
@@ -117,12 +125,12 @@ class FrameFile:
     """One frame.
 
     Attributes:
-        name: the file's, with its folders where two have the same, numbered where a file is given twice; or topic and
-            stamp.
+        name: the file's, with its folders where two have the same, numbered where a file is given twice; or topic or
+            video and stamp.
         image: None if it is broken.
         problem: why it is; else empty.
-        stamp: when it was taken [s]; None where nothing tells.
-        lens: of a bag's camera, by the last camera_info before the frame; None if there is none that can be used.
+        stamp: when it was taken [s], of a video or folder after its first frame; None where nothing tells.
+        lens: the given one, or that of the last camera_info before the frame; None if there is none that can be used.
     """
 
     name: str
@@ -133,40 +141,54 @@ class FrameFile:
 
 
 class FrameSource:
-    """The frames at given paths: files in the order given, a folder by name, a bag by time.
+    """The frames at given paths: pictures in the order given, those of a folder by name, of a video or bag by time.
 
     Args:
-        paths: picture files, one folder of pictures, or one bag.
-        remap: new name of a bag's topic by its recorded name.
+        options: of `command.add_frames`.
         log: called with a line for a person on what of a bag is damaged or not checked.
 
     Attributes:
         count: number of frames.
-        names: of picture files; empty for a bag.
-        is_sequence: whether the frames follow one another in time, as in a bag.
+        names: of picture files; empty for a bag or video.
+        is_sequence: whether the frames follow one another in time: those of a bag, a video, or one folder.
         unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
+        problems: why frames that were gone through could not be taken, with their number.
 
     Raises:
-        BagError: a path does not exist, a folder holds no pictures, or a bag cannot be used.
+        BagError: a path does not exist, a folder holds no pictures, or a bag or video cannot be used.
+        InvalidInputError: the lens cannot be used.
     """
 
-    def __init__(self, paths: Sequence[Path], remap: Mapping[str, str] | None, log: Log) -> None:
+    def __init__(self, options: argparse.Namespace, log: Log) -> None:
+        paths: list[Path] = options.frames
+        self._path = paths[0]
+        self._lens = read_lens(options.camera_info) if options.camera_info is not None else None
         self._files: list[Path] = []
         self._recording: Recording | None = None
+        self._video: Video | None = None
         self._lens_problems: Counter[str] = Counter()
-        self.count, self.unverified = 0, ""
+        self.problems: Counter[str] = Counter()
+        self.count, self.unverified, self._rate = 0, "", options.rate or 30.0
         for path in paths:
             inside = _files_at(path)
-            if not any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside)):
+            is_video = path.suffix.lower() in VIDEOS and not path.is_dir()
+            is_bag = any(file.name.endswith((*STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)) for file in (path, *inside))
+            if not (is_bag or is_video):
                 self._files += inside
                 self.count = len(self._files)
             elif len(paths) > 1:
-                raise BagError(path, "is a bag; expected it alone, without other frames")
+                raise BagError(path, f"is a {'bag' if is_bag else 'video'}; expected it alone, without other frames")
+            elif is_bag:
+                self._open(Bag(path, remap=dict(options.remap)), log)
             else:
-                self._open(Bag(path, remap=remap), log)
-        self.is_sequence = self._recording is not None
-        if remap and not self.is_sequence:
+                self._video = Video(path, options.rate)
+                self._rate, self.count = self._video.rate, self._video.count
+        is_folder = len(paths) == 1 and bool(self._files) and paths[0].is_dir()
+        self.is_sequence = is_folder or not self._files
+        if options.remap and self._recording is None:
             raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
+        if options.rate is not None and not (is_folder or self._video):
+            raise BagError(paths[0], "is no video and no folder, so --rate has no meaning for it")
         names = [file.name for file in self._files]
         unique = len(set(names)) == len(names)
         self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
@@ -175,26 +197,45 @@ class FrameSource:
         recording = self._recording = Recording(bag)
         self.unverified = bag.unverified
         doubt = f"is unverified: {bag.unverified}" if bag.unverified else bag.unchecked
-        for line in (str(bag.damage or ""), doubt, *bag.remarks):
+        for line in (str(bag.damage or ""), doubt, *recording.remarks):
             if line:
                 log(f"{recording.path} {line}")
         if recording.camera is None:
             topics, present = " or ".join(c.recorded for c in CAMERA.values()), ", ".join(sorted(bag.counts))
             problem = f"holds no camera frames; expected some on {topics}; its topics: {present}"
             raise BagError(recording.path, problem)
+        if recording.rectified and self._lens is not None:
+            raise BagError(recording.path, f"has rectified frames on {recording.rectified}; omit --camera-info")
         self.count = recording.counts[recording.camera.recorded]
 
     def __iter__(self) -> Iterator[FrameFile]:
         """Go through the frames."""
         if self._recording is not None:
             yield from self._recorded(self._recording)
-        for name, file in zip(self.names, self._files, strict=True):
-            try:
-                yield FrameFile(name, decode_image(read_regular(file, MAX_FILE_BYTES)))
-            except OSError as error:
-                yield FrameFile(name, None, f"cannot be read: {error.strerror}")
-            except InvalidInputError as error:
-                yield FrameFile(name, None, str(error))
+        if self._video is not None:
+            yield from self._filmed(self._video)
+        for index, (name, file) in enumerate(zip(self.names, self._files, strict=True)):
+            stamp = index / self._rate if self.is_sequence else None
+            yield self._frame(name, partial(_read_picture, file), stamp, self._lens)
+
+    def _frame(self, name: str, read: Callable[[], np.ndarray], stamp: float | None, lens: Lens | None) -> FrameFile:
+        """Return a frame, or why it cannot be read."""
+        try:
+            return FrameFile(name, read(), "", stamp, lens)
+        except OSError as error:
+            problem = f"cannot be read: {error.strerror}"
+        except (BagError, InvalidInputError) as error:
+            problem = str(error)
+        self.problems[problem] += 1
+        return FrameFile(name, None, problem, stamp, lens)
+
+    def _filmed(self, video: Video) -> Iterator[FrameFile]:
+        index = -1
+        for index, image in enumerate(video.frames()):
+            stamp = index / video.rate
+            yield FrameFile(f"{self._path.name} {stamp:.6f}", image, "", stamp, self._lens)
+        if index + 1 < self.count:
+            self.problems[f"{self._path} is damaged"] += self.count - index - 1
 
     def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
         lens: Lens | None = None
@@ -210,22 +251,20 @@ class FrameSource:
                 continue
             stamp = stamp_of(record) * 1e-9
             name = f"{record.topic} {stamp:.6f}"
-            try:
-                yield FrameFile(name, read_image(record), "", stamp, lens)
-            except (BagError, InvalidInputError) as error:
-                yield FrameFile(name, None, str(error), stamp, lens)
+            yield self._frame(name, partial(read_image, record), stamp, self._lens or lens)
 
     def log_refused(self, log: Log) -> None:
-        """Log why frames of a bag could not be taken, once all have been gone through."""
-        for reason, count in (self._recording.refused if self._recording is not None else {}).items():
+        """Log why frames could not be taken, once all have been gone through."""
+        refused = self._recording.refused if self._recording is not None else Counter[str]()
+        for reason, count in (refused + self.problems).items():
             log(f"{reason}: {pluralize(count, 'frame')} left out")
         for problem in self._lens_problems:
             log(f"{problem}: frames are taken as they are")
 
     def rate(self) -> float:
-        """Return the frame rate of a bag, by the median interval of its first frames' stamps; 30 for pictures."""
+        """Return the frame rate; of a bag by the median interval of its first frames' stamps."""
         if self._recording is None or self._recording.camera is None:
-            return 30.0
+            return self._rate
         stamps = [stamp_of(record) for record in islice(self._recording.records([self._recording.camera]), 300)]
         intervals = np.diff(stamps) * 1e-9
         if not np.any(intervals > 0.0):
@@ -234,15 +273,24 @@ class FrameSource:
         return min(240.0, max(0.1, round(1.0 / float(np.median(intervals[intervals > 0.0])), 2)))
 
 
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts frame_2 before frame_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _read_picture(file: Path) -> np.ndarray:
+    return decode_image(read_regular(file, MAX_FILE_BYTES))
+
+
 def _files_at(path: Path) -> list[Path]:
     """Return a file itself, or what may be frames in a folder: pictures, or the files of a bag."""
     try:
         path.stat()
         if not path.is_dir():
             return [path]
-        inside = sorted(path.iterdir())
+        inside = sorted(path.iterdir(), key=_natural)
     except FileNotFoundError:
-        raise BagError(path, "does not exist; expected pictures, a folder of them, or a bag") from None
+        raise BagError(path, "does not exist; expected pictures, a folder of them, a video, or a bag") from None
     except (OSError, ValueError) as error:
         raise BagError(path, f"cannot be read: {error}") from None
     endings = (*PICTURES, *STORAGE_SUFFIXES, *COMPRESSED_SUFFIXES)

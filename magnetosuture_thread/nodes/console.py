@@ -38,7 +38,7 @@ from magnetosuture_thread.planning.procedure import read_procedure
 from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.texts import shortened
-from magnetosuture_thread.vision.images import unpack_image
+from magnetosuture_thread.vision.images import image_of
 
 NAME = "console"
 RIG = "rig_simulator"
@@ -271,8 +271,7 @@ def _compressed(message: CompressedImage) -> bytes:
 
 
 def _encoded(message: Image) -> bytes:
-    image = unpack_image(message.data, message.height, message.width, message.step, message.encoding)
-    return encode_jpeg(image, 80).tobytes()
+    return encode_jpeg(image_of(message), 80).tobytes()
 
 
 class GraphHost:

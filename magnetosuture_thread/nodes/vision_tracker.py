@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -16,7 +15,7 @@ from magnetosuture_thread.messages import reading
 from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
-from magnetosuture_thread.vision.images import decode_image, unpack_image
+from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import FrameMeasurement, State, Track, TrackerSession, no_pose, warm_up
@@ -50,18 +49,15 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         """Load the kernels, and subscribe to the camera."""
         with self.health.load("the tracker's kernels"):
             warm_up()
-        self._start_session(settings, self._scene.load(settings.scene))
         self._states = self.held(topics.TRACKER_STATE.publisher(self))
         self._outputs = {
             interface.NEEDLE_POSE: self.held(topics.NEEDLE_POSE.publisher(self)),
             interface.THREAD_OBSERVATION: self.held(topics.THREAD_OBSERVATION.publisher(self)),
             interface.MEASURED_THREAD: self.held(topics.MEASURED_THREAD.publisher(self)),
         }
-        if settings.image_transport == "compressed":
-            camera = topics.COMPRESSED_IMAGE.subscribe(self, self.while_active(self.on_compressed))
-        else:
-            camera = topics.IMAGE.subscribe(self, self.while_active(self.on_image))
-        self._camera = self.held(camera).topic_name
+        topic = topics.COMPRESSED_IMAGE if settings.image_transport == "compressed" else topics.IMAGE
+        self._camera = self.held(topic.subscribe(self, self.while_active(self.on_image))).topic_name
+        self._start_session(settings, self._scene.load(settings.scene))
         # Simulated time may stand still; that the camera is silent must be noticed all the same.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.held(self.create_timer(0.5 * SILENCE, self.while_active(self.on_watch), clock=steady))
@@ -88,15 +84,6 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         elif self.settings is not None:
             self._start_session(self.settings, scene)
 
-    def on_compressed(self, message: CompressedImage) -> None:
-        """Track the needle in a JPEG or PNG frame."""
-        self._take(message, lambda: decode_image(message.data))
-
-    def on_image(self, message: Image) -> None:
-        """Track the needle in a raw frame."""
-        size = message.height, message.width, message.step
-        self._take(message, lambda: unpack_image(message.data, *size, message.encoding))
-
     def on_camera_info(self, message: CameraInfo) -> None:
         """Undo the distortion of the camera's lens; frames are taken as they are where its parameters are invalid."""
         try:
@@ -105,7 +92,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             self._lens, self._lens_problem = None, str(error)
             self.refuse(error)
         if self._session is not None:
-            self._session.set_lens(self._lens)
+            self._set_lens(self._session)
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""
@@ -120,9 +107,14 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         self._session = None
         if scene is not None:
             self._session = TrackerSession(settings, scene)
-            self._session.set_lens(self._lens)
+            self._set_lens(self._session)
 
-    def _take(self, message: Image | CompressedImage, decode: Callable[[], Any]) -> None:
+    def _set_lens(self, session: TrackerSession) -> None:
+        """Undo the lens's distortion, unless frames come rectified."""
+        session.set_lens(None if interface.is_rectified(self._camera) else self._lens)
+
+    def on_image(self, message: Image | CompressedImage) -> None:
+        """Track the needle in a frame."""
         self._last_frame = time.monotonic()
         stamp, taken = message.header.stamp, 0.0
         try:
@@ -135,7 +127,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             self.health.warn(NO_SCENE)
             return
         try:
-            image = np.asarray(decode())
+            image = image_of(message)
         except InvalidInputError as error:
             seen = self._session.on_broken(error)
         else:
@@ -160,11 +152,9 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
         if seen.problem is not None:
             self.health.refuse(seen.problem, **values)
-        elif not seen.tracked:
-            self._text = f"{track.state.value}: {track.reason}"
-            self.health.warn(self._text, **values)
         else:
-            self._text = f"tracking; {track.warning}" if track.warning else "tracking"
+            state = "tracking" if seen.tracked else f"{track.state.value}: {track.reason}"
+            self._text = "; ".join(filter(None, (state, track.warning)))
             text = "; ".join(filter(None, (self._text, self._lens_problem)))
             report = self.health.ok if text == "tracking" else self.health.warn
             report(text, confidence=round(track.confidence, 3), **values)

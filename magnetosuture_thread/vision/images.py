@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import io
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -34,12 +36,51 @@ from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
 OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
-CHANNELS = {"bgr8": 3, "rgb8": 3, "mono8": 1}
+JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # markers
 CELL_PX = 8  # side of a cell of the grid on which the floor's brightness is known
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
 
 Gray = NDArray[np.uint8]
+
+
+class Encoding(NamedTuple):
+    """How the pixels of a raw image lie in memory.
+
+    Attributes:
+        bits: of a value.
+        values: in a row, for each pixel.
+        conversion: OpenCV's to BGR; None for pixels that are grey or BGR.
+        block: side of the square of pixels that share their colour.
+    """
+
+    bits: int
+    values: int
+    conversion: int | None = None
+    block: int = 1
+
+
+_UYVY, _YUYV = (Encoding(8, 2, code, block=2) for code in (cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2BGR_YUYV))
+# By the names of sensor_msgs/image_encodings, and nv12 as drivers name it.
+ENCODINGS = {"yuv422": _UYVY, "uyvy": _UYVY, "yuv422_yuy2": _YUYV, "yuyv": _YUYV}
+ENCODINGS |= {
+    name: Encoding(8, 1, code, block=2)
+    for name, code in (("nv12", cv2.COLOR_YUV2BGR_NV12), ("nv21", cv2.COLOR_YUV2BGR_NV21))
+}
+for _bits in (8, 16):
+    for _names, _values, _conversion in (
+        (("mono{}", "{}UC1"), 1, None),
+        (("bgr{}", "{}UC3"), 3, None),
+        (("rgb{}",), 3, cv2.COLOR_RGB2BGR),
+        (("bgra{}", "{}UC4"), 4, cv2.COLOR_BGRA2BGR),
+        (("rgba{}",), 4, cv2.COLOR_RGBA2BGR),
+        # OpenCV names a pattern by the second and third pixel of its second row.
+        (("bayer_rggb{}",), 1, cv2.COLOR_BayerBG2BGR),
+        (("bayer_bggr{}",), 1, cv2.COLOR_BayerRG2BGR),
+        (("bayer_gbrg{}",), 1, cv2.COLOR_BayerGR2BGR),
+        (("bayer_grbg{}",), 1, cv2.COLOR_BayerGB2BGR),
+    ):
+        ENCODINGS |= {name.format(_bits): Encoding(_bits, _values, _conversion) for name in _names}
 
 
 @dataclass(frozen=True)
@@ -282,26 +323,49 @@ def glare_mask(picture: Picture) -> Gray:
     return np.asarray(cv2.compare(cv2.blur(bright, (5, 5)), 127.0, cv2.CMP_GT))
 
 
-def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
-    """Decode a JPEG, PNG, BMP, TIFF or WebP image to BGR, its pixels as they are stored.
-
-    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. Size
-    and kind are read from the header before any pixel is decoded: a megabyte may decode to gigabytes.
+def image_of(message: Any) -> np.ndarray:
+    """Return the image of a sensor_msgs/Image or CompressedImage as BGR or grey array, uint8.
 
     Raises:
-        InvalidInputError: the bytes are no image that can be decoded, or of more than `MAX_PIXELS`.
+        InvalidInputError: see `unpack_image` and `decode_image`.
+    """
+    if hasattr(message, "format"):
+        return decode_image(message.data)
+    size = message.height, message.width, message.step
+    return unpack_image(message.data, *size, message.encoding, big_endian=bool(message.is_bigendian))
+
+
+def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
+    """Decode a JPEG, PNG, BMP, TIFF or WebP image to BGR, its pixels as they are stored; 16 bits by `eight_bits`.
+
+    An orientation in its EXIF data is ignored, as in frames of a camera: pixels stay where the sensor has them. Size
+    and kind are read from the header before any pixel is decoded: a megabyte may decode to gigabytes. A JPEG of which
+    bytes are lost is refused: what follows them is decoded to wrong places. Its end marker may be missing.
+
+    Raises:
+        InvalidInputError: the bytes are no image, a damaged one, or one of more than `MAX_PIXELS`.
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     width, height = _size_of(buffer)
     if width * height > MAX_PIXELS:
-        raise InvalidInputError("image.data", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
-    try:
-        image = cv2.imdecode(buffer, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if width else None
-    except cv2.error:  # some headers promise more than can be made
-        image = None
-    if image is None:
-        raise InvalidInputError("image.data", f"{buffer.size} bytes", "a JPEG or PNG image, or BMP, TIFF, WebP")
-    return image
+        raise InvalidInputError("image.size", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
+    image = None
+    with suppress(cv2.error, ValueError):  # some headers promise more than can be made
+        if width and buffer[:2].tobytes() == JPEG_START:  # OpenCV's decoder only prints that bytes are missing
+            image = simplejpeg.decode_jpeg(buffer.tobytes() + JPEG_END, "BGR")
+        elif width:
+            flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+            image = cv2.imdecode(buffer, flags)
+    if image is None or image.dtype not in (np.uint8, np.uint16):
+        raise InvalidInputError("image.data", "damaged bytes", "a JPEG or PNG image, or BMP, TIFF, WebP, as a whole")
+    return eight_bits(image)
+
+
+def eight_bits(image: np.ndarray) -> np.ndarray:
+    """Return pixels of 16 bits scaled by the greatest, as sensors of 10 or 12 bits use a part of them; others as is."""
+    if image.dtype == np.uint8:
+        return image
+    return np.asarray(cv2.convertScaleAbs(image, alpha=255.0 / max(1, int(image.max()))))
 
 
 def _size_of(buffer: np.ndarray) -> tuple[int, int]:
@@ -310,38 +374,50 @@ def _size_of(buffer: np.ndarray) -> tuple[int, int]:
         with Image.open(io.BytesIO(buffer.tobytes()), formats=("JPEG", "PNG", "BMP", "TIFF", "WEBP")) as picture:
             return picture.size
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:  # far more pixels than we take
-        raise InvalidInputError("image.data", str(error), f"at most {MAX_PIXELS} pixels") from None
+        raise InvalidInputError("image.size", str(error), f"at most {MAX_PIXELS} pixels") from None
     except Exception:  # a damaged picture raises whatever its reader did not expect
         return 0, 0
 
 
 def unpack_image(
-    data: bytes | bytearray | memoryview | np.ndarray, height: int, width: int, step: int, encoding: str
+    data: bytes | bytearray | memoryview | np.ndarray,
+    height: int,
+    width: int,
+    step: int,
+    encoding: str,
+    *,
+    big_endian: bool = False,
 ) -> np.ndarray:
-    """Return a raw image as BGR or grey array.
+    """Return a raw image as BGR or grey array, uint8; 16 bits by `eight_bits`.
 
     Args:
-        data: rows of `step` bytes each.
+        data: rows of `step` bytes each; of nv12 and nv21 half as many rows of colours follow those of brightness.
         height: rows.
         width: columns.
         step: bytes in a row, padding included.
-        encoding: bgr8, rgb8 or mono8.
+        encoding: one of `ENCODINGS`.
+        big_endian: whether the high byte of 16 bits comes first.
 
     Raises:
         InvalidInputError: the encoding is another, or the sizes don't fit the data.
     """
-    channels = CHANNELS.get(encoding)
-    if channels is None:
-        raise InvalidInputError("image.encoding", repr(encoding), "bgr8, rgb8 or mono8")
-    buffer = np.frombuffer(data, dtype=np.uint8)
-    if height < 1 or width < 1 or step < width * channels or buffer.size != height * step:
+    if (form := ENCODINGS.get(encoding)) is None:
+        expected = "one that OpenCV converts to BGR, as bgr8, mono16, bayer_rggb8, yuv422 or nv12"
+        raise InvalidInputError("image.encoding", repr(encoding), expected)
+    buffer, length = np.frombuffer(data, dtype=np.uint8), width * form.values * form.bits // 8
+    planar = form.block == 2 and form.values == 1
+    rows = height * 3 // 2 if planar else height
+    whole = width % form.block == 0 and not (planar and height % 2)
+    if height < 1 or width < 1 or step < length or buffer.size != rows * step or not whole:
         sizes = f"{buffer.size} bytes for {width} x {height}, step {step}"
-        raise InvalidInputError("image.data", sizes, f"height times step bytes, {channels} for each pixel")
-    rows = buffer.reshape(height, step)[:, : width * channels]
-    if channels == 1:
-        return rows
-    image = rows.reshape(height, width, 3)
-    return image[:, :, ::-1] if encoding == "rgb8" else image
+        expected = f"{rows} rows of step bytes, {form.values * form.bits // 8} for each of {width} pixels"
+        raise InvalidInputError("image.step", sizes, expected)
+    pixels = buffer.reshape(rows, step)[:, :length]
+    if form.bits == 16:
+        pixels = np.ascontiguousarray(pixels).view(">u2" if big_endian else "<u2").astype(np.uint16, copy=False)
+    if form.values > 1:
+        pixels = pixels.reshape(height, width, form.values)
+    return eight_bits(pixels if form.conversion is None else np.asarray(cv2.cvtColor(pixels, form.conversion)))
 
 
 def check_image(image: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,10 @@ from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.untrusted import BudgetError, check_yaml
 
 COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+ALIASES = {
+    **dict.fromkeys(("pinhole", "radtan", "radial_tangential", "brown_conrady"), "plumb_bob"),
+    **dict.fromkeys(("fisheye", "equi", "kannala_brandt", "kannala_brandt4", "kb4"), "equidistant"),
+}
 MAX_SIDE_PX = 65536
 GRID = 33  # points along each side at which a lens is checked
 
@@ -114,11 +119,27 @@ def lens_of(message: Any) -> Lens:
         given = f"{message.binning_x} x {message.binning_y}"
         raise InvalidInputError("camera_info.binning", given, "0 or 1: frames of the size that was calibrated")
     coefficients, matrix = tuple(map(float, message.d)), tuple(map(float, message.k))
-    return Lens((int(message.width), int(message.height)), str(message.distortion_model), coefficients, matrix)
+    model = _model(message.distortion_model, "", len(coefficients))
+    return Lens((int(message.width), int(message.height)), model, coefficients, matrix)
+
+
+def _model(distortion: str, camera: str, count: int) -> str:
+    """Return the model of a number of coefficients by its name and that of the camera's, either of which may be empty.
+
+    Raises:
+        InvalidInputError: they contradict each other.
+    """
+    names = [re.sub("[- ]", "_", name.strip().lower()) for name in (distortion, camera)]
+    own, whole = (ALIASES.get(name, name) for name in names)
+    if own and whole not in ("", "plumb_bob", own):
+        raise InvalidInputError("camera_model", camera, f"that of distortion_model, which is {distortion}")
+    model = own or whole
+    # Each begins with the coefficients of the one before.
+    return "rational_polynomial" if model == "plumb_bob" and count > 5 else model
 
 
 def read_lens(path: Path) -> Lens:
-    """Read a camera's calibration, a YAML file as ROS's `camera_calibration_parsers` writes it.
+    """Read a camera's calibration, a YAML file as ROS's `camera_calibration_parsers` writes it, or with `camera_model`.
 
     Raises:
         InvalidInputError: it cannot be read, is no such file, or see `Lens`.
@@ -129,8 +150,9 @@ def read_lens(path: Path) -> Lens:
         content = yaml.load(text, yaml.CSafeLoader)
         matrix, coefficients = (content[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
         size = int(content["image_width"]), int(content["image_height"])
-        model = content.get("distortion_model", "plumb_bob")
-        return Lens(size, str(model), tuple(map(float, coefficients)), tuple(map(float, matrix)))
+        distortion, camera = (str(content.get(key) or "") for key in ("distortion_model", "camera_model"))
+        model = _model(distortion, camera, len(coefficients))
+        return Lens(size, model, tuple(map(float, coefficients)), tuple(map(float, matrix)))
     except OSError as error:
         raise InvalidInputError(str(path), f"{error.strerror}", "a camera's calibration") from None
     except (BudgetError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -217,10 +217,10 @@ class VisionTracker:
             problem = self._lens.problem_with(image.shape)
             small = self._lens.undistorted(small, self._factor) if problem is None else small
         found = self._track(small, time_s)
-        if problem is not None:
-            found = replace(found, warning="; ".join(filter(None, (found.warning, f"{problem}; it is not used"))))
+        dish = self._dish.found.warning if self._dish.found is not None else ""
+        warning = "; ".join(filter(None, (dish, f"{problem}; it is not used" if problem is not None else "")))
         view = found.view.shrunk(1.0 / self._factor) if found.view is not None else None
-        return replace(found, view=view, needle_length=self._length.length)
+        return replace(found, view=view, warning=warning, needle_length=self._length.length)
 
     def _track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame, shrunk."""
@@ -385,7 +385,6 @@ class VisionTracker:
             covariance=_in_dish(needle, view) + dish.covariance(tail, heading, radius),
             centreline=view.to_dish(line),
             view=dish.view,
-            warning=dish.warning,
             observation=observation,
         )
 

@@ -18,6 +18,7 @@ from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.interface import (
+    CAMERA_INFO,
     COMPRESSED_IMAGE,
     GROUND_TRUTH_NEEDLE,
     GROUND_TRUTH_THREAD,
@@ -148,6 +149,21 @@ def test_images_are_told_by_their_type(tmp_path: Path):
     both = [(IMAGE.recorded, image(IMAGE)), *[(COMPRESSED_IMAGE.recorded, image(COMPRESSED_IMAGE))] * 2]
     assert Recording(bag_of(tmp_path / "both", *both)).camera is COMPRESSED_IMAGE
     assert Recording(bag_of(tmp_path / "none", ("/pose", pose_stamped()))).camera is None
+
+
+@pytest.mark.parametrize("topic", ["/camera/image_rect", "/lab/image_rect_color", "/zed/left/rect/image"])
+def test_the_lens_of_frames_that_are_rectified_is_left_out(topic: str, tmp_path: Path):
+    lens = ("/camera/camera_info", make("sensor_msgs/msg/CameraInfo", stamped(1, "camera")))
+    bag = bag_of(tmp_path / "rectified", (topic, image(IMAGE)), lens, remap={topic: IMAGE.recorded})
+    recording = Recording(bag)
+    assert recording.rectified == topic
+    assert list(recording.records([CAMERA_INFO])) == []
+    assert recording.remarks == [f"{topic} is rectified: the lens of /camera/camera_info is not undone again"]
+    raw = Recording(
+        bag_of(tmp_path / "raw", ("/correct/image", image(IMAGE)), lens, remap={"/correct/image": "/camera/image_raw"})
+    )
+    assert raw.rectified == ""
+    assert len(list(raw.records([CAMERA_INFO]))) == 1
 
 
 def test_poses_of_another_frame_are_transformed(tmp_path: Path):

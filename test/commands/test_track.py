@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,7 +17,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
-from test.bags.bags import copy_with_notes
+from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.commands.recorded import read_image
+from magnetosuture_thread.interface import COMPRESSED_IMAGE
+from test.bags.bags import copy_with_notes, make, stamped
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
 KEYS = {
@@ -31,7 +38,7 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> str:
     return text
 
 
-def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_pictures_give_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = tmp_path / "frames"
     folder.mkdir()
     for index in (0, 3):
@@ -41,7 +48,8 @@ def test_a_folder_of_pictures_gives_one_entry_each(tmp_path: Path, capsys: pytes
     cv2.imwrite(str(folder / "frame_09.jpg"), np.full((480, 640, 3), 90, np.uint8))
     file, overlay = tmp_path / "seen.json", tmp_path / "drawn"
     given = ["--metres-per-pixel", "8e-5", "--centre", "322", "238", "--overlay", str(overlay)]
-    assert cli.main(["track", str(folder), "--json", str(file), *given]) == 0
+    pictures = sorted(str(path) for path in folder.glob("frame_*"))
+    assert cli.main(["track", *pictures, "--json", str(file), *given]) == 0
     rows = json.loads(file.read_text())
     assert [row["file"] for row in rows] == ["frame_00.png", "frame_01.png", "frame_03.png", "frame_09.jpg"]
     assert [row["status"] for row in rows] == ["tracked", "lost", "tracked", "lost"]
@@ -73,10 +81,97 @@ def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):
     capture.release()
 
 
+def images_of(bag: Path, count: int) -> list[np.ndarray]:
+    """Return the first camera frames of a bag."""
+    records = Recording(Bag(bag)).records([COMPRESSED_IMAGE])
+    return [read_image(record) for record in islice(records, count)]
+
+
+def tracked_over_time(given: list[str], file: Path) -> list[dict[str, Any]]:
+    """Return the rows of 12 frames of a needle that moves, which must be followed at 15 frames a second."""
+    assert cli.main(["track", *given, "--json", str(file)]) == 0
+    rows: list[dict[str, Any]] = json.loads(file.read_text())
+    assert [row["status"] for row in rows] == ["searching"] * 2 + ["tracked"] * 10
+    assert [row["stamp_s"] for row in rows] == pytest.approx(np.arange(12) / 15.0)
+    tails = np.array([row["tail_m"] for row in rows[2:]])
+    np.testing.assert_allclose(tails, [(0.003 + 0.003 * index / 30.0, 0.002) for index in range(2, 12)], atol=8e-5)
+    return rows
+
+
+def test_a_folder_is_followed_over_time_in_the_order_of_its_numbers(
+    short_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "frames").mkdir()
+    for number, image in enumerate(images_of(short_bag, 12), 1):
+        cv2.imwrite(str(tmp_path / "frames" / f"frame_{number}.png"), image)
+    rows = tracked_over_time([str(tmp_path / "frames"), "--rate", "15"], tmp_path / "seen.json")
+    assert [row["file"] for row in rows] == [f"frame_{number}.png" for number in range(1, 13)]
+    assert "is read as a video of 15 frames/s" in " ".join(capsys.readouterr().out.split())
+    assert cli.main(["track", str(tmp_path / "frames" / "frame_1.png"), "--rate", "15"]) == 1
+    assert "--rate has no meaning" in error_of(capsys)
+
+
+def test_a_video_is_followed_over_time_and_one_that_is_cut_off_is_reported(
+    short_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 15.0, (640, 480))
+    for image in images_of(short_bag, 12):
+        writer.write(image)
+    writer.release()
+    rows = tracked_over_time([str(film)], tmp_path / "seen.json")
+    assert [row["file"] for row in rows[:2]] == ["film.avi 0.000000", "film.avi 0.066667"]
+    film.write_bytes(film.read_bytes()[: film.stat().st_size * 2 // 3])
+    assert cli.main(["track", str(film)]) == 0
+    assert "film.avi is damaged" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_picture_of_12_megapixels_is_measured_in_its_own_pixels(tmp_path: Path):
+    large = cv2.resize(cv2.imread(str(SAMPLES / "frame_00.png")), (4000, 3000), interpolation=cv2.INTER_CUBIC)
+    picture, file, overlay = tmp_path / "large.jpg", tmp_path / "seen.json", tmp_path / "drawn"
+    cv2.imwrite(str(picture), large)
+    scale = 4000 / 640
+    centre = [str((value + 0.5) * scale - 0.5) for value in (322, 238)]
+    given = ["--metres-per-pixel", str(8e-5 / scale), "--centre", *centre, "--overlay", str(overlay)]
+    assert cli.main(["track", str(picture), "--json", str(file), *given]) == 0
+    truth = json.loads((SAMPLES / "truth.json").read_text())["frames"][0]
+    np.testing.assert_allclose(json.loads(file.read_text())[0]["tail_m"], np.array(truth["tail_mm"]) * 1e-3, atol=5e-5)
+    drawn = cv2.imread(str(overlay / "large.png"))
+    assert drawn is not None
+    assert drawn.shape == (3000, 4000, 3)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["track"],
+        ["calibrate-camera", "--dish-diameter", "0.035", "--output"],
+        ["evaluate", "--output"],
+        ["replay", "--offline", "--output"],
+    ],
+    ids=" ".join,
+)
+def test_every_command_names_an_encoding_that_it_cannot_read(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("/camera/image_raw", "sensor_msgs/msg/Image")
+        for index in range(12):
+            data = {"encoding": "32FC1", "data": np.zeros(48, np.uint8)}
+            message = make("sensor_msgs/msg/Image", stamped(1 + index, "camera"), 3, 4, step=16, **data)
+            writer.write_message("/camera/image_raw", (1 + index) * 10**9, message)
+    output = [str(tmp_path / "out")] if command[-1] == "--output" else []
+    assert cli.main([command[0], str(tmp_path / "bag"), *command[1:], *output]) == 1
+    captured = capsys.readouterr()
+    assert "'32FC1'" in captured.out + captured.err
+
+
 def test_paths_without_frames_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file.mcap").write_bytes(b"")
     cases = {"nowhere": "does not exist", "empty": "holds no pictures", "file.mcap": "is empty, expected an mcap file"}
+    cases["film.mp4"] = "cannot be read as a video"
+    (tmp_path / "film.mp4").write_bytes(b"no film")
     for name, words in cases.items():
         assert cli.main(["track", str(tmp_path / name)]) == 1
         assert words in error_of(capsys)
@@ -87,7 +182,7 @@ def test_a_calibration_is_written_as_parameters(tmp_path: Path, capsys: pytest.C
     assert cli.main(["calibrate-camera", str(SAMPLES), "--dish-diameter", "0.035", "--output", str(file)]) == 0
     assert "5 frames" in capsys.readouterr().out
     given = ["--setup", str(file), "--scene", "dish_35mm", "--json", str(tmp_path / "seen.json")]
-    assert cli.main(["track", str(SAMPLES), *given]) == 0
+    assert cli.main(["track", *map(str, SAMPLES.glob("*.png")), *given]) == 0
     assert {row["status"] for row in json.loads((tmp_path / "seen.json").read_text())} == {"tracked"}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from magnetosuture_msgs.msg import TrackerState
-from sensor_msgs.msg import CameraInfo, CompressedImage
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from benchmarks.vision.measurements import frame_of
 from magnetosuture_thread.nodes import topics
@@ -122,3 +122,27 @@ def test_a_lens_from_camera_info_is_undone_and_an_invalid_one_is_reported_and_no
     graph.wait(lambda: any("camera_info.d" in state for state in states(diagnostics)), "a refusal")
     graph.publish(topics.COMPRESSED_IMAGE, compressed(image, graph.now()))
     graph.wait(lambda: any("tracking; camera_info.d" in state for state in states(diagnostics)), "the reason to stay")
+
+
+def test_frames_of_a_topic_that_is_rectified_are_not_undistorted_again(graph):
+    class Remapped(VisionTrackerNode):
+        def __init__(self, **options):
+            rule = "camera/image_raw/compressed:=camera/image_rect/compressed"
+            super().__init__(cli_args=["--ros-args", "--remap", rule], **options)
+
+    case, _ = frame_of("distortion", 2, 31)
+    assert case.lens is not None
+    node = graph.add(Remapped, scene="dish_35mm", confirm_frames=1)
+    graph.publish(topics.CAMERA_INFO, camera_info(case.lens))
+    graph.wait(lambda: node._lens is not None, "the lens")
+    assert node._session._tracker._lens is None
+
+
+def test_an_encoding_that_cannot_be_read_is_named(graph):
+    graph.add(VisionTrackerNode, scene="dish_35mm", image_transport="raw")
+    tracking, diagnostics = graph.listen(topics.TRACKER_STATE), graph.listen(topics.DIAGNOSTICS)
+    message = Image(height=64, width=64, step=256, encoding="32FC1", data=bytes(64 * 256))
+    message.header.stamp = graph.now()
+    graph.publish(topics.IMAGE, message)
+    graph.wait(lambda: any("'32FC1'" in state.reason for state in tracking), "the encoding")
+    graph.wait(lambda: any("'32FC1'" in state for state in states(diagnostics)), "the encoding")

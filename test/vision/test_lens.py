@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from benchmarks.vision.frames import distorted, lens_with
 from benchmarks.vision.measurements import frame_of, measure
@@ -86,20 +87,58 @@ def test_parameters_of_no_camera_are_refused(size, model: str, coefficients, mat
         Lens(size, model, coefficients, matrix)
 
 
-def test_a_lens_of_another_size_is_warned_of_and_not_used():
+def test_a_lens_of_another_size_is_warned_of_and_not_used_with_a_needle_and_without():
     frame = render(Pose(np.zeros(2), 0.3))
     tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     without = tracker.look(frame)
     tracker.set_lens(Lens((1280, 960), "plumb_bob", LENSES["plumb_bob"], MATRIX))
     found = tracker.look(frame)
-    assert found.warning == "camera_info.width: got 1280 x 960 pixels, expected the frames' 640 x 480; it is not used"
+    warning = "camera_info.width: got 1280 x 960 pixels, expected the frames' 640 x 480; it is not used"
+    assert found.warning == warning
     assert np.array_equal(found.tail, without.tail)
+    found = tracker.look(render(Pose(np.array([0.5, 0.5]), 0.3)))
+    assert found.reason.startswith("no needle")
+    assert found.warning == warning
+
+
+def test_a_scale_that_does_not_fit_the_dish_is_warned_of_without_a_needle_too():
+    settings = VisionTrackerSettings(metres_per_pixel=1.06 * VIEW.metres_per_pixel)
+    found = VisionTracker(settings, SCENE).look(render(Pose(np.array([0.5, 0.5]), 0.3)))
+    assert found.reason.startswith("no needle")
+    assert found.warning.startswith("metres_per_pixel is 6 % off")
 
 
 def test_a_calibration_file_is_read(tmp_path: Path):
     file = tmp_path / "camera.yaml"
     file.write_text(YAML)
     assert read_lens(file) == Lens(SIZE, "plumb_bob", LENSES["plumb_bob"], MATRIX)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "camera", "count", "model"),
+    [
+        (None, "fisheye", 4, "equidistant"),
+        ("Kannala-Brandt", None, 4, "equidistant"),
+        ("equidistant", "pinhole", 4, "equidistant"),
+        (None, "pinhole", 5, "plumb_bob"),
+        ("radtan", "pinhole", 4, "plumb_bob"),
+        ("plumb_bob", None, 8, "rational_polynomial"),
+        (None, None, 5, "distortion_model: got '', expected plumb_bob"),
+        (None, "omni", 4, "distortion_model: got 'omni', expected plumb_bob"),
+        ("radtan", "omni", 4, "camera_model: got omni, expected that of distortion_model, which is radtan"),
+        ("plumb_bob", "fisheye", 4, "camera_model: got fisheye"),
+    ],
+)
+def test_a_model_has_many_names_and_none_is_guessed(distortion, camera, count: int, model: str, tmp_path: Path):
+    file = tmp_path / "camera.yaml"
+    content = yaml.safe_load(YAML) | {"distortion_model": distortion, "camera_model": camera}
+    content["distortion_coefficients"]["data"] = [0.01] * count
+    file.write_text(yaml.safe_dump({key: value for key, value in content.items() if value is not None}))
+    if ":" in model:
+        with pytest.raises(InvalidInputError, match=model):
+            read_lens(file)
+    else:
+        assert read_lens(file).model == model
 
 
 @pytest.mark.parametrize("text", ["", "[]", "a: b", YAML.replace("900, 0, 320", "x, 0, 320"), "a: [", "a: &b [*b]"])
