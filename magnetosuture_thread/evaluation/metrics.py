@@ -169,6 +169,15 @@ class SensorSilence:
     max_gap: float = 0.0
     at: float = math.nan
 
+    @property
+    def longest(self) -> str:
+        """The longest gap in words."""
+        return f"{self.max_gap:.1f} s at the longest, from {self.at:.2f} s on"
+
+    def __str__(self) -> str:
+        """Return the gaps in words; empty if there are none."""
+        return f"without frames for {self.total:.1f} s, {self.longest}" if self.gaps else ""
+
     @classmethod
     def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
         """Return the gaps between frames, and before the first and after the last, where they are of one clock.

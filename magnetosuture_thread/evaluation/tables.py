@@ -253,6 +253,8 @@ def summary_table(summary: ReplaySummary) -> Table:
             ("messages dropped", str(sum(summary.dropped.values())), "of those played"),
             *(("  dropped", str(count), which) for which, count in summary.dropped.items() if count),
         ]
+    if summary.silence.gaps:
+        frames.append(("frames are missing", f"{summary.silence.total:.1f} s", summary.silence.longest))
     doubts = {"the bag is damaged": summary.damage, "the bag is unverified": summary.unverified}
     frames += [(name, "", why) for name, why in {**doubts, "setup in doubt": summary.remark}.items() if why]
     times: list[Line] = [
