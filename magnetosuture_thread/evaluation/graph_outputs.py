@@ -307,6 +307,7 @@ class LoopSummary(RunSummary):
         path_error_greatest: greatest such distance [m].
         processing: of a frame in the tracker [s].
         procedure: what came of a procedure; None for a path that was followed.
+        too_slow: that the computer was too slow for the run, and what to do; empty if it was not.
     """
 
     duration: float
@@ -320,6 +321,7 @@ class LoopSummary(RunSummary):
     path_error_greatest: float
     processing: Percentiles | None
     procedure: dict[str, Any] | None = None
+    too_slow: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none; units as above."""

@@ -28,7 +28,7 @@ from magnetosuture_thread.evaluation.frames import (
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import SOLID, Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
@@ -219,6 +219,16 @@ class MinimumMargin:
     node: int
     obstacle: int
     time: float
+
+    @property
+    def promised(self) -> float:
+        """What the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
+        return self.value if self.kind in SOLID else self.clearance
+
+    @property
+    def chord(self) -> float | None:
+        """The clearance of the chord between two nodes where it lies in a shape, as on a round one [m]; else None."""
+        return self.clearance if self.clearance < min(0.0, self.promised) - 1e-9 else None
 
 
 def hidden_part(frame: FrameResult, length: float) -> float:
