@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import shlex
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -11,11 +13,14 @@ import pytest
 import yaml
 
 import magnetosuture_thread
+from magnetosuture_thread.errors import missing_module
 from magnetosuture_thread.resources import share_directory
+from test.test_imports import MODULES, imported
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
 REUSE = (ROOT / "REUSE.toml").read_text()
+INSTALLATION = (ROOT / "docs" / "how_to" / "installation.md").read_text()
 
 
 def package_xml(path: Path) -> ElementTree.Element:
@@ -70,6 +75,38 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
     used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
     assert used <= declared
+
+
+def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
+    keys = {entry.text for tag in ("depend", "exec_depend") for entry in package_xml(ROOT / "package.xml").iter(tag)}
+    line = re.search(r"^ +pip install --break-system-packages (.+)$", INSTALLATION, re.MULTILINE)
+    assert line is not None
+    by_pip = {re.split("[^a-z0-9]", word)[0] for word in shlex.split(line[1])}
+    own = {"magnetosuture_thread", "typing_extensions"}  # the latter for mypy only
+    cluster = {"dask", "distributed", "pyarrow", "upath"}
+    names = {"cv2": "opencv", "PIL": "pil", "rosbags": "rosbags-pip"}
+    used = {name.split(".")[0] for path in MODULES for name in imported(path)} | {"lz4"}  # by import_module
+    used -= {*sys.stdlib_module_names, *own, *cluster}
+    missing = {name for name in used if not {name, f"python3-{names.get(name, name)}"} & keys}
+    assert missing == by_pip
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("shapely", r"pip install 'shapely>=2\.1'"),
+        ("cv2", "pip install 'opencv-python-headless>=4.6'"),
+        ("lz4.frame", "pip install 'lz4'"),
+        ("rclpy", "source the setup.bash of ROS"),
+        ("magnetosuture_msgs", "and of the workspace where this package is built"),
+        ("upath", r"pip install '\.\[cluster\]'"),
+    ],
+)
+def test_a_missing_package_is_named_with_the_line_that_installs_it(module: str, words: str):
+    text = missing_module(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    assert text.startswith(f"No module named {module!r}; ")
+    assert re.search(words, text)
+    assert ("'.[ros]'" in text) == ("setup.bash" in text)
 
 
 @pytest.mark.parametrize(
