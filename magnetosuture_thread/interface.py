@@ -4,7 +4,7 @@ Nothing of ROS is needed here: bags are read and written by the same names on ma
 
 Names follow the Collaborative Robotics Toolkit (CRTK) where it has one: `measured_cp` is a measured
 Cartesian position, `servo_cv` a velocity to follow now, `setpoint_cv` the velocity that is really asked
-of the actuators.
+of the actuators. Of their types that of `needle/measured_cp` is not CRTK's: it has a covariance.
 """
 
 from __future__ import annotations

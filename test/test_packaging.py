@@ -5,12 +5,14 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 import yaml
+from catkin_pkg.packages import find_packages
 
 import magnetosuture_thread
 from magnetosuture_thread.errors import missing_module
@@ -56,6 +58,30 @@ def test_maintainer_and_addresses_are_those_of_pyproject_everywhere():
     assert citation["authors"] == [{"name": name}]
     assert citation["repository-code"] == known["repository"]
     assert re.search(rf'^SPDX-FileCopyrightText = "\d{{4}}(-\d{{4}})? {re.escape(name)}"$', REUSE, re.MULTILINE)
+
+
+LINK = "ln -s magnetosuture_thread/msg_defs src/magnetosuture_msgs"
+
+
+def test_the_documented_link_makes_the_messages_a_sibling_of_the_package(tmp_path: Path):
+    """By the same search rosdep and colcon find packages: not inside of another, but through links."""
+    places = ("README.md", "docs/how_to/installation.md", ".github/workflows/ci.yml")
+    assert all(re.search(rf"^ *{re.escape(LINK)}\b", (ROOT / name).read_text(), re.MULTILINE) for name in places)
+    (tmp_path / "src" / "other").mkdir(parents=True)
+    other = (ROOT / "msg_defs" / "package.xml").read_text().replace("<name>magnetosuture_msgs<", "<name>other<")
+    (tmp_path / "src" / "other" / "package.xml").write_text(other)
+    (tmp_path / "src" / "magnetosuture_thread").symlink_to(ROOT)
+    found = {each.name for each in find_packages(str(tmp_path / "src")).values()}
+    assert found == {"magnetosuture_thread", "other"}
+    subprocess.run(shlex.split(LINK), cwd=tmp_path, check=True)
+    found = {each.name for each in find_packages(str(tmp_path / "src")).values()}
+    assert found == {"magnetosuture_thread", "magnetosuture_msgs", "other"}
+
+
+def test_every_folder_of_config_is_installed():
+    folders = {str(path.parent.relative_to(ROOT)) for path in (ROOT / "config").rglob("*") if path.is_file()}
+    setup = (ROOT / "setup.py").read_text()
+    assert folders == set(re.findall(r'files\("(config[\w/]*)/\*[.\w]*"\)', setup))
 
 
 def test_every_message_is_built():
