@@ -4,7 +4,7 @@
 # make kernels  compile what nodes would compile when they first start
 # make coverage  measure which lines of the core packages their tests run
 # make lint   check style and types
-# make colcon build both packages by colcon, into install/
+# make colcon build both packages by colcon, in the workspace output/ws
 # make docs  build the documentation into output/docs
 # make peers  add the solvers of `python -m benchmarks solver --peers`
 # make clean  remove all that make made
@@ -60,9 +60,12 @@ lint: $(READY)
 docs: $(READY)
 	$(RUN)/python -m sphinx --fail-on-warning --keep-going --quiet docs output/docs
 
-# Both packages by colcon, over the wheels in .venv, into install/.
+# Both packages by colcon, over the wheels in .venv, in a workspace as docs/how_to/installation.md makes one.
 colcon: $(READY)
-	COLCON_DEFAULTS_FILE=colcon_defaults.yaml PATH="$(CURDIR)/$(RUN):$$PATH" $(RUN)/colcon build
+	@mkdir -p output/ws/src
+	@ln -sfn ../../.. output/ws/src/magnetosuture_thread
+	@ln -sfn magnetosuture_thread/msg_defs output/ws/src/magnetosuture_msgs
+	cd output/ws && PATH="$(CURDIR)/$(RUN):$$PATH" colcon build
 
 # From the extra `peers`, without building the package again.
 peers: $(READY)
@@ -72,7 +75,7 @@ help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 clean:
-	rm -rf $(VENV) build install log output
+	rm -rf $(VENV) build output
 
 # The packages, and the messages that pip builds in an environment of its own, at the same time: most of
 # either keeps one processor busy.

@@ -33,6 +33,7 @@ setup(
         (f"share/{PACKAGE}/config/procedures", files("config/procedures/*")),
         (f"share/{PACKAGE}/config/ros2_bag", files("config/ros2_bag/*")),
         (f"share/{PACKAGE}/config/security", files("config/security/*")),
+        (f"share/{PACKAGE}/config/systemd", files("config/systemd/*")),
         (f"share/{PACKAGE}/config/viewers", files("config/viewers/*")),
         (f"share/{PACKAGE}/launch", files("launch/*.launch.py")),
     ],

@@ -6,6 +6,7 @@ arms it. With `simulated:=true` a rig in software and a path follower come with 
 arms itself, unless `autostart` is given. With `planner:=true` procedures can be executed, and no path follower starts.
 With `console:=true` the operator's page is served on this machine. Where tf2_ros is installed, the dish's frame is
 published as that of `parent_frame:=NAME`, on `tf_static` of the namespace; with an empty name it is left to others.
+With `frame_prefix:=left/` the rig's frames are `left/dish` and `left/camera`, and the transform is on `/tf_static`.
 With `enclaves:=true` each process is in the SROS2 enclave of its name, below that of its namespace: see
 docs/how_to/security.md. With `autostart:=inactive` or `autostart:=unconfigured` the lifecycle nodes go no farther by
 themselves, for a lifecycle manager or `ros2 lifecycle set`; else each goes as far as the setup says.
@@ -55,7 +56,7 @@ def generate_launch_description() -> LaunchDescription:
             raise FileNotFoundError(f"setup_file: got {given!r}, expected a parameter file that exists")
         autostart = LaunchConfiguration("autostart").perform(context)
         planner, enclaves = (LaunchConfiguration(name).perform(context) == "true" for name in ("planner", "enclaves"))
-        frame = LaunchConfiguration("parent_frame").perform(context)
+        frame, prefix = (LaunchConfiguration(name).perform(context) for name in ("parent_frame", "frame_prefix"))
         inner = LaunchConfiguration("namespace").perform(context)
         # As launch_ros does it: what a group pushes comes before, but not before an absolute namespace.
         pushed = "" if inner.startswith("/") else context.launch_configurations.get("ros_namespace", "")
@@ -64,8 +65,8 @@ def generate_launch_description() -> LaunchDescription:
         def ros_arguments(name: str) -> list[str]:
             return ["--enclave", "/" + "/".join([*outer, name])] if enclaves else []
 
-        robot = started(str(file.resolve()), autostart, planner, ros_arguments)
-        return [*robot, *transforms(frame, ros_arguments)]
+        robot = started(str(file.resolve()), autostart, planner, prefix, ros_arguments)
+        return [*robot, *transforms(frame, prefix, ros_arguments)]
 
     return LaunchDescription(
         [
@@ -79,6 +80,7 @@ def generate_launch_description() -> LaunchDescription:
                 choices=["", "unconfigured", "inactive", "active"],
             ),
             argument("parent_frame", "map", "frame that the dish's is in; empty if others publish it"),
+            argument("frame_prefix", "", "before the frames dish and camera, for example left/"),
             switch("use_sim_time", "take the time from /clock"),
             switch("simulated", "with a rig in software"),
             switch("planner", "with the needle planner, in place of the path follower"),
@@ -89,13 +91,16 @@ def generate_launch_description() -> LaunchDescription:
     )
 
 
-def started(file: str, autostart: str, planner: bool, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
+def started(
+    file: str, autostart: str, planner: bool, prefix: str, ros_arguments: Callable[[str], list[str]]
+) -> list[Node]:
     """Return the nodes with a parameter file.
 
     Args:
         file: the setup.
         autostart: state that the lifecycle nodes enter by themselves; empty: as the setup says.
         planner: whether the needle planner is among them, in place of the path follower.
+        prefix: of the rig's frames.
         ros_arguments: of a node, by its name.
     """
     with_console = IfCondition(LaunchConfiguration("console"))
@@ -111,6 +116,7 @@ def started(file: str, autostart: str, planner: bool, ros_arguments: Callable[[s
             namespace=LaunchConfiguration("namespace"),
             parameters=[file, {"use_sim_time": LaunchConfiguration("use_sim_time")}, *more],
             ros_arguments=ros_arguments(name),
+            additional_env={"MAGNETOSUTURE_FRAME_PREFIX": prefix},
             output="screen",
             respawn=name in RESPAWNED,
             respawn_delay=RESPAWN_DELAY,
@@ -130,7 +136,7 @@ def started(file: str, autostart: str, planner: bool, ros_arguments: Callable[[s
     ]
 
 
-def transforms(parent_frame: str, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
+def transforms(parent_frame: str, prefix: str, ros_arguments: Callable[[str], list[str]]) -> list[Node]:
     """Return the publisher of the dish's frame in another one; none without tf2_ros, or without a name."""
     if not parent_frame or "tf2_ros" not in get_packages_with_prefixes():
         return []
@@ -140,8 +146,9 @@ def transforms(parent_frame: str, ros_arguments: Callable[[str], list[str]]) -> 
             executable="static_transform_publisher",
             name="dish_transform",
             namespace=LaunchConfiguration("namespace"),
-            arguments=["--frame-id", parent_frame, "--child-frame-id", "dish"],
+            arguments=["--frame-id", parent_frame, "--child-frame-id", f"{prefix}dish"],
             ros_arguments=ros_arguments("dish_transform"),
-            remappings=[("/tf_static", "tf_static")],  # two rigs in two namespaces have a dish each
+            # Two rigs in two namespaces have a dish each, with one name unless there is a prefix.
+            remappings=[] if prefix else [("/tf_static", "tf_static")],
         )
     ]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import copyreg
+import re
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, requires
 from typing import Any
 
 from magnetosuture_thread.texts import shortened
@@ -10,12 +13,24 @@ from magnetosuture_thread.texts import shortened
 MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
 
 
+_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
+_ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|builtin|action|rosidl)_?.*|.+_(msgs|srvs)")
+
+
 def missing_module(error: ModuleNotFoundError) -> str:
-    """Return what to do about a module that is not there: those of ROS, and of a cluster, come with an extra."""
+    """Return what to do about a module that is not there: the line that installs it."""
+    module = str(error.name).split(".")[0]
     # Modules of the extra `cluster`.
-    if str(error.name).split(".")[0] in ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath"):
+    if module in ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath"):
         return f"{error}; clusters and bags by URL need the extra: pip install '.[cluster]'"
-    return f"{error}; nodes and the live graph need ROS 2 Jazzy: docs/how_to/installation.md, or pip install '.[ros]'"
+    if _ROS.fullmatch(module):
+        sourced = "source the setup.bash of ROS, and of the workspace where this package is built"
+        return f"{error}; nodes and the live graph need ROS 2 Jazzy: {sourced}; without ROS: pip install '.[ros]'"
+    name = _DISTRIBUTIONS.get(module, module)
+    with suppress(PackageNotFoundError):
+        found = [each.split(";")[0].strip() for each in requires(__package__) or ()]
+        name = next((each for each in found if re.split("[^A-Za-z0-9_.-]", each)[0].lower() == name.lower()), name)
+    return f"{error}; a Python package is missing: pip install '{name}'; see docs/how_to/installation.md"
 
 
 class MagnetosutureError(Exception):

@@ -9,6 +9,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 RANGE_BYTES = 1 << 20  # read at once, at least, of a file that a URL names
+# What often stands in the place of a file, by its first bytes: what it is, and what to do.
+_SUBSTITUTES = {
+    b"version https://git-lfs": "is a pointer of Git LFS, not the file itself; fetch that by: git lfs pull",
+    b"#ROSBAG V": "is a bag of ROS 1; convert it by: rosbags-convert --src FILE.bag --dst FOLDER",
+}
+HEAD_BYTES = max(map(len, _SUBSTITUTES))
 
 
 def parse_location(text: str) -> Path:
@@ -44,6 +50,11 @@ def open_ranges(path: Path) -> BinaryIO:
     return opened
 
 
+def substitute_problem(head: bytes) -> str:
+    """Return what stands in the place of a file by its first `HEAD_BYTES`, and what to do; empty if nothing does."""
+    return next((problem for magic, problem in _SUBSTITUTES.items() if head.startswith(magic)), "")
+
+
 def read_regular(path: Path, max_bytes: int) -> bytes:
     """Return the content of a regular file.
 
@@ -54,7 +65,8 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
         max_bytes: that it may have.
 
     Raises:
-        OSError: it cannot be read, is a folder, pipe or device, or is larger; `strerror` says which.
+        OSError: it cannot be read, is a folder, pipe or device, is larger, or a pointer of Git LFS stands in its place;
+            `strerror` says which.
     """
     if is_url(path):
         with open_ranges(path) as stream:
@@ -74,7 +86,10 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
         os.close(descriptor)
     if not left:
         raise OSError(errno.EFBIG, "a larger file", str(path))
-    return b"".join(parts)
+    content = b"".join(parts)
+    if problem := substitute_problem(content):
+        raise OSError(errno.EINVAL, f"it {problem}", str(path))
+    return content
 
 
 def _require_regular(status: os.stat_result, path: Path) -> None:

@@ -4,11 +4,12 @@ Nothing of ROS is needed here: bags are read and written by the same names on ma
 
 Names follow the Collaborative Robotics Toolkit (CRTK) where it has one: `measured_cp` is a measured
 Cartesian position, `servo_cv` a velocity to follow now, `setpoint_cv` the velocity that is really asked
-of the actuators.
+of the actuators. Of their types that of `needle/measured_cp` is not CRTK's: it has a covariance.
 """
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from enum import Enum
@@ -21,8 +22,11 @@ RIG_NODES = ("rig_simulator", "path_follower")  # besides, where the robot is si
 PLANNER = "needle_planner"  # besides, where procedures are executed
 STANDBY_NODES = ("vision_tracker", "thread_model", SCENE_SERVER, PLANNER, "path_follower")  # lifecycle, without boards
 ALL_NODES = (*NODES, SCENE_SERVER, PLANNER, *RIG_NODES)
-DISH_FRAME = "dish"
-CAMERA_FRAME = "camera"
+# Before the frames of this process's rig, for example "left/"; all that the process packs and reads has it.
+FRAME_PREFIX_VARIABLE = "MAGNETOSUTURE_FRAME_PREFIX"
+FRAME_PREFIX = os.environ.get(FRAME_PREFIX_VARIABLE, "")
+DISH_FRAME = f"{FRAME_PREFIX}dish"
+CAMERA_FRAME = f"{FRAME_PREFIX}camera"
 STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
 
 

@@ -8,7 +8,10 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 import magnetosuture_thread
+from magnetosuture_thread.nodes.program import MAKERS
 
 PACKAGE = Path(magnetosuture_thread.__file__).parent
 
@@ -122,6 +125,17 @@ def test_what_is_installed_needs_nothing_of_the_source_tree():
 
 
 LATE = {"matplotlib", "plotly", "scipy.interpolate", "scipy.optimize", "scipy.spatial", "scipy.stats"}
+
+
+@pytest.mark.parametrize(("modules", "allowed"), [(sorted(MAKERS), set[str]()), (["console"], {"aiohttp"})])
+def test_a_node_needs_no_library_for_plots_bags_or_pages(modules: list[str], allowed: set[str]):
+    """Only the node that serves the page has that of its server."""
+    unneeded = {"matplotlib", "plotly", "jinja2", "rich", "rosbags", "mcap", "lz4", "zstandard", "pyarrow", "aiohttp"}
+    code = (
+        "import sys, " + ", ".join(f"magnetosuture_thread.nodes.{name}" for name in modules) + "; print(*sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], check=True, timeout=300, capture_output=True, text=True)
+    assert unneeded & set(found.stdout.split()) == allowed
 
 
 def test_what_few_need_delays_no_start():

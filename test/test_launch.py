@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import configparser
 import importlib.util
+import os
 import re
+import shlex
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
@@ -15,7 +19,7 @@ import pytest
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.configuration import configuration_fields
-from magnetosuture_thread.interface import ALL_NODES, NODES, PROCESSES, RIG_NODES, STANDBY_NODES
+from magnetosuture_thread.interface import ALL_NODES, FRAME_PREFIX_VARIABLE, NODES, PROCESSES, RIG_NODES, STANDBY_NODES
 
 ROOT = Path(__file__).parent.parent
 INSTALLED: dict[str, str] = {}  # packages of the ROS installation
@@ -143,6 +147,38 @@ def test_enclaves_have_the_names_of_processes_below_their_namespace(
         assert node.ros_arguments == ["--enclave", f"{outer}/{name}"]
         assert node.ros_arguments[1] in enclaves
     assert all(node.ros_arguments == [] for node in nodes(description, namespace=namespace))
+
+
+@pytest.mark.parametrize(("prefix", "remapped"), [("", [("/tf_static", "tf_static")]), ("left/", [])])
+def test_the_frames_of_a_rig_have_its_prefix(
+    description, monkeypatch: pytest.MonkeyPatch, prefix: str, remapped: list[tuple[str, str]]
+):
+    monkeypatch.setitem(INSTALLED, "tf2_ros", "/opt/ros/jazzy")
+    *robot, transform = nodes(description, frame_prefix=prefix)
+    assert all(node.additional_env == {FRAME_PREFIX_VARIABLE: prefix} for node in robot)
+    assert transform.arguments == ["--frame-id", "map", "--child-frame-id", f"{prefix}dish"]
+    assert transform.remappings == remapped
+
+
+def test_the_systemd_unit_launches_with_its_arguments_and_ends_all_that_it_launched(description, tmp_path: Path):
+    unit = configparser.ConfigParser(interpolation=None, strict=False)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(ROOT / "config" / "systemd" / "magnetosuture.service")
+    service = dict(unit["Service"])
+    assert (service["KillMode"], service["KillSignal"], service["Restart"]) == ("control-group", "SIGINT", "no")
+    (tmp_path / "install").mkdir()
+    (tmp_path / "install" / "setup.bash").write_text('PATH="$WORKSPACE:$PATH"\n')
+    (tmp_path / "ros2").write_text('#!/bin/sh\necho "$@"\n')
+    (tmp_path / "ros2").chmod(0o755)
+    command = [word.replace("$$", "$") for word in shlex.split(service["ExecStart"])]  # as systemd reads it
+    name, _, given = service["Environment"].partition("=")  # the last of that name
+    environment = {**os.environ, "WORKSPACE": str(tmp_path), name: f"{given} console:=true"}
+    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    *words, setup, console = done.stdout.split()
+    assert [*words, console] == ["launch", "magnetosuture_thread", "magnetosuture.launch.py", "console:=true"]
+    argument, _, value = setup.partition(":=")
+    (declared,) = (each for each in description if each.kind == "argument" and each.given[0] == argument)
+    assert value in declared.choices
 
 
 def test_what_moves_the_needle_never_comes_back_by_itself(description):

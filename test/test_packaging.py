@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import ast
 import re
+import shlex
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 import yaml
+from catkin_pkg.packages import find_packages
 
 import magnetosuture_thread
+from magnetosuture_thread.errors import missing_module
 from magnetosuture_thread.resources import share_directory
+from test.test_imports import MODULES, imported
 
 ROOT = Path(__file__).parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
 REUSE = (ROOT / "REUSE.toml").read_text()
+INSTALLATION = (ROOT / "docs" / "how_to" / "installation.md").read_text()
 
 
 def package_xml(path: Path) -> ElementTree.Element:
@@ -53,6 +60,30 @@ def test_maintainer_and_addresses_are_those_of_pyproject_everywhere():
     assert re.search(rf'^SPDX-FileCopyrightText = "\d{{4}}(-\d{{4}})? {re.escape(name)}"$', REUSE, re.MULTILINE)
 
 
+LINK = "ln -s magnetosuture_thread/msg_defs src/magnetosuture_msgs"
+
+
+def test_the_documented_link_makes_the_messages_a_sibling_of_the_package(tmp_path: Path):
+    """By the same search rosdep and colcon find packages: not inside of another, but through links."""
+    places = ("README.md", "docs/how_to/installation.md", ".github/workflows/ci.yml")
+    assert all(re.search(rf"^ *{re.escape(LINK)}\b", (ROOT / name).read_text(), re.MULTILINE) for name in places)
+    (tmp_path / "src" / "other").mkdir(parents=True)
+    other = (ROOT / "msg_defs" / "package.xml").read_text().replace("<name>magnetosuture_msgs<", "<name>other<")
+    (tmp_path / "src" / "other" / "package.xml").write_text(other)
+    (tmp_path / "src" / "magnetosuture_thread").symlink_to(ROOT)
+    found = {each.name for each in find_packages(str(tmp_path / "src")).values()}
+    assert found == {"magnetosuture_thread", "other"}
+    subprocess.run(shlex.split(LINK), cwd=tmp_path, check=True)
+    found = {each.name for each in find_packages(str(tmp_path / "src")).values()}
+    assert found == {"magnetosuture_thread", "magnetosuture_msgs", "other"}
+
+
+def test_every_folder_of_config_is_installed():
+    folders = {str(path.parent.relative_to(ROOT)) for path in (ROOT / "config").rglob("*") if path.is_file()}
+    setup = (ROOT / "setup.py").read_text()
+    assert folders == set(re.findall(r'files\("(config[\w/]*)/\*[.\w]*"\)', setup))
+
+
 def test_every_message_is_built():
     listed = set(re.findall(r'"msg/(\w+)\.msg"', (ROOT / "msg_defs" / "CMakeLists.txt").read_text()))
     assert listed == {path.stem for path in (ROOT / "msg_defs" / "msg").glob("*.msg")}
@@ -70,6 +101,38 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
     used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
     assert used <= declared
+
+
+def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
+    keys = {entry.text for tag in ("depend", "exec_depend") for entry in package_xml(ROOT / "package.xml").iter(tag)}
+    line = re.search(r"^ +pip install --break-system-packages (.+)$", INSTALLATION, re.MULTILINE)
+    assert line is not None
+    by_pip = {re.split("[^a-z0-9]", word)[0] for word in shlex.split(line[1])}
+    own = {"magnetosuture_thread", "typing_extensions"}  # the latter for mypy only
+    cluster = {"dask", "distributed", "pyarrow", "upath"}
+    names = {"cv2": "opencv", "PIL": "pil", "rosbags": "rosbags-pip"}
+    used = {name.split(".")[0] for path in MODULES for name in imported(path)} | {"lz4"}  # by import_module
+    used -= {*sys.stdlib_module_names, *own, *cluster}
+    missing = {name for name in used if not {name, f"python3-{names.get(name, name)}"} & keys}
+    assert missing == by_pip
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("shapely", r"pip install 'shapely>=2\.1'"),
+        ("cv2", "pip install 'opencv-python-headless>=4.6'"),
+        ("lz4.frame", "pip install 'lz4'"),
+        ("rclpy", "source the setup.bash of ROS"),
+        ("magnetosuture_msgs", "and of the workspace where this package is built"),
+        ("upath", r"pip install '\.\[cluster\]'"),
+    ],
+)
+def test_a_missing_package_is_named_with_the_line_that_installs_it(module: str, words: str):
+    text = missing_module(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    assert text.startswith(f"No module named {module!r}; ")
+    assert re.search(words, text)
+    assert ("'.[ros]'" in text) == ("setup.bash" in text)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.nodes import topics
 
-VIEWERS = Path(__file__).parent.parent / "config" / "viewers"
+ROOT = Path(__file__).parent.parent
+VIEWERS = ROOT / "config" / "viewers"
 RVIZ = yaml.safe_load((VIEWERS / "magnetosuture.rviz").read_text())["Visualization Manager"]
 FOXGLOVE: dict[str, Any] = json.loads((VIEWERS / "foxglove.json").read_text())
 KNOWN = {topic.channel.recorded: topic for topic in (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS)}
@@ -33,7 +35,7 @@ DISPLAYS = [display for display in RVIZ["Displays"] if "Topic" in display]
 def test_rviz_shows_what_is_there(display: dict[str, Any]):
     """RViz gets nothing of a publisher that offers less than it asks for."""
     asked = display["Topic"]
-    topic = KNOWN[asked["Value"]]
+    topic = KNOWN[f"/{asked['Value']}"]  # in the namespace of RViz
     assert topic.channel.type_name == SHOWN_BY[display["Class"]]
     if asked["Reliability Policy"] == "Reliable":
         assert topic.qos.reliability == ReliabilityPolicy.RELIABLE
@@ -42,7 +44,8 @@ def test_rviz_shows_what_is_there(display: dict[str, Any]):
 
 
 def test_both_look_at_the_dish():
-    assert RVIZ["Global Options"]["Fixed Frame"] == RVIZ["Views"]["Current"]["Target Frame"] == DISH_FRAME
+    assert RVIZ["Global Options"]["Fixed Frame"] == DISH_FRAME
+    assert RVIZ["Views"]["Current"]["Target Frame"] == RVIZ["Displays"][0]["Reference Frame"] == "<Fixed Frame>"
     assert FOXGLOVE["configById"]["3D!dish"]["followTf"] == DISH_FRAME
 
 
@@ -64,6 +67,17 @@ def fields_of(message: Any, path: str) -> bool:
         if isinstance(message, list):  # of another type of ours
             message = BarrierMargin()
     return True
+
+
+def test_the_documented_line_writes_foxgloves_layout_for_a_rig_with_a_namespace_and_prefix():
+    page = (ROOT / "docs" / "how_to" / "several_rigs.md").read_text()
+    (line,) = re.findall(r"^    (sed .+) > left\.json$", page, re.MULTILINE)
+    done = subprocess.run(line, shell=True, cwd=VIEWERS, capture_output=True, text=True, check=True)
+    layout = json.loads(done.stdout)
+    assert layout["configById"]["3D!dish"]["followTf"] == "left/dish"
+    assert layout["configById"]["DiagnosticSummary!nodes"] == FOXGLOVE["configById"]["DiagnosticSummary!nodes"]
+    given, written = (re.findall(r'"(/[^" ]+)', json.dumps(each)) for each in (FOXGLOVE, layout))
+    assert written == [name if name == "/diagnostics" else f"/left{name}" for name in given]
 
 
 def test_foxglove_shows_what_is_there():

@@ -16,6 +16,7 @@ from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording, UnfitError
 from magnetosuture_thread.bags.storage import (
     CDR,
+    MAX_SILENCE,
     QOS,
     UNCHECKED_NOTE,
     Connection,
@@ -115,8 +116,12 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
         types = bag.conflicts.get(name) or (bag.topics[name],)
         topics[name] = TopicReport(name, types, channel, is_empty, recording.unfit.get(name, ""))
     refused: Counter[str] = Counter()
+    silences, last = list[dict[str, float]](), 0.0
     for connection, record in bag.every_record(refused):
         time = (record.time - bag.start) * 1e-9
+        if time - last > MAX_SILENCE:
+            silences.append({"begin_s": last, "end_s": time})
+        last = time
         topics[record.topic].add(record, time, connection.serialization, recording)
         progress(time / max(bag.duration, 1e-9))
     return {
@@ -130,6 +135,7 @@ def inspect_bag(bag: Bag, dish_frame: str, progress: Callable[[float], None] = l
         "unverified": bag.unverified or None,
         "remarks": bag.remarks,
         "refused": dict(refused),
+        "silences": silences,
         "damage": None if bag.damage is None else _damage(bag.damage),
         "topics": [topic.to_json() for topic in topics.values()],
     }

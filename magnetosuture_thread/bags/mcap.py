@@ -48,7 +48,7 @@ from magnetosuture_thread.bags.storage import (
     verified_notes,
 )
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.files import is_url, open_ranges
+from magnetosuture_thread.files import HEAD_BYTES, is_url, open_ranges, substitute_problem
 from magnetosuture_thread.untrusted import (
     LONE_RECORD,
     MAX_BLOCK_BYTES,
@@ -655,8 +655,9 @@ class McapFile:
                     limit = summary.start if summary is not None else size
                     scan = Scanner(path.name, stream, limit, budget, progress).scan()
                     stream.seek(0)
-                    if stream.read(len(MAGIC)) != MAGIC and not scan.blocks and summary is None:
-                        raise BagError(path, "is no mcap file")
+                    head = stream.read(HEAD_BYTES)
+                    if not head.startswith(MAGIC) and not scan.blocks and summary is None:
+                        raise BagError(path, substitute_problem(head) or "is no mcap file")
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from error
         except BudgetError as error:
@@ -876,9 +877,10 @@ def _contradiction(summary: McapSummary, blocks: list[Block], counts: Counter[in
     if statistics is None:
         return ""
     filled = [block for block in blocks if block.counts]
+    start = min((block.start for block in filled), default=statistics.message_start_time)
     found = (
         counts.total(),
-        min((block.start for block in filled), default=statistics.message_start_time),
+        start or statistics.message_start_time,  # writers take a start of 0 ns for none, and the next time for it
         max((block.end for block in filled), default=statistics.message_end_time),
     )
     claimed = (statistics.message_count, statistics.message_start_time, statistics.message_end_time)

@@ -35,7 +35,7 @@ from magnetosuture_thread.bags.storage import (
     merge_reports,
 )
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.files import is_url
+from magnetosuture_thread.files import HEAD_BYTES, is_url, substitute_problem
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 SQLITE_UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
@@ -80,11 +80,12 @@ class SqliteFile:
         try:
             size = path.stat().st_size
             with path.open("rb") as stream:
-                magic = stream.read(len(_SQLITE_MAGIC))
+                magic = stream.read(HEAD_BYTES)
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from error
-        if magic != _SQLITE_MAGIC:
-            raise BagError(path, "is no sqlite3 file" if magic else "is empty, expected a sqlite3 file")
+        if not magic.startswith(_SQLITE_MAGIC):
+            problem = substitute_problem(magic) or "is no sqlite3 file"
+            raise BagError(path, problem if magic else "is empty, expected a sqlite3 file")
         self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
         self.unchecked = SQLITE_UNCHECKED

@@ -32,6 +32,7 @@ UNVERIFIED_NOTE = "unverified"  # note of a bag that was salvaged from one witho
 UNCHECKED_NOTE = "unchecked"  # note of a bag that was made from one whose damage could not have been noticed
 MAX_ALIASES = 16  # in metadata.yaml; some recorders write none, others a few
 _CHECKSUM = "crc32"  # note: of all others
+MAX_SILENCE = 5.0  # s without any message, which a person waits for; longer is a pause, or a clock that was set
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,15 @@ class DamageReport:
         chunks = f" in {pluralize(self.chunks, 'chunk')}" if self.chunks else ""
         verb = "is" if self.messages in (1, None) else "are"
         return f"is damaged ({where}): {lost}{chunks} {verb} lost, all else is read"
+
+
+def silence_text(begin: float, end: float) -> str:
+    """Return a line on a silence of more than `MAX_SILENCE`, with where it begins and ends in the bag [s]."""
+    after = math.floor(1e3 * end) * 1e-3  # not later than the message that ends it
+    return (
+        f"no message for {end - begin:.1f} s from {begin:.3f} s on, by a pause or a clock that was set: "
+        f"a live replay leaves this out, --start {after:.3f} begins after it"
+    )
 
 
 def pluralize(count: int, noun: str) -> str:
@@ -229,6 +239,7 @@ def find_bag_files(path: Path) -> BagFiles:
         raise BagError(path, f"is compressed as a whole; decompress it first: zstd -d {compressed[0]}")
     if is_file:
         return BagFiles([path])
+    files = files or [file for file in inside if file.suffix == ".bag"][:1]  # of ROS 1, which opening it names
     if not files:
         raise BagError(path, f"holds no {' or '.join(STORAGE_SUFFIXES)} file")
     content, remarks = _read_metadata(path)

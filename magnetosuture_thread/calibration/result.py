@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 from rich.table import Table
 
+from magnetosuture_thread.bags.storage import MAX_SILENCE
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, mean_across, mean_error
-from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
@@ -96,6 +97,7 @@ class BagErrors:
         across_after: calibrated; this is what was made least.
         unverified: why any message of the bag may be wrong; empty if nothing speaks against them.
         simulated: what of it is simulated; empty if nothing says so.
+        silence: time without a needle in words; empty if it is never longer than `MAX_SILENCE`.
     """
 
     name: str
@@ -110,6 +112,7 @@ class BagErrors:
     across_after: float = math.nan
     unverified: str = field(default="", kw_only=True)
     simulated: str = field(default="", kw_only=True)
+    silence: str = field(default="", kw_only=True)
 
     @property
     def warning(self) -> str:
@@ -147,8 +150,11 @@ class BagFit(NamedTuple):
             for vertices in self[1:]
         ]
         across = [mean_across(vertices, run, length) for vertices in (self.before, self.after)]
-        frames, unverified = len(run.frames), run.unverified
-        return BagErrors(run.name, frames, *errors, *across, unverified=unverified, simulated=run.simulated)
+        times = (run.stamps - run.stamps[0]) * 1e-9
+        silence = SensorSilence.of(times, 0.0, float(times[-1]))
+        found = BagErrors(run.name, len(run.frames), *errors, *across)
+        words = str(silence) if silence.max_gap > MAX_SILENCE else ""
+        return replace(found, unverified=run.unverified, simulated=run.simulated, silence=words)
 
 
 @dataclass(frozen=True)
@@ -337,7 +343,8 @@ def bag_table(found: Mapping[str, Any]) -> Table:
     truth = any(row["truth_after"] is not None for row in found["bags"])
     fitted = "the measured thread" if found["against"] == "seen" else "ground truth"
     table = Table(title=f"prediction error, fitted to {fitted}")
-    table.caption = "mean over time of the mean distance of the nodes, % of the length"
+    silences = [f"{row['name']} is {row['silence']}" for row in found["bags"] if row["silence"]]
+    table.caption = "; ".join(["mean over time of the mean distance of the nodes, % of the length", *silences])
     table.add_column("bag", overflow="fold", min_width=12)
     table.add_column("frames", justify="right")
     keys = ["before", "after", *(["held_out"] if len(found["bags"]) > 1 else [])]

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from magnetosuture_thread.bags.check import inspect_bag, write_repaired_bag
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.bags.storage import pluralize
+from magnetosuture_thread.bags.storage import pluralize, silence_text
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.texts import one_line
@@ -40,7 +40,8 @@ def run_check(options: argparse.Namespace, terminal: command.Terminal) -> int:
 
     The whole bag is read: every checksum, and every message's time and stamp. For each topic: its type, how
     many messages, their mean rate, when the first and the last came, the greatest gap, and how often a stamp
-    went back; the types follow. What is damaged is reported, with what is lost; all else is shown as it can be read.
+    went back; the types follow, and when nothing was recorded for more than 5 s. What is damaged is reported, with what
+    is lost; all else is shown as it can be read.
     """
     with terminal.progress("bag check") as advance:
         bag = Bag(options.bag, remap=dict(options.remap), progress=lambda share: advance(0.5 * share))
@@ -96,7 +97,7 @@ def _times(first: int | None, last: int | None, start: int) -> str:
 
 
 def _shown(places: list[str]) -> list[str]:
-    """Return a line for each of 100 damaged places, and how many are not shown; `--json` writes all."""
+    """Return a line for each of 100 places, and how many are not shown; `--json` writes all."""
     others = len(places) - 100
     return [f"  {place}" for place in places[:100]] + ([f"  and {others} other places"] if others > 0 else [])
 
@@ -129,6 +130,7 @@ def _lines(found: dict[str, Any]) -> Iterator[str]:
             yield f"{name}: {topic['stamps_going_back']} stamps are before the one before them"
         if topic["unreadable_stamps"]:
             yield f"{name}: {topic['unreadable_stamps']} stamps cannot be read"
+    yield from _shown([silence_text(each["begin_s"], each["end_s"]) for each in found["silences"]])
     for file in found["files"]:
         yield "; ".join(f"{key} {value}" for key, value in file.items())
     for key, value in found["notes"].items():

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 
 from magnetosuture_thread import interface
@@ -19,7 +20,7 @@ from magnetosuture_thread.commands import recorded, replay
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, ReplaySummary
-from magnetosuture_thread.evaluation.metrics import RunMetrics, stage_latencies
+from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, stage_latencies
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import COMPILING
@@ -297,9 +298,9 @@ def _summary(
         if record.topic == interface.CURRENTS.recorded:
             replayed.add(message)
     metrics, losses = collector.metrics(given.recording.start), live.losses
-    frames, things = losses.frames_played, "frames"
+    frames, things, channel = losses.frames_played, "frames", given.recording.camera
     if given.source == "poses":
-        frames, things = losses.played[interface.NEEDLE_POSE.name], "poses"
+        frames, things, channel = losses.played[interface.NEEDLE_POSE.name], "poses", interface.NEEDLE_POSE
     if not len(metrics.series):
         health = "; ".join(f"{name}: {text}" for name, text in sorted(collector.health.items()))
         raise GraphError(f"none of {frames} {things} gave a prediction, {collector.poses} had a needle; {health}")
@@ -307,5 +308,8 @@ def _summary(
     counts: dict[str, Any] = {"frames": frames, "tracked": collector.poses, "commands": len(commands)}
     counts |= {"driven": len(collector.applied & set(commands)), "dropped": losses.dropped()}
     latency = stage_latencies(live.published, live.arrived, collector.applied)
+    stamps = live.published[channel.name] if channel is not None else ()
+    times = 1e-9 * (np.array([*stamps], dtype=np.int64) - given.recording.start).astype(np.float64)
+    others |= {"silence": SensorSilence.of(times, given.start, given.start + given.duration)}
     currents = replayed.against(before)
     return metrics, replay.replay_summary(given, metrics, **counts, latency=latency, currents=currents, **others)

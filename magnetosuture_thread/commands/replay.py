@@ -17,7 +17,7 @@ from magnetosuture_thread.commands import command, recorded
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.graph_outputs import ReplaySummary
-from magnetosuture_thread.evaluation.metrics import RunMetrics, compare_errors, finite_or_none
+from magnetosuture_thread.evaluation.metrics import RunMetrics, SensorSilence, compare_errors, finite_or_none
 from magnetosuture_thread.evaluation.tables import summary_table
 from magnetosuture_thread.messages import packing
 from magnetosuture_thread.messages.reading import stamp_of
@@ -116,12 +116,13 @@ def replay_offline(
         refused = Counter[str]()
         with BagWriter(folder / "bag", given.notes) as bag:
             made = _Output(bag, seen, given)
-            steps = recorded.predictions(seen, given.setup.model, given.setup.scene)
+            steps = recorded.predictions(seen, given.setup.model, given.setup.scene, metrics.observe)
             began = time.perf_counter()  # kernels are loaded
             for step in steps:
                 made.write(step)
                 recorded.measure_step(step, metrics, refused)
-            speed = given.duration / (time.perf_counter() - began)
+            silence = SensorSilence.of(metrics.observed.times, given.start, given.start + given.duration)
+            speed = (given.duration - silence.total) / (time.perf_counter() - began)
         log(f"{speed:.3g} times as fast as it was recorded; evaluating the outputs")
         reasons = (refused + seen.refused + given.recording.refused).most_common()
         if not len(metrics.series):
@@ -129,7 +130,8 @@ def replay_offline(
             found = f"{seen.found} of {seen.count} {things} had a needle"
             raise BagError(given.recording.path, f"gave no prediction: {found}; {words}")
         counts: dict[str, Any] = {"frames": seen.count, "tracked": seen.found, "commands": 0, "driven": 0}
-        others = {"latency": {}, "speed": speed, "refused": dict(reasons), "remark": seen.thread_problem()}
+        others = {"latency": {}, "speed": speed, "refused": dict(reasons)}
+        others |= {"silence": silence, "remark": seen.thread_problem()}
         summary = replay_summary(given, metrics, **counts, **others)
         if summary.remark:
             log(summary.remark)

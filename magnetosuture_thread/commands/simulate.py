@@ -23,7 +23,7 @@ from magnetosuture_thread.commands.recorded import SETUP_NOTE
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.evaluation.metrics import finite_or_none
-from magnetosuture_thread.evaluation.tables import loop_table
+from magnetosuture_thread.evaluation.tables import loop_table, outcome_line
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.planning.procedure import read_procedure
@@ -40,6 +40,9 @@ OPTIONAL = (
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 EXTRA_TIME = 20.0  # s of simulated time
+MIN_RATE = 0.5
+MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
+TOO_SLOW = "machine too slow"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +56,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--procedure", default="", metavar="NAME", help="execute a procedure, by its name or YAML file")
     clock = parser.add_mutually_exclusive_group()
     rate = "run with a simulated clock, this much faster than real time (default: in real time)"
-    clock.add_argument("--rate", type=command.number_argument(0.5, 5.0), help=rate)
+    clock.add_argument("--rate", type=command.number_argument(MIN_RATE, 5.0), help=rate)
     boards = "drive simulated RoboClaw boards, by the driver for real ones"
     clock.add_argument("--boards", action="store_true", help=boards)
     option("--json", type=command.output_file, metavar="FILE", help="write the figures to a file")
@@ -68,7 +71,8 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     simulated, and the bag says so.
 
     With --procedure, needle_planner executes it in place of path_follower. Whether it succeeded, or why it failed, is
-    printed before the table, and is in summary.json in BAG.
+    at the end of the table, and in summary.json in BAG. Where the computer skips a tenth of the frames or more, that is
+    the reason: a lower --rate gives it more time.
 
     SETUP is a setup with waypoints in its section path_follower, which a procedure needs not. BAG, which must not
     exist, records every topic, including ground truth, and the nodes' logs; `replay` takes it. Ctrl-C ends the run,
@@ -83,20 +87,21 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
         if new and options.output.exists():
             terminal.log(f"what was recorded is in {options.output}")
         raise
-    outcome = summary.procedure
-    if outcome is not None:
-        terminal.log(outcome_text(outcome))
     terminal.print(loop_table(summary))
+    if summary.too_slow:
+        terminal.log(f"{TOO_SLOW}: {summary.too_slow}")
     terminal.log(f"bag: {options.output}")
     command.write_json(options.json, summary.to_json())
-    return command.FAILED if outcome is not None and outcome["state"] in ("not begun", "failed") else command.DONE
+    outcome = summary.procedure
+    return command.FAILED if outcome and outcome["state"] in ("not begun", "failed", TOO_SLOW) else command.DONE
 
 
-def outcome_text(outcome: dict[str, Any]) -> str:
-    """Return what came of a procedure in one line: its state, the goals met, and the reason where it failed."""
-    state = "succeeded" if outcome["state"] == clients.DONE else outcome["state"]
-    reason = f": {outcome['reason']}" if outcome["reason"] else ""
-    return "procedure {procedure}: {0}, {goals_met} of {goals} goals met{1}".format(state, reason, **outcome)
+def too_slow(skipped: int, taken: int, rate: float) -> str:
+    """Return that a run skipped more frames than `MAX_SKIPPED`, and what to do; empty if it did not."""
+    if skipped <= MAX_SKIPPED * (skipped + taken):
+        return ""
+    remedy = f"try --rate {max(MIN_RATE, 0.5 * rate):g}" if rate > MIN_RATE else "end other programs"
+    return f"{skipped} of {skipped + taken} frames skipped; {remedy}"
 
 
 def simulate(
@@ -151,10 +156,15 @@ def simulate(
     log("evaluating the run")
     figures = {"setup": setup.name, "procedure": task.result}
     try:
-        summary = replace(measure_loop(Bag(output), setup).summary(setup.name), procedure=task.result)
+        summary = measure_loop(Bag(output), setup).summary(setup.name)
+        slow = too_slow(summary.skipped, summary.frames, rate or 1.0)
+        if slow and task.result is not None and task.result["state"] == "failed":  # which tells nothing of the planner
+            task.result |= {"state": TOO_SLOW, "reason": f"{slow}; then {task.result['reason']}"}
+        summary = replace(summary, procedure=task.result, too_slow=slow)
         figures = summary.to_json()
     except GraphError as error:
-        raise GraphError(f"{outcome_text(task.result)}; {error}" if task.result else str(error)) from None
+        told = "{}: {}, {}; ".format(*outcome_line(task.result)) if task.result else ""
+        raise GraphError(f"{told}{error}") from None
     finally:
         if task.result is not None:
             (output / SUMMARY_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")

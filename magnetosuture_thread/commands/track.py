@@ -25,7 +25,7 @@ from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.metrics import finite_or_none
+from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
 from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
 from magnetosuture_thread.messages.reading import stamp_of
@@ -397,5 +397,8 @@ def _table(rows: Sequence[dict[str, Any]]) -> Table:
     if len(rows) > 20:
         lines.append((f"and {len(rows) - 20} more", "", "", "", "", "", ""))
     caption = "tail and thread's length in mm, heading in degrees, confidence, processor time"
+    if began is not None:
+        times = np.array([row["stamp_s"] - began for row in rows])
+        caption = "; ".join(filter(None, (caption, str(SensorSilence.of(times, 0.0, float(times.max()))))))
     columns = ("frame", "status", "tail", "heading", "thread", "sure", "ms")
     return command.make_table(f"{len(rows)} frames", columns, lines, caption, left=2)

@@ -233,12 +233,14 @@ def _margin(about: BagDetails, metrics: RunMetrics) -> Headline:
     broken = [least.kind.replace("_", " ") for least in minima if not _holds(about, least)]
     worst = min(minima, key=lambda least: least.clearance - _min_clearance(about, least))
     if not broken:
-        worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.clearance, default=worst)
+        worst = min((least for least in minima if least.kind in SOLID), key=lambda m: m.promised, default=worst)
     touching = f"; touches in {_count(metrics.contact_frames, 'frame')}" if metrics.contact_frames else ""
     detail = f"at {worst.time:.2f} s, node {worst.node}{touching}"
+    if worst.chord is not None:
+        detail = f"of nodes; a chord between two, {micrometres(worst.chord)}, {detail}"
     grade = ("bad", f"broken: {', '.join(broken)}") if broken else ("good", "every barrier holds")
     name = f"minimum margin, {worst.kind.replace('_', ' ')}"
-    return Headline(name, micrometres(worst.clearance), detail, *grade)
+    return Headline(name, micrometres(worst.promised), detail, *grade)
 
 
 def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
@@ -247,15 +249,14 @@ def _min_clearance(about: BagDetails, least: MinimumMargin) -> float:
 
 
 def _holds(about: BagDetails, least: MinimumMargin) -> bool:
-    # What the program keeps outside of something solid is h, of nodes; on a disc the chord between two lies deeper.
-    return (least.value if least.kind in SOLID else least.clearance) >= _min_clearance(about, least)
+    return least.promised >= _min_clearance(about, least)
 
 
 def margin_state(about: BagDetails, margin: MinimumMargin) -> str:
     """Return as text whether a barrier held."""
     if not _holds(about, margin):
         return "broken"
-    return "holds" if margin.clearance >= -1e-9 else "holds within the tolerance"
+    return "holds" if margin.promised >= -1e-9 else "holds within the tolerance"
 
 
 def _strain(strain: float) -> Headline:

@@ -17,6 +17,7 @@ from magnetosuture_thread.evaluation.metrics import (
     MinimumMargin,
     Percentiles,
     RunMetrics,
+    SensorSilence,
     compare_errors,
     finite_or_none,
 )
@@ -255,6 +256,7 @@ class ReplaySummary(RunSummary):
         speed: how many seconds of the bag were worked through in a second, of an offline replay; else None.
         refused: frames and poses that could not be used, by why.
         dropped: messages that got lost on a way, by which; empty offline, where there are none.
+        silence: time without frames, or poses.
         damage: what of the bag could not be read, empty if nothing.
         unverified: why any message of the bag may be wrong, empty if nothing speaks against them.
         remark: what else to know of the bag, empty if nothing.
@@ -275,6 +277,7 @@ class ReplaySummary(RunSummary):
     speed: float | None = None
     refused: dict[str, int] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
+    silence: SensorSilence = field(default_factory=SensorSilence)
     damage: str = ""
     unverified: str = ""
     remark: str = ""
@@ -282,6 +285,7 @@ class ReplaySummary(RunSummary):
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values; units as above. Those of `estimation` stand beside the others."""
         figures = {name: value for name, value in asdict(self).items() if name != "estimation"}
+        figures["silence"]["at"] = finite_or_none(self.silence.at)
         events = [asdict(event) for event in self.estimation.disturbances]
         return figures | self.estimation.to_json() | {"disturbances": events}
 
@@ -303,6 +307,7 @@ class LoopSummary(RunSummary):
         path_error_greatest: greatest such distance [m].
         processing: of a frame in the tracker [s].
         procedure: what came of a procedure; None for a path that was followed.
+        too_slow: that the computer was too slow for the run, and what to do; empty if it was not.
     """
 
     duration: float
@@ -316,6 +321,7 @@ class LoopSummary(RunSummary):
     path_error_greatest: float
     processing: Percentiles | None
     procedure: dict[str, Any] | None = None
+    too_slow: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as plain values, None where there is none; units as above."""

@@ -28,7 +28,7 @@ from magnetosuture_thread.evaluation.frames import (
 )
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import SOLID, Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first
 KINDS = {"prediction": "", "estimate": "estimate_"}  # of threads, and how the columns of their errors begin
@@ -169,6 +169,15 @@ class SensorSilence:
     max_gap: float = 0.0
     at: float = math.nan
 
+    @property
+    def longest(self) -> str:
+        """The longest gap in words."""
+        return f"{self.max_gap:.1f} s at the longest, from {self.at:.2f} s on"
+
+    def __str__(self) -> str:
+        """Return the gaps in words; empty if there are none."""
+        return f"without frames for {self.total:.1f} s, {self.longest}" if self.gaps else ""
+
     @classmethod
     def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
         """Return the gaps between frames, and before the first and after the last, where they are of one clock.
@@ -210,6 +219,16 @@ class MinimumMargin:
     node: int
     obstacle: int
     time: float
+
+    @property
+    def promised(self) -> float:
+        """What the barrier keeps at 0 or more [m]: beside a shape or the wall h of the nodes, else the clearance."""
+        return self.value if self.kind in SOLID else self.clearance
+
+    @property
+    def chord(self) -> float | None:
+        """The clearance of the chord between two nodes where it lies in a shape, as on a round one [m]; else None."""
+        return self.clearance if self.clearance < min(0.0, self.promised) - 1e-9 else None
 
 
 def hidden_part(frame: FrameResult, length: float) -> float:

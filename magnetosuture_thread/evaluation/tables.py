@@ -167,7 +167,8 @@ def bags_table(rows: Sequence[Row]) -> Table:
     """Return the table for a terminal: the figures that matter most, and mean and worst."""
     caption = (
         "errors in % of the length, mean and maximum over time, of the estimate,\n"
-        "and below of the prediction; margin: the minimum of an obstacle;\n"
+        "and below of the prediction; margin: the minimum of an obstacle,\n"
+        "chords between nodes included;\n"
         "step: median of the model's"
     )
     if any(row["simulated"] for row in rows):
@@ -253,6 +254,8 @@ def summary_table(summary: ReplaySummary) -> Table:
             ("messages dropped", str(sum(summary.dropped.values())), "of those played"),
             *(("  dropped", str(count), which) for which, count in summary.dropped.items() if count),
         ]
+    if summary.silence.gaps:
+        frames.append(("frames are missing", f"{summary.silence.total:.1f} s", summary.silence.longest))
     doubts = {"the bag is damaged": summary.damage, "the bag is unverified": summary.unverified}
     frames += [(name, "", why) for name, why in {**doubts, "setup in doubt": summary.remark}.items() if why]
     times: list[Line] = [
@@ -261,10 +264,12 @@ def summary_table(summary: ReplaySummary) -> Table:
     ]
     if summary.speed is not None:
         times.append(("speed", f"{summary.speed:.3g}", "times as fast as recorded"))
-    margins: list[Line] = [("minimum margin", "", "0 or more is safe; lengths are met to 0.1 %")]
+    margins: list[Line] = [("minimum margin", "", "0 or more is safe, of nodes; lengths are met to 0.1 %")]
     for margin in summary.least_margins:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
-        margins.append((f"  {margin.kind}", micrometres(margin.clearance), f"{where}, at {margin.time:.2f} s"))
+        margins.append((f"  {margin.kind}", micrometres(margin.promised), f"{where}, at {margin.time:.2f} s"))
+        if margin.chord is not None:
+            margins.append(("    a chord there", micrometres(margin.chord), "between two nodes; no barrier keeps it"))
     margins += [
         ("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted)),
         ("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment"),
@@ -285,7 +290,7 @@ def loop_table(summary: LoopSummary) -> Table:
     """Return the figures of a closed loop as a table."""
     frames: list[Line] = [
         ("camera frames", str(summary.frames), f"over {summary.duration:.1f} s of steering"),
-        ("  skipped", str(summary.skipped), "the rig had no time for them"),
+        ("  skipped", str(summary.skipped), summary.too_slow or "the rig had no time for them"),
         ("  tracked", str(summary.tracked), f"{summary.lost} looked at and lost"),
         ("  wrong poses", str(summary.wrong), "more than 0.3 mm or 5 degrees from the ground truth"),
         ("  predicted", str(summary.predicted), _share(summary.predicted, summary.frames)),
@@ -300,7 +305,17 @@ def loop_table(summary: LoopSummary) -> Table:
     latency = {f"to {name}": found for name, found in summary.latency.items()}
     latency |= {"tracker alone": summary.processing, "model step alone": summary.step_time}
     times: list[Line] = [("latency from the frame's stamp", "", "99th percentile, maximum"), *_times(latency)]
-    return _figures_table(f"{summary.setup}, closed loop, simulated", [frames, needle, times, _errors(summary)])
+    sections = [frames, needle, times, _errors(summary)]
+    if summary.procedure is not None:
+        sections.append([outcome_line(summary.procedure)])
+    return _figures_table(f"{summary.setup}, closed loop, simulated", sections)
+
+
+def outcome_line(outcome: Mapping[str, Any]) -> Line:
+    """Return what came of a procedure: its name, its state, the goals met and the reason where it failed."""
+    state = "succeeded" if outcome["state"] == "done" else outcome["state"]
+    met = f"{outcome['goals_met']} of {outcome['goals']} goals met"
+    return f"procedure {outcome['procedure']}", state, f"{met}: {outcome['reason']}" if outcome["reason"] else met
 
 
 def _figures_table(title: str, sections: Sequence[Sequence[Line]]) -> Table:

@@ -13,7 +13,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import DISH_FRAME
 
 BEGIN = b"\x00\x01\x00\x00"  # plain CDR, little endian, as every ROS 2 machine of today writes it
-_DISH = struct.pack("<I", len(DISH_FRAME) + 1) + DISH_FRAME.encode() + b"\0"
+_DISH = struct.pack("<I", len(DISH_FRAME.encode()) + 1) + DISH_FRAME.encode() + b"\0"
 DISH_END = len(BEGIN) + 8 + len(_DISH)  # where a header in the dish frame ends, behind its stamp
 _COUNT = struct.Struct("<I")
 

@@ -69,14 +69,16 @@ def packed_pose_stamped(stamp: Stamp, point: Vector, angle: float) -> bytes:
 
 
 PATH_AT = aligned(DISH_END, 4) + 4  # where the poses of a path begin, behind their count
-PATH_POSES = np.dtype(  # each begins at a multiple of 8
+_POSITION_AT = aligned(DISH_END, 8) - len(BEGIN)  # in a pose that begins at a multiple of 8
+PATH_POSES = np.dtype(  # all but the first begin there
     {
         "names": ["time", "frame", "x", "y", "z", "w"],  # z and w of the quaternion
         "formats": ["V8", f"V{DISH_END - len(BEGIN) - 8}", "<f8", "<f8", "<f8", "<f8"],
-        "offsets": [0, 8, 24, 32, 64, 72],
-        "itemsize": 80,
+        "offsets": [0, 8, *(_POSITION_AT + np.array([0, 8, 40, 48])).tolist()],
+        "itemsize": _POSITION_AT + 56,
     }
 )
+PATH_GAP = aligned(PATH_AT, 8) - PATH_AT  # bytes more before the first position, by the length of the frame's name
 
 
 def packed_path(stamp: Stamp, points: Points) -> bytes:
@@ -86,7 +88,9 @@ def packed_path(stamp: Stamp, points: Points) -> bytes:
     poses["time"], poses["frame"] = np.void(header[:8]), np.void(header[8:])
     half = 0.5 * points[:, 2] if points.shape[1:] == (3,) else np.zeros(len(points))
     poses["x"], poses["y"], poses["z"], poses["w"] = points[:, 0], points[:, 1], np.sin(half), np.cos(half)
-    return pack("header uint32 raw", stamp, len(points), poses.tobytes())
+    data = poses.tobytes()
+    data = data[:_POSITION_AT] + bytes(PATH_GAP if len(points) else 0) + data[_POSITION_AT:]
+    return pack("header uint32 raw", stamp, len(points), data)
 
 
 def packed_twist(stamp: Stamp, velocity: Vector) -> bytes:

@@ -15,7 +15,7 @@ from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import heading_from_quaternion, round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.messages.cdr import BEGIN, DISH_END, header_stamp, is_in_dish_frame
-from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_POSES
+from magnetosuture_thread.messages.packing import IN_PLANE, PATH_AT, PATH_GAP, PATH_POSES
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
@@ -356,7 +356,7 @@ def read_observation(record: RecordedMessage) -> ThreadObservation:
 
 def _plain_path(data: bytes) -> Points | None:
     """Return a path whose poses all are in the dish frame, as ours are, so that they lie at equal distances."""
-    if not is_in_dish_frame(data) or len(data) < PATH_AT:
+    if PATH_GAP or not is_in_dish_frame(data) or len(data) < PATH_AT:
         return None
     (count,) = struct.unpack_from("<I", data, PATH_AT - 4)
     if len(data) < PATH_AT + count * PATH_POSES.itemsize:

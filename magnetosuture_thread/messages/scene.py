@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.obstacles import Disc, Polygon, triangulate
 from magnetosuture_thread.geometry.obstacles.shapes import Ring
 from magnetosuture_thread.interface import DISH_FRAME, SCENE
 from magnetosuture_thread.messages.cdr import Stamp, pack
@@ -57,7 +58,7 @@ def parse_scene_message(message: Any) -> Scene:
     frame = message.header.frame_id
     if frame != DISH_FRAME:
         raise InvalidInputError(f"{SCENE.name}.header.frame_id", repr(frame[:MAX_NAME_CHARS]), repr(DISH_FRAME))
-    _require_bounds(message)
+    _require_bounds(message.shapes)
     try:
         wall_friction = float(getattr(message, "wall_friction", 0.0))  # not in messages of before
         self_contact = _self_contact(int(getattr(message, "self_contact", 0)))
@@ -77,22 +78,36 @@ def _self_contact(value: int) -> bool | None:
     return next(setting for setting, number in SELF_CONTACT.items() if number == value)
 
 
-def _require_bounds(message: Any) -> None:
-    """Refuse an oversized message before anything is built from it."""
+def parse_shape_message(message: Any) -> SceneShape:
+    """Parse a SceneShape message and validate it.
+
+    Raises:
+        InvalidInputError: it is too large, or neither a disc nor a polygon.
+        ConfigurationError: anything in it is out of bounds.
+    """
+    _require_bounds([message])
+    shape = _shape_of(message)
+    if isinstance(shape.geometry, Polygon):
+        triangulate(shape.geometry)  # as its markers will be
+    return shape
+
+
+def _require_bounds(shapes: Sequence[Any]) -> None:
+    """Refuse oversized shapes before anything is built from them."""
 
     def require(field: str, count: int, maximum: int) -> None:
         if count > maximum:
             raise InvalidInputError(f"{SCENE.name}.{field}", count, f"at most {maximum}")
 
-    require("shapes", len(message.shapes), MAX_SHAPES)
-    for index, shape in enumerate(message.shapes):
+    require("shapes", len(shapes), MAX_SHAPES)
+    for index, shape in enumerate(shapes):
         field = f"shapes[{index}]"
         require(f"{field}.name", len(shape.name), MAX_NAME_CHARS)
         require(f"{field}.kind", len(shape.kind), MAX_NAME_CHARS)
         if len(shape.disc) + len(shape.polygon) != 1:
             given = f"{len(shape.disc)} discs and {len(shape.polygon)} polygons"
             raise InvalidInputError(f"{SCENE.name}.{field}", given, "one disc or one polygon")
-    polygons = [polygon for shape in message.shapes for polygon in shape.polygon]
+    polygons = [polygon for shape in shapes for polygon in shape.polygon]
     rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
     require("shapes.polygon", len(rings), MAX_OUTLINES)
     require("shapes.polygon.corners", sum(len(ring.corners) for ring in rings), MAX_VERTICES)

@@ -146,7 +146,7 @@ class Health:
             level=DiagnosticStatus.WARN if self._standby else self._level,
             name=f"{self._node.get_fully_qualified_name().lstrip('/')}: state",
             message=self._standby or self._text,
-            hardware_id="magnetosuture",
+            hardware_id=self._node.get_namespace().strip("/") or "magnetosuture",  # a rig has a namespace
             values=[KeyValue(key=key, value=shortened(str(value), MAX_REASON_CHARS)) for key, value in values.items()],
         )
         message = DiagnosticArray(status=[status])

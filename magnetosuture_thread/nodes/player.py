@@ -13,6 +13,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread import InvalidInputError, interface
+from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.messages.cdr import header_stamp
 from magnetosuture_thread.messages.reading import nanoseconds
@@ -207,6 +208,12 @@ class LiveReplay:
             publisher = self._inputs.get(record.topic)
             if publisher is None:
                 continue
+            if record.time - clock > 1e9 * MAX_SILENCE:
+                clock = self._drain(clock)  # what is under way belongs before the silence
+                begin, end = ((at - self._time.start) * 1e-9 for at in (clock, record.time))
+                self._log(silence_text(begin, end))
+                self._time.skip_to(record.time)
+                clock = record.time
             clock = self._run_clock(clock, record.time)
             self._publish_clock(record.time)
             self._publish(publisher, record)
@@ -237,15 +244,16 @@ class LiveReplay:
             self.losses.heard(name, stamp, None)
             self._receive(record.topic, record.time, bytes(record.data))
 
-    def _drain(self, clock: int) -> None:
-        """Let time go on until the graph has taken and answered all, and no more answers come."""
+    def _drain(self, clock: int) -> int:
+        """Let time go on until the graph has taken and answered all, and no more answers come; return the next tick."""
         deadline = self._time.running() + 30.0
         self._last_answer = time.perf_counter()
         while self._time.running() < deadline:
             enough = STUCK if self.losses.poses_waiting else QUIET
             if not self.losses.frames_waiting and time.perf_counter() > self._last_answer + enough:
-                return
+                break
             clock = self._run_clock(clock, clock + CLOCK_PERIOD)
+        return clock
 
     def _run_clock(self, clock: int, until: int) -> int:
         """Publish /clock up to a simulated time, taking outputs all the while; return the next tick."""

@@ -9,7 +9,7 @@ from typing import Any
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
 from magnetosuture_thread.interface import SCENE_SERVER, Service
 from magnetosuture_thread.messages.markers import packed_scene_markers
-from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.messages.scene import packed_scene, parse_shape_message
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.scene.files import SceneEditor, SceneServerSettings
@@ -33,8 +33,8 @@ class SceneServerNode(ManagedNode[SceneServerSettings]):
         self._markers = self.held(topics.SCENE_MARKERS.publisher(self))
         for service, change in (
             (Service.LOAD_SCENE, lambda asked: editor.load(asked.file)),
-            (Service.ADD_SHAPE, lambda asked: editor.add(asked.name, asked.shape)),
-            (Service.REPLACE_SHAPE, lambda asked: editor.replace(asked.name, asked.shape)),
+            (Service.ADD_SHAPE, lambda asked: editor.add(parse_shape_message(asked.shape))),
+            (Service.REPLACE_SHAPE, lambda asked: editor.replace(parse_shape_message(asked.shape))),
             (Service.REMOVE_SHAPE, lambda asked: editor.remove(asked.name)),
         ):
             self.held(self.serve(service, partial(self._change, change)))

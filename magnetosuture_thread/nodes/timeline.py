@@ -18,6 +18,7 @@ class Timeline:
         start: as given.
         stood: real time of all pauses that are over [s].
         lag: simulated time that was left out, as the computer was too slow for it [s].
+        skipped: simulated time that was left out, as nothing happens in it [s].
     """
 
     def __init__(self, start: int, rate: float) -> None:
@@ -25,11 +26,11 @@ class Timeline:
         self._rate = rate
         self._began: float | None = None
         self._paused: float | None = None
-        self.stood = self.lag = 0.0
+        self.stood = self.lag = self.skipped = 0.0
 
     def begin(self) -> None:
         """Begin, or begin anew, at the start."""
-        self._began, self.stood = time.perf_counter(), 0.0
+        self._began, self.stood, self.skipped = time.perf_counter(), 0.0, 0.0
         self._paused = self._began if self._paused is not None else None
 
     @property
@@ -63,7 +64,11 @@ class Timeline:
 
     def elapsed(self) -> float:
         """Return the simulated time since the start [s]."""
-        return self.running() * self._rate - self.lag
+        return self.running() * self._rate - self.lag + self.skipped
+
+    def skip_to(self, simulated: int) -> None:
+        """Leave out the time until a simulated time [ns]."""
+        self.skipped += (simulated - self.now()) * 1e-9
 
     def now(self) -> int:
         """Return the simulated time [ns]."""
@@ -73,4 +78,4 @@ class Timeline:
         """Return how long it takes until a simulated time [ns], in real time [s]; for ever while it is paused."""
         if self._paused is not None:
             return math.inf
-        return (simulated - self.start) * 1e-9 / self._rate - self.running()
+        return ((simulated - self.start) * 1e-9 - self.skipped) / self._rate - self.running()

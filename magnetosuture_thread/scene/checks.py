@@ -80,10 +80,11 @@ def _shape_warnings(shape: SceneShape, dish_radius: float, needle_width: float) 
     elif room < needle_width:
         yield SceneWarning("gap", (shape.name,), room, (x, y), _gap(f"{shape.name} and the wall", room, (x, y)))
     for hole in map(shapely.Polygon, shape.solid.interiors):
-        if hole.buffer(-0.5 * needle_width).is_empty:
-            circle = shapely.maximum_inscribed_circle(hole, tolerance=0.01 * needle_width)
-            x, y = circle.coords[0]
-            width = 2.0 * circle.length
+        tolerance = 0.01 * needle_width
+        circle = shapely.maximum_inscribed_circle(hole, tolerance)
+        x, y = circle.coords[0]
+        width = 2.0 * circle.length
+        if width < needle_width - tolerance:
             text = f"a hole of {shape.name} at {_at((x, y))} is {_mm(width)} mm wide: narrower than the needle"
             yield SceneWarning("hole", (shape.name,), width, (x, y), text)
 

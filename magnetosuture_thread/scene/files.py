@@ -26,13 +26,13 @@ import shapely
 import shapely.geometry
 import yaml
 
-from magnetosuture_thread.configuration import Configuration, autostart_parameter, read_yaml, read_yaml_text
+from magnetosuture_thread.configuration import Configuration, autostart_parameter, read_yaml
 from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.files import read_regular
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.outputs import output_problem
 from magnetosuture_thread.resources import find_scene_file
-from magnetosuture_thread.scene.scene import MAX_NAME_CHARS, MAX_SHAPES, Dish, Scene, SceneShape, is_number
+from magnetosuture_thread.scene.scene import MAX_SHAPES, Dish, Scene, SceneShape, is_number
 from magnetosuture_thread.scene.shapes import (
     DISH_FIELDS,
     dish_from_mapping,
@@ -47,7 +47,6 @@ from magnetosuture_thread.shared_parameters import shared_parameter
 from magnetosuture_thread.untrusted import MAX_TEXT_BYTES
 
 GEOJSON_ENDINGS = (".json", ".geojson")
-MAX_SHAPE_CHARS = 300_000  # 10,000 vertices in full precision
 DISH = "dish"  # kind of the feature that is the dish
 GEOMETRY_TOLERANCE = 1e-7  # m; drawing programs round coordinates to no less
 PROPERTIES = ("name", "kind", "corner_radius", "friction", "radius", "definition", *DISH_FIELDS)
@@ -269,16 +268,17 @@ class SceneEditor:
 
     def load(self, file: str) -> None:
         """Load the scene of a file, given as a path or as the name of one that ships with the package."""
-        _require_length("file", file, 4096)
+        if len(file) > 4096:
+            raise ConfigurationError("file", f"{len(file)} characters", "at most 4096")
         self.scene = read_scene(file)
 
-    def add(self, name: str, shape: str) -> None:
-        """Append a shape; the text is its description as in a scene file."""
-        self.scene = self._require_scene().add(_parse_shape(name, shape))
+    def add(self, shape: SceneShape) -> None:
+        """Append a shape."""
+        self.scene = self._require_scene().add(shape)
 
-    def replace(self, name: str, shape: str) -> None:
+    def replace(self, shape: SceneShape) -> None:
         """Replace the shape of the same name."""
-        self.scene = self._require_scene().replace(_parse_shape(name, shape))
+        self.scene = self._require_scene().replace(shape)
 
     def remove(self, name: str) -> None:
         """Remove a shape."""
@@ -289,14 +289,3 @@ class SceneEditor:
             expectation = "a scene that is loaded first, of which the dish is known"
             raise ConfigurationError("scene", "a change of a shape", expectation)
         return self.scene
-
-
-def _parse_shape(name: str, text: str) -> SceneShape:
-    _require_length("name", name, MAX_NAME_CHARS)
-    _require_length("shape", text, MAX_SHAPE_CHARS)
-    return shape_from_mapping(name, read_yaml_text(text, "shape", plain=True))
-
-
-def _require_length(field: str, text: str, max_chars: int) -> None:
-    if len(text) > max_chars:
-        raise ConfigurationError(field, f"{len(text)} characters", f"at most {max_chars}")

@@ -23,6 +23,7 @@ from magnetosuture_thread.scene.scene import (
     MAX_OUTLINES,
     MAX_SHAPES,
     MAX_VERTICES,
+    MIN_EDGE,
     MIN_RADIUS,
     Dish,
     Scene,
@@ -219,7 +220,9 @@ def _rounded_convex(solid: shapely.Polygon, radius: float) -> Polygon:
     opened = solid.buffer(-radius, quad_segs=segments).buffer(radius, quad_segs=segments)
     if not isinstance(opened, shapely.Polygon) or opened.is_empty:
         raise ConfigurationError("corner_radius", radius, "a radius with which the shape stays in one piece [m]")
-    return Polygon(tuple(_rounded_point(x, y) for x, y in opened.simplify(0.1 * ARC_TOLERANCE).exterior.coords))
+    # Two arcs may end a hair apart; what is removed is shorter than what contacts resolve.
+    drawn = shapely.remove_repeated_points(opened.simplify(0.1 * ARC_TOLERANCE), MIN_EDGE)
+    return Polygon(tuple(_rounded_point(x, y) for x, y in drawn.exterior.coords))
 
 
 @dataclass(frozen=True)

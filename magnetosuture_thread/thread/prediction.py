@@ -107,6 +107,11 @@ class Prediction:
         """
         return self.compute_forces()
 
+    @property
+    def tension(self) -> NDArray[np.float64] | None:
+        """Tension of each segment, shape (n,) [N]; None where there are no `forces`."""
+        return None if self.forces is None else self.forces.tension
+
 
 def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int = 2) -> None:
     """Raise `InvalidInputError` unless a pose can be one: finite, its tail within reach, its heading a unit vector.
@@ -121,7 +126,10 @@ def check_pose(pose: NeedlePose, reach: float = MAX_COORDINATE, dimension: int =
         raise InvalidInputError("needle pose stamp", pose.stamp, "a finite time [s]")
     if not pose.tail.shape == pose.heading.shape == (dimension,):
         shapes = f"tail and heading of shapes {pose.tail.shape} and {pose.heading.shape}"
-        raise InvalidInputError("needle pose", shapes, f"shapes ({dimension},)")
+        remedy = "; in space, with a Workspace of dimension=3 for the scene" if dimension == 2 else ""
+        raise InvalidInputError("needle pose", shapes, f"shapes ({dimension},){remedy}")
+    if dimension == 3 and pose.motion is not None:
+        raise InvalidInputError("needle pose motion", "one in space", "None, as it turns in the plane only")
     tail, heading = pose.tail.tolist(), pose.heading.tolist()
     if not math.hypot(*tail) <= reach:
         expected = f"finite coordinates, at most {reach:g} m from the dish's centre"

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import osqp
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
@@ -110,6 +109,9 @@ class OsqpSolver:
     name = "osqp"
 
     def __init__(self, tolerance: float = 1e-7, iterations: int = 20_000) -> None:
+        import osqp  # here, as it brings a library for pages that most processes do not need
+
+        self._osqp = osqp
         self._settings: dict[str, Any] = {
             "eps_abs": tolerance,
             "eps_rel": tolerance,
@@ -127,7 +129,7 @@ class OsqpSolver:
         try:
             self._load(general)
             found = self._solver.solve(raise_error=False)
-        except osqp.OSQPException as error:
+        except self._osqp.OSQPException as error:
             self._loaded, status, iterations = None, f"refused: {error}", 0
         else:
             status, iterations = str(found.info.status), int(found.info.iter)
@@ -146,7 +148,7 @@ class OsqpSolver:
         if last is not None and _same_pattern(last.P, program.P) and _same_pattern(last.A, program.A):
             self._solver.update(Px=program.P.data, Ax=program.A.data, q=program.q, l=program.lower, u=program.upper)
         else:
-            self._solver = osqp.OSQP()
+            self._solver = self._osqp.OSQP()
             self._solver.setup(program.P, program.q, program.A, program.lower, program.upper, **self._settings)
         self._loaded = program
 

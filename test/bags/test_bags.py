@@ -20,6 +20,7 @@ from magnetosuture_thread.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
 
 COUNT = 300
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1951000\n"
 
 
 def write(folder: Path) -> Path:
@@ -67,6 +68,8 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
     (tmp_path / "packed" / "a.mcap.zstd").write_bytes(zstandard.compress(good.read_bytes()))
     for name in ("one", "other"):
         (tmp_path / "two" / f"{name}.mcap").write_bytes(good.read_bytes())
+    (tmp_path / "ros1").mkdir()
+    (tmp_path / "ros1" / "a.bag").write_bytes(b"#ROSBAG V2.0\n" * 9)
     with BagWriter(tmp_path / "hollow") as bag:
         bag.add_topic("/one", HEADER)
     for name, content, words in (
@@ -75,6 +78,10 @@ def test_what_is_no_bag_is_refused(tmp_path: Path, good: Path):
         ("packed", None, "is compressed as a whole; decompress it first: zstd -d a.mcap.zstd"),
         ("hollow", None, "holds no messages"),
         ("two", None, "holds 2 .mcap files; name one of them"),
+        ("pointer.mcap", LFS_POINTER, "is a pointer of Git LFS, not the file itself; fetch that by: git lfs pull"),
+        ("pointer.db3", LFS_POINTER, "is a pointer of Git LFS"),
+        ("old.bag", b"#ROSBAG V2.0\n" * 9, "is a bag of ROS 1; convert it by: rosbags-convert --src FILE.bag"),
+        ("ros1", None, "is a bag of ROS 1"),
         ("text.mcap", b"not a bag, but long enough to be one", "is no mcap file"),
         ("empty.db3", b"", "is empty"),
         ("text.db3", b"text" * 99, "is no sqlite3"),

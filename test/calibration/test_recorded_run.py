@@ -17,6 +17,7 @@ from magnetosuture_thread.calibration.recorded_run import (
     read_run,
     replay_with_parameters,
 )
+from magnetosuture_thread.calibration.result import BagFit
 from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
@@ -66,6 +67,11 @@ def test_after_a_gap_it_begins_anew_from_the_measured_thread(observations: Obser
         for passage in (whole, parts)
     ]
     assert last == pytest.approx([0.0, 0.0], abs=0.3)
+    vertices = np.zeros((len(passage.frames), SETTINGS.segments + 1, 2))
+    for silence, words in ((0, ""), (3600, "without frames for 3600.7 s, 3600.7 s at the longest, from 2.60 s on")):
+        later = silence * 10**9 * (np.arange(len(passage.stamps)) >= 40)
+        fit = BagFit(replace(passage, stamps=passage.stamps + later), vertices, vertices)
+        assert fit.errors(LENGTH).silence == words
 
 
 def test_errors_are_those_of_the_score(observations: Observations):

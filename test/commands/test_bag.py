@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
-from test.bags.bags import HEADER, make, read, stamped, write_many_chunks
+from test.bags.bags import HEADER, STRING, cdr, make, read, stamped, write_many_chunks, write_mcap
 
 
 @pytest.fixture
@@ -51,6 +51,21 @@ def test_a_whole_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert (told["messages"], told["rate_hz"], told["first_s"], told["last_s"]) == (6, 2.0, 0.0, 2.5)
     assert (told["greatest_gap_s"], told["stamps_going_back"], told["frames"]) == (0.5, 2, ["dish"])
     assert (topics["/ground_truth/needle"]["rate_hz"], topics["/ground_truth/needle"]["known"]) == (None, True)
+
+
+def test_a_silence_is_named_and_a_first_message_at_0_ns_is_no_damage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Clocks that are set after the start give such a bag; its writer took 0 for no time in the summary."""
+    messages = [("/text", at, cdr(STRING, "a")) for at in (0, 10**8, 1_700_000_000_200_000_000)]
+    file = write_mcap(tmp_path / "zero.mcap", messages, {"/text": STRING})
+    found = tmp_path / "found.json"
+    assert cli.main(["bag", "check", str(file), "--json", str(found)]) == 0
+    shown = capsys.readouterr().out
+    assert "no message for 1700000000.1 s from 0.100 s on" in shown
+    assert "--start 1700000000.200 begins after it" in shown
+    assert "nothing is damaged" in shown
+    assert json.loads(found.read_text())["silences"] == [{"begin_s": 0.1, "end_s": pytest.approx(1.7e9 + 0.2)}]
 
 
 def test_a_damaged_bag_is_shown_all_the_same(damaged: Path, capsys: pytest.CaptureFixture[str]):

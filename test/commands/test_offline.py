@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread import interface
+from magnetosuture_thread import cli, interface
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording
@@ -203,6 +203,26 @@ def test_stamps_that_go_back_are_refused_and_a_time_that_goes_back_by_more_begin
     assert summary.predicted == 30
     assert summary.error_seen is not None
     assert summary.error_seen["maximum"] < 1.0
+
+
+def test_a_silence_is_in_every_table(pose_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    source, file = Bag(pose_bag), tmp_path / "silent"
+    with BagWriter(file, source.notes) as bag:
+        for topic, type_name in source.topics.items():
+            bag.add_topic(topic, type_name)
+        for record in source.records():
+            later = 3600 * 10**9 * (record.time > source.start + 10**9 // 2)
+            message = record.decode()
+            message.header.stamp.sec += later // 10**9
+            bag.write_message(record.topic, record.time + later, message)
+    words = "3600.0 s at the longest"
+    assert cli.main(["replay", str(file), "--offline", "--output", str(tmp_path / "out")]) == 0
+    assert words in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert found["silence"]["max_gap"] == pytest.approx(3600.0, abs=0.1)
+    assert found["speed"] < 1e4
+    assert cli.main(["evaluate", str(file), "--output", str(tmp_path / "page")]) == 0
+    assert words in capsys.readouterr().out
 
 
 def test_broken_pictures_and_poses_are_counted(pose_bag: Path, short_bag: Path, tmp_path: Path):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from magnetosuture_msgs.msg import Disc, SceneShape
 from magnetosuture_msgs.srv import EditShape
 
 from magnetosuture_thread.interface import ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER, Service
@@ -35,7 +36,7 @@ SETUP = """
 """
 OTHER_NAME = "joystick/servo_cv"  # of the operator's commands, for the rig on the right
 REMAPPED = {LEFT: (), RIGHT: ("-r", f"{OPERATOR_COMMAND.name}:={OTHER_NAME}")}
-DISC = "{disc: {center: [-0.006, 0.008], radius: 0.001}, kind: instrument}"
+HOOK = SceneShape(name="hook", kind=SceneShape.KIND_INSTRUMENT, disc=[Disc(x=-0.006, y=0.008, radius=0.001)])
 
 
 def within(space: str, topic: topics.Topic, name: str = "") -> topics.Topic:
@@ -164,7 +165,7 @@ def test_an_emergency_stop_a_reset_and_a_new_shape_reach_one_rig_alone(rigs: Rig
             assert await right.ask(type="bridge_action", action="reset") == ""
             await wait(right, lambda: not right.graph["bridge"]["emergency_stopped"], "the reset")
             assert left.graph["bridge"]["emergency_stopped"]
-            answer = client.call_async(EditShape.Request(name="hook", shape=DISC))
+            answer = client.call_async(EditShape.Request(shape=HOOK))
             await wait(right, lambda: answer.done() and right.graph["scene"]["shapes"], "the shape")
             assert answer.result().success
             since = left.graph["time"]

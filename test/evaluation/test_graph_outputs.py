@@ -15,7 +15,7 @@ from rich.console import Console
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import Percentiles, compare_errors, stage_latencies
-from magnetosuture_thread.evaluation.tables import summary_table
+from magnetosuture_thread.evaluation.tables import loop_table, summary_table
 from test.evaluation.runs import replay_summary
 
 STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])
@@ -262,6 +262,19 @@ def test_only_the_time_of_steering_counts():
     loop.health("path_follower", "done")
     summary = loop.collector.summary("x")
     assert (summary.frames, summary.tracked, summary.lost, summary.skipped) == (4, 3, 1, 0)
+
+
+def test_the_table_ends_with_what_came_of_the_procedure():
+    loop = Loop()
+    loop.truth(0)
+    loop.pose(0)
+    loop.setpoint(0)
+    met = {"procedure": "hernia", "goals_met": 2, "goals": 5}
+    for state, shown, reason in (("done", "succeeded", ""), ("machine too slow", "machine too slow", "73 of 109")):
+        outcome = {**met, "state": state, "reason": reason}
+        table = loop_table(replace(loop.collector.summary("x"), procedure=outcome))
+        assert [[*column.cells][-1] for column in table.columns[:2]] == ["procedure hernia", shown]
+        assert [*table.columns[2].cells][-1] == "2 of 5 goals met" + f": {reason}" * bool(reason)
 
 
 def test_a_run_without_a_pose_says_what_the_nodes_said():

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from magnetosuture_thread.evaluation.figures import BagDetails, Figures, LiveFigures, headlines
+from magnetosuture_thread.evaluation.figures import BagDetails, Figures, LiveFigures, headlines, margin_state
 from magnetosuture_thread.evaluation.frames import FrameResult
 from magnetosuture_thread.evaluation.metrics import RunMetrics
 from magnetosuture_thread.evaluation.page import page_data, write_page
@@ -206,6 +206,18 @@ def test_the_head_shows_the_margin_that_is_broken(clearance: float, value: float
     metrics.add(FrameResult(0, vertices=NODES, margins=given))
     tile = next(tile for tile in headlines(ABOUT, Figures.of(metrics)) if "margin" in tile.name)
     assert (tile.name, tile.assessment) == expected
+
+
+def test_what_a_barrier_keeps_is_shown_apart_from_a_chord_that_cuts_a_round_shape():
+    metrics = RunMetrics(LENGTH)
+    metrics.add(FrameResult(0, vertices=NODES, margins=margins(-16e-6, "obstacle", 0.0)))
+    figures = Figures.of(metrics)
+    tile = next(tile for tile in headlines(ABOUT, figures) if "margin" in tile.name)
+    assert (tile.value, tile.assessment) == ("0 µm", "every barrier holds")
+    assert tile.detail.startswith("of nodes; a chord between two, -16.0 µm, at ")
+    least = metrics.minimum_margins["obstacle"]
+    assert (least.promised, least.chord, margin_state(ABOUT, least)) == (0.0, -16e-6, "holds")
+    assert "<td>0 µm</td><td>-16.0 µm</td>" in write_page(ABOUT, metrics, figures, [])
 
 
 def test_the_forces_are_drawn_and_their_greatest_stated():

@@ -11,7 +11,15 @@ import pytest
 
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.plots import draw_case
-from magnetosuture_thread.evaluation.reference import CaseResult, Evaluation, find_references, read_reference, score
+from magnetosuture_thread.evaluation.reference import (
+    CaseResult,
+    Evaluation,
+    find_references,
+    read_reference,
+    resampled,
+    score,
+    write_reference,
+)
 from magnetosuture_thread.evaluation.tables import evaluation_table
 
 MATERIAL = {
@@ -57,6 +65,24 @@ def test_a_trajectory_is_read_and_interpolated(tmp_path: Path):
     assert tail == pytest.approx([1e-3, 0.0])
     assert heading == pytest.approx(0.02)
     assert thread[[0, -1], 0] == pytest.approx([1e-3, 1e-3 - 0.019])
+
+
+def test_a_packed_trajectory_is_as_it_was_to_a_hundred_thousandth_of_the_length(tmp_path: Path):
+    reference = read_reference(write(tmp_path, "whole", offset=1e-4))
+    write_reference(reference, tmp_path / "packed.npz", 25)
+    packed = read_reference(tmp_path / "packed.npz")
+    assert np.array_equal(packed.times, reference.times)
+    assert np.array_equal(packed.headings, reference.headings)
+    assert packed.metadata == reference.metadata
+    nodes = np.stack([resampled(curve, 25) for curve in reference.threads])
+    assert packed.threads == pytest.approx(nodes, abs=0.51e-5 * 0.019)
+
+
+def test_the_references_that_ship_give_the_error_that_the_readme_states():
+    found, _ = scored(find_references(Path(__file__).parents[2] / "examples" / "reference"))
+    assert len(found.cases) == 12
+    assert round(found.mean_error_percent, 3) == 0.013
+    assert round(found.worst_error_percent, 3) == 0.032
 
 
 @pytest.mark.parametrize(

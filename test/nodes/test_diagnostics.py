@@ -21,6 +21,7 @@ def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):
     )
     assert len(said) < 20
     assert said[-1].status[0].level == DiagnosticStatus.WARN
+    assert said[-1].status[0].hardware_id == (graph.probe.get_namespace().strip("/") or "magnetosuture")
 
 
 def test_that_a_node_stands_by_is_reported_at_once_as_a_warning_whatever_else_there_is(graph, monkeypatch):

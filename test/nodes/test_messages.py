@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -19,17 +22,27 @@ from visualization_msgs.msg import Marker
 
 from magnetosuture_thread import interface
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.barrier import BUILT_IN, WALL
+from magnetosuture_thread.coils import bridge
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
+from magnetosuture_thread.forecast import rollout
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.messages import markers, packing, reading
 from magnetosuture_thread.messages.scene import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
+from magnetosuture_thread.planning.procedure import GOALS
+from magnetosuture_thread.safety import filter as safety
+from magnetosuture_thread.scene import KINDS
+from magnetosuture_thread.thread import predictor
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
+from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.prediction import Prediction
+from magnetosuture_thread.thread.solvers import SOLVERS
 from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
@@ -146,6 +159,62 @@ def test_what_is_packed_is_what_rosbags_and_rclpy_make_of_the_same_message(name:
     assert bytes(theirs) == data
     message = topic_of(channel).decode(data)
     assert str(topic_of(channel).decode(serialize_message(message))) == str(message)  # NaN is not equal to itself
+
+
+IN_A_RIG_WITH_A_PREFIX = """
+import numpy as np
+from magnetosuture_thread import interface
+from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.messages import packing, reading
+from magnetosuture_thread.nodes import topics
+
+points, store = np.arange(10.0).reshape(5, 2), typestore()
+for count in (0, 1, 5):
+    data = packing.packed_path(7, points[:count])
+    path = topics.MEASURED_THREAD.decode(data)
+    assert bytes(store.serialize_cdr(store.deserialize_cdr(data, "nav_msgs/msg/Path"), "nav_msgs/msg/Path")) == data
+    assert {each.header.frame_id for each in (path, *path.poses)} == {interface.DISH_FRAME}
+    np.testing.assert_array_equal(reading.path_points(path), points[:count])
+    found = reading._plain_path(data)
+    assert found is None or found.tolist() == points[:count].tolist()
+pose = topics.NEEDLE_POSE.decode(packing.packed_pose(7, points[0], np.array([0.6, 0.8])))
+assert reading.needle_pose(pose).tail.tolist() == [0.0, 1.0]
+image = topics.COMPRESSED_IMAGE.decode(packing.packed_compressed_image(7, np.arange(9, dtype=np.uint8)))
+print(pose.header.frame_id, image.header.frame_id)
+"""
+
+
+@pytest.mark.parametrize("prefix", ["ab/", "abc/", "left_1/", "right_1/"])  # what follows is aligned by their lengths
+def test_the_frames_of_a_rig_with_a_prefix_are_its_own(prefix: str):
+    environment = {**os.environ, interface.FRAME_PREFIX_VARIABLE: prefix}
+    command = [sys.executable, "-c", IN_A_RIG_WITH_A_PREFIX]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"{prefix}dish {prefix}camera\n"), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "prefix", "words"),
+    [
+        ("BarrierMargin", "", set(BUILT_IN)),
+        ("ThreadForecast", "MARGIN_", set(rollout.KINDS) - set(BUILT_IN)),
+        ("SceneShape", "KIND_", set(KINDS)),
+        ("ThreadMaterial", "ATTACHMENT_", {each.value for each in Attachment}),
+        ("FilterState", "SOURCE_", set(bridge.INPUTS)),
+        ("FilterState", "ACTIVE_", {safety.FRICTION, safety.SPEED, safety.ACCELERATION, WALL}),
+        ("PredictedThread", "FORMULATION_", set(predictor.FORMULATIONS)),
+        ("PredictedThread", "SOLVER_", set(SOLVERS)),
+        (
+            "CoilBridgeState",
+            "DRIVER_",
+            {*CoilBridgeSettings.__dataclass_fields__["driver"].metadata["quantity"].choices, "none"},
+        ),
+        ("ProcedureState", "GOAL_", set(GOALS)),
+    ],
+)
+def test_the_texts_that_messages_may_have_are_constants_of_their_definitions(name: str, prefix: str, words: set[str]):
+    constants = typestore().fielddefs[f"magnetosuture_msgs/msg/{name}"][0]
+    found = {each[0]: each[2] for each in constants if each[1] == "string" and each[0].startswith(prefix)}
+    assert found == {f"{prefix}{word.upper()}": word for word in words}
 
 
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1))

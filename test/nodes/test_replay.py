@@ -8,8 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
 
+from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import NEEDLE_POSE
 from magnetosuture_thread.nodes import player, timeline, topics
@@ -35,6 +37,9 @@ def test_time_stands_still_before_it_begins_and_while_it_is_paused(monkeypatch: 
     line.pause(False)
     now[0] += 0.25
     assert line.now() == round(5.5e9)
+    line.skip_to(10**18)
+    assert line.now() == pytest.approx(10**18, abs=200)  # ns; seconds are floats
+    assert line.left(10**18 + 10**9) == pytest.approx(0.5, abs=1e-6)
     line.begin()
     assert line.now() == 3 * 10**9
 
@@ -63,6 +68,25 @@ def test_losses_are_counted_by_the_way_on_which():
         "poses without an answer": 2,  # of three, one was refused
         "outputs lost by the recording": 1,
     }
+
+
+def test_a_silence_of_54_years_is_left_out_and_named(graph, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(player, "QUIET", 0.1)
+    played, logged, line = [topics.MEASURED_THREAD], list[str](), Timeline(0, 5.0)
+    live = LiveReplay(
+        graph.domain, line, played=played, nodes=1, receive=lambda *_: None, watch=lambda: None, log=logged.append
+    )
+    data = serialize_message(Path())
+    times = [0, 10**8, 1_700_000_000_200_000_000, 1_700_000_000_300_000_000]
+    try:
+        live.play([RecordedMessage("/thread/measured", "nav_msgs/msg/Path", at, data) for at in times], lambda at: None)
+    finally:
+        live.close()
+    assert live.losses.played["thread/measured"] == 4
+    assert line.now() >= times[-1]
+    assert [text.rpartition(": ")[2] for text in logged] == [
+        "a live replay leaves this out, --start 1700000000.200 begins after it"
+    ]
 
 
 def test_a_graph_in_which_nobody_hears_an_input_is_not_complete(graph, monkeypatch: pytest.MonkeyPatch):

@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from geometry_msgs.msg import Point
+from magnetosuture_msgs.msg import Disc, Outline, Polygon, SceneShape
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
 from magnetosuture_thread.interface import Service
@@ -21,8 +23,21 @@ SERVICES = {
     "replace": (Service.REPLACE_SHAPE, EditShape),
     "remove": (Service.REMOVE_SHAPE, RemoveShape),
 }
-DISC = "{disc: {center: [0.001, 0.002], radius: 0.001}, kind: instrument}"
-WIDER = "{disc: {center: [0.001, 0.002], radius: 0.002}, kind: instrument}"
+
+
+def pin(name: str = "pin", radius: float = 0.001, **fields: Any) -> SceneShape:
+    """Return a disc as a message."""
+    disc = Disc(x=0.001, y=0.002, radius=radius)
+    return SceneShape(**{"name": name, "kind": SceneShape.KIND_INSTRUMENT, "disc": [disc], **fields})
+
+
+def corners(*points: tuple[float, float]) -> Outline:
+    """Return an outline."""
+    return Outline(corners=[Point(x=x, y=y) for x, y in points])
+
+
+SQUARE = corners((0.002, 0.0), (0.005, 0.0), (0.005, 0.003), (0.002, 0.003))
+BOW = corners((0.002, 0.0), (0.005, 0.0), (0.002, 0.003), (0.005, 0.003))
 POST = read_scene("dish_35mm_post")
 
 
@@ -36,12 +51,12 @@ class Server:
         self.markers = graph.listen(topics.SCENE_MARKERS)
         self.reports = graph.listen(topics.DIAGNOSTICS)
 
-    def ask(self, name: str, /, **fields: str) -> Any:
+    def ask(self, name: str, /, **fields: Any) -> Any:
         """Call a service and return its answer."""
         service, kind = SERVICES[name]
         return self.graph.call(kind, service, **fields)
 
-    def change(self, name: str, /, **fields: str) -> Any:
+    def change(self, name: str, /, **fields: Any) -> Any:
         """Call a service that shall succeed, and return the scene that is then published."""
         before = len(self.scenes)
         answer = self.ask(name, **fields)
@@ -70,19 +85,27 @@ def test_shapes_are_added_replaced_and_removed_and_scenes_loaded(graph, tmp_path
     graph.wait(lambda: bool(server.scenes and server.markers), "the scene")
     shape, wider = ({"disc": {"center": [0.001, 0.002], "radius": r}, "kind": "instrument"} for r in (0.001, 0.002))
     added = POST.add(shape_from_mapping("pin", shape))
-    assert server.change("add", name="pin", shape=DISC) == added
-    assert server.change("replace", name="pin", shape=WIDER) == added.replace(shape_from_mapping("pin", wider))
+    assert server.change("add", shape=pin()) == added
+    assert server.change("replace", shape=pin(radius=0.002)) == added.replace(shape_from_mapping("pin", wider))
+    square = pin("square", disc=[], polygon=[Polygon(outline=SQUARE)])
+    assert server.change("add", shape=square).shapes[-1].geometry.outline == (
+        (0.002, 0.0),
+        (0.005, 0.0),
+        (0.005, 0.003),
+        (0.002, 0.003),
+    )
+    assert server.change("remove", name="square").names == ("post", "pin")
     assert server.change("remove", name="post").names == ("pin",)
     write_scene(every_shape(), tmp_path / "lab.geojson")
     assert server.change("load", file=str(tmp_path / "lab.geojson")) == every_shape()
     assert server.change("load", file="dish_35mm_post").version == POST.version
-    graph.wait(lambda: len(server.markers) == len(server.scenes) == 6, "as many markers as scenes")
+    graph.wait(lambda: len(server.markers) == len(server.scenes) == 8, "as many markers as scenes")
 
 
 def test_without_a_scene_only_loading_one_is_possible(graph):
     server = Server(graph)
     graph.wait(lambda: server.said("no scene yet"), "its report")
-    for name, fields in (("add", {"name": "a", "shape": DISC}), ("remove", {"name": "a"})):
+    for name, fields in (("add", {"shape": pin("a")}), ("remove", {"name": "a"})):
         answer = server.ask(name, **fields)
         assert not answer.success
         assert answer.message == (
@@ -94,16 +117,22 @@ def test_without_a_scene_only_loading_one_is_possible(graph):
     graph.wait(lambda: server.said("dish of 35 mm, 1 shape"), "that all is well")
 
 
-HOSTILE: list[tuple[str, dict[str, str], str]] = [
+HOSTILE: list[tuple[str, dict[str, Any], str]] = [
     ("load", {"file": ""}, "scene: got '', expected a YAML or GeoJSON file, or one of dead_end"),
     ("load", {"file": "FIFO"}, "scene: got '"),
     ("load", {"file": "x" * 100_000}, "file: got '100000 characters', expected at most 4096"),
-    ("add", {"name": "", "shape": DISC}, "shapes: got '', expected names of 1 to 64 printable characters"),
-    ("add", {"name": "post", "shape": DISC}, "post: got 'a name given twice', expected a name of its own"),
-    ("add", {"name": "a", "shape": "{disc: {center: [0, 0], radius: 1.5}}"}, "a.disc.radius: got 1.5, expected"),
-    ("add", {"name": "a", "shape": "&a [*a]"}, "shape: got 'an anchor or alias"),
-    ("add", {"name": "a", "shape": "[" * 100_000}, "shape: got 'lists and mappings 21 deep"),
-    ("replace", {"name": "none", "shape": DISC}, "shape.name: got 'none', expected one of post"),
+    ("add", {"shape": pin("")}, "shape.name: got '', expected 1 to 64 printable characters"),
+    ("add", {"shape": pin("post")}, "post: got 'a name given twice', expected a name of its own"),
+    ("add", {"shape": pin("a", 1.5)}, "a: got 'a shape that covers the whole dish', expected"),
+    ("add", {"shape": pin("a", kind="")}, "a.kind: got '', expected one of tissue, instrument, wall"),
+    ("add", {"shape": pin("a", disc=[])}, "scene.shapes[0]: got 0 discs and 0 polygons, expected one disc"),
+    ("add", {"shape": pin("a", disc=[], polygon=[Polygon(outline=BOW)])}, "a.polygon.outline: got 'Self-inter"),
+    (
+        "add",
+        {"shape": pin("a", disc=[], polygon=[Polygon(outline=corners(*[(0.0, 0.0)] * 1501))])},
+        "scene.shapes.polygon.corners: got 1501, expected at most 1500",
+    ),
+    ("replace", {"shape": pin("none")}, "shape.name: got 'none', expected one of post"),
     ("remove", {"name": "x" * 100_000}, "shape.name: got 'xxxxxxxx"),
 ]
 

@@ -76,3 +76,9 @@ def test_check_reports_a_hole_too_narrow_for_the_needle():
     (warning,) = scene_warnings(Scene(Dish(), (ring,)), WIDTH)
     assert (warning.what, warning.shapes) == ("hole", ("ring",))
     assert warning.value == pytest.approx(0.00038, rel=0.02)
+    # A disc of 0.5 mm fits, though by a negative buffer of 0.2 mm nothing of the hole is left.
+    hole = [(117, 362), (40, 207), (-314, -223), (-268, -298), (520, -292), (477, -20)]
+    plate = Polygon(moved(-0.002, -0.002).outline, (tuple((1e-6 * x, 1e-6 * y) for x, y in hole),))
+    assert scene_warnings(scene(plate), WIDTH) == []
+    (narrow,) = scene_warnings(scene(plate), 0.00051)
+    assert narrow.value == pytest.approx(0.0005, abs=5e-6)

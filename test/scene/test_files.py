@@ -112,6 +112,9 @@ def test_only_a_regular_file_of_a_bounded_size_is_read(tmp_path: Path):
         os.truncate(os.open(large, os.O_CREAT | os.O_WRONLY), 10**12)  # a terabyte with nothing in it
         with pytest.raises(ConfigurationError, match=f"got 'a larger file', expected a readable {problem} file"):
             read_scene(str(large))
+        large.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+        with pytest.raises(ConfigurationError, match="it is a pointer of Git LFS, not the file itself"):
+            read_scene(str(large))
 
 
 @pytest.mark.parametrize("name", ["", "nowhere", "a\0b", "x" * 5000, "../config/scenes/dish_35mm"])

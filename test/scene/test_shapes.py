@@ -75,6 +75,17 @@ def test_a_corner_radius_takes_the_four_corners_off_a_sector():
     assert soft.can_contain(0.001)
 
 
+def test_corners_are_rounded_with_any_radius_of_which_a_disc_fits():
+    """By a negative buffer nothing of this outline would be left; arcs of this sector end 0.5 um apart."""
+    outline = [[1.9, 5.89], [0.65, 3.38], [-5.11, -3.63], [-4.36, -4.86], [8.47, -4.75], [7.77, -0.33]]
+    assert polygon(polygon={"outline": [[1e-3 * x, 1e-3 * y] for x, y in outline]}, corner_radius=0.003258).area > 7e-5
+    inner, outer = 0.0034664354975234646, 0.004019624212047212
+    fields = {"center": [0, 0], "inner_radius": inner, "outer_radius": outer}
+    sector, width = {**fields, "start_angle": 0.0, "end_angle": math.radians(249.89381737240402)}, outer - inner
+    for share in (0.3, 0.6, 0.86, 0.99):
+        assert polygon(annular_sector=sector, corner_radius=0.5 * share * width).can_contain(0.5 * share * width)
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.6, HALF_PI, -2.0])
 def test_a_capsule_reaches_a_radius_around_its_segment(angle: float):
     length, radius = 0.006, 0.001

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
-from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 
 THREAD = Thread.of(MATERIALS["polyamide_7_0"], length=0.019, segments=25, attachment=Attachment.PINNED)
@@ -33,6 +33,21 @@ def started(obstacles: tuple[Disc | Polygon, ...] = (), fixed_nodes: tuple[int, 
     predictor = new(obstacles, fixed_nodes)
     predictor.start(pose(0.0), np.array([[0.0, 0.0], [-0.019, 0.0]]))
     return predictor
+
+
+def test_space_is_refused_at_the_start_in_the_plane_and_works_in_a_workspace_of_three_dimensions():
+    east = NeedlePose(0.0, np.zeros(3), np.eye(3)[0])
+    with pytest.raises(InvalidInputError, match=r"expected shapes \(2,\); in space, with a Workspace of dimension=3"):
+        ThreadPredictor.create("polyamide_7_0", length=0.019, segments=25).start(east)
+    predictor = ThreadPredictor(THREAD, Workspace((), 5e-3, dimension=3))
+    assert predictor.start(east).tension is None
+    prediction = predictor.step(NeedlePose(0.02, np.array([1e-4, 0.0, 1e-4]), np.eye(3)[0]))
+    assert prediction.converged
+    assert prediction.forces is not None
+    assert prediction.tension is prediction.forces.tension
+    moving = NeedlePose(0.04, np.zeros(3), np.eye(3)[0], motion=NeedleMotion(np.zeros(3), 0.0))
+    with pytest.raises(InvalidInputError, match="expected None, as it turns in the plane only"):
+        predictor.step(moving)
 
 
 def test_steps_are_bounded_whatever_the_interval():
