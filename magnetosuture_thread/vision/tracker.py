@@ -43,6 +43,7 @@ SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: give a point near it by --tip or needle/tip"
 REMEDY = "check light, needle_length, needle_width, max_needle_brightness"
+TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 REPEATED = "camera repeats frames"
 MAX_CYCLE = 100  # frames; after more of them a repetition is not found
@@ -194,8 +195,8 @@ class VisionTracker:
         """Take a point near the needle's tip, shape (2,) [m], as a person gives it.
 
         It is used in the next frame in which a needle is found, where nothing else tells its direction, and if an end
-        of it is nearer to the point than half of its length. From then on the direction is carried from frame to frame
-        as long as the needle cannot have turned round unseen.
+        of it is nearer to the point than a third of its length. From then on the direction is carried from frame to
+        frame as long as the needle cannot have turned round unseen.
         """
         self._tip = np.array(place, dtype=float)
         self._last, self._anew = None, []
@@ -383,7 +384,7 @@ class VisionTracker:
             return None
         tip, self._tip = picture.view.to_pixels(self._tip), None
         ways = [way for needle in needles if not needle.heading_known for way in (needle, needle.reversed())]
-        near = [way for way in ways if math.dist(way.tip_px, tip) < 0.5 * way.length_px]
+        near = [way for way in ways if math.dist(way.tip_px, tip) < TIP_REACH * way.length_px]
         return min(near, key=lambda way: math.dist(way.tip_px, tip), default=None)
 
     def _with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> MeasuredNeedle | None:

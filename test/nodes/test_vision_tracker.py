@@ -110,8 +110,11 @@ def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_a
         message = CompressedImage(format="jpeg", data=data)
         message.header.stamp = graph.now()
         graph.publish(topics.COMPRESSED_IMAGE, message)
-        graph.wait(lambda n=count: len(tracking) == n, "a state for each")
-    assert all("expected a JPEG or PNG image" in state.reason for state in tracking)
+        # On a busy machine the camera seems to be silent in between.
+        graph.wait(
+            lambda n=count: sum("expected a JPEG or PNG image" in state.reason for state in tracking) == n,
+            "a refusal of each",
+        )
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
     graph.wait(lambda: "tracking" in states(diagnostics), "tracking")
