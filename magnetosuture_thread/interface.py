@@ -78,8 +78,13 @@ CAMERA_INFO = Channel(
 NEEDLE_POSE = Channel(
     "needle/measured_cp",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "the needle's tail, x axis along the needle; a heading with a deviation above 1 rad is unknown",
+    "the needle's tail, x axis along the needle; a heading with a deviation above 1 rad is unknown: the axis alone is",
     Quality.SENSOR,
+)
+NEEDLE_TIP = Channel(
+    "needle/tip",
+    "geometry_msgs/msg/PointStamped",
+    "a point near the needle's tip, by a person, for a needle of which nothing else tells the direction",
 )
 TRACKER_STATE = Channel(
     "needle/tracker_state",
@@ -226,7 +231,7 @@ SERVICES = {each.value: each for each in Service}  # by name
 
 CAMERA = {"raw": IMAGE, "compressed": COMPRESSED_IMAGE}  # by image transport
 
-INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_COMMAND, OPERATOR_COMMAND)
+INPUTS = (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, NEEDLE_TIP, NEEDLE_COMMAND, OPERATOR_COMMAND)
 OUTPUTS = (
     *(NEEDLE_POSE, TRACKER_STATE, MEASURED_THREAD, THREAD_OBSERVATION),
     *(PREDICTED_THREAD, ESTIMATED_THREAD, FORECAST, MARGINS, THREAD_MARKERS),

@@ -13,6 +13,7 @@ from magnetosuture_thread.commands.track import FrameSource
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.texts import one_line
 from magnetosuture_thread.vision.calibration import calibrate_by_dish, calibrate_by_markers, measure_needle_length
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     command.runs(parser, run_calibrate_camera)
     option = parser.add_argument
     command.add_frames(parser)
+    command.add_dish(parser)
     diameter = "inner diameter of the dish [m]"
     option("--dish-diameter", type=command.number_argument(0.005, 0.5), required=True, metavar="D", help=diameter)
     markers = "of the ArUco markers around the dish [m] (default: by the dish's rim)"
@@ -35,8 +37,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     The result is its centre, the scale and, by markers, the rotation. FILE gets a section vision_tracker of a ROS 2
     parameter file.
 
-    Without --markers the dish's rim is used: a mean over all frames. With --markers, ArUco markers 4x4_50 lie
-    around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
+    Without --markers the dish is found as by `track`, in the median of all frames. With --markers, ArUco markers
+    4x4_50 lie around the dish, their centres SPACING apart on a square around its centre: 0 at the top left, then
     clockwise, all upright.
 
     With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
@@ -63,7 +65,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     if by_markers:
         found = calibrate_by_markers(images, options.dish_diameter, *options.markers)
     else:
-        found = calibrate_by_dish(images, options.dish_diameter)
+        looked = VisionTrackerSettings(region_px=tuple(options.region or ()), rim=options.rim or "")
+        found = calibrate_by_dish(images, options.dish_diameter, looked)
     if options.needle is not None:
         found = replace(found, needle_length=measure_needle_length(images, found, *options.needle))
     with whole_file(options.output) as partial:
@@ -73,7 +76,10 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     scale, turned = found.view.metres_per_pixel * 1e3, found.view.rotation
     terminal.log(f"centre {u:.2f}, {v:.2f} px; {scale:.5f} mm a pixel; turned by {turned:.4f} rad")
     by = f"markers, residual {found.residual_px:.2f} px" if by_markers else "the dish's rim"
+    by += "" if by_markers else f", scale within {100.0 * found.scale_error:.2g} %"
     terminal.log(f"by {by}; {found.frames} frames, scatter {found.scatter_px:.2f} px")
+    if found.remark:
+        terminal.log(found.remark)
     if found.needle_length is not None:
         terminal.log(f"the needle is {1e3 * found.needle_length:.3f} mm long")
     terminal.log(f"parameters: {options.output}")

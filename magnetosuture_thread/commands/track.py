@@ -34,7 +34,7 @@ from magnetosuture_thread.thread_observation import ThreadPiece
 from magnetosuture_thread.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
-from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay
+from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region
 from magnetosuture_thread.vision.tracker import State, Track, VisionTracker, no_pose, warm_up
 from magnetosuture_thread.vision.video import VIDEOS, Video
 from magnetosuture_thread.workers import Log
@@ -54,6 +54,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     option("--metres-per-pixel", type=command.number_argument(1e-7, 1e-2), metavar="S", help=scale)
     centre = "the dish's centre [px] (default: the setup's, or found)"
     option("--centre", type=command.number_argument(0.0, 1e5), nargs=2, metavar=("U", "V"), help=centre)
+    command.add_dish(parser)
+    bright = "greatest brightness of the needle, as a share of the floor's (default: the setup's)"
+    option("--needle-brightness", type=command.number_argument(0.1, 0.95), metavar="SHARE", help=bright)
+    tip = "a point near the needle's tip in the first frame that shows it, in the dish frame [m]"
+    option("--tip", type=command.number_argument(-0.25, 0.25), nargs=2, metavar=("X", "Y"), help=tip)
     option("--json", type=command.output_file, metavar="FILE", help="write what was found to a file")
     overlay = "draw it over the frames: a video (.mp4, .avi), or a folder of PNG"
     option("--overlay", type=Path, metavar="PATH", help=overlay)
@@ -66,25 +71,33 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     frames of a bag, a video or a folder are followed over time, as the node vision_tracker does.
 
     --json writes a list with an entry for each frame: file (for a bag or video, with the stamp), status (tracked,
-    lost or searching) and its reason, warning (of the dish's scale and tilt, and of the lens), tail_m, tip_m and
-    heading_rad (the tangent at the tail), curvature_per_m (positive to the left), thread_m from the tail on, all
-    in the dish frame, needle_length_m as measured over the first frames that follow one another, pieces of the
-    thread (points_m, deviation_m across, why their ends are ends, arc_length_m of the first point at least and at
-    most) and whether they are complete, confidence from 0 to 1, stamp_s, and time_s, the processor time to search
-    the frame, on one core, without reading and decoding it; all is compiled before. What has no value is null.
+    lost or searching) and its reason, warning (of the dish's scale and tilt, and of the lens), axis_m (both ends of
+    the needle, also where nothing tells which is the tip; --tip does, from then on), dish_centre_px, metres_per_pixel
+    and by which share it may be off, scale_doubt, tail_m, tip_m and heading_rad (the tangent at the tail),
+    curvature_per_m (positive to the left), thread_m from the tail on, all in the dish frame, needle_length_m as
+    measured over the first frames that follow one another, pieces of the thread (points_m, deviation_m across, why
+    their ends are ends, arc_length_m of the first point at least and at most) and whether they are complete,
+    confidence from 0 to 1, stamp_s, and time_s, the processor time to search the frame, on one core, without reading
+    and decoding it; all is compiled before. What has no value is null.
 
-    Where no frame gives a pose the command fails.
+    Where no frame shows a needle the command fails.
     """
     setup = read_setup(options.setup, read_scene(options.scene) if options.scene else None)
     view: dict[str, Any] = {} if options.metres_per_pixel is None else {"metres_per_pixel": options.metres_per_pixel}
     if options.centre is not None:
         view["dish_centre_px"] = tuple(options.centre)
+    if options.region is not None:
+        view["region_px"] = tuple(options.region)
+    view |= {"rim": options.rim} if options.rim else {}
+    view |= {"max_needle_brightness": options.needle_brightness} if options.needle_brightness else {}
     settings = replace(setup.vision, **view)
     source = FrameSource(options, terminal.log)
     if source.is_sequence and source.names:
         how = f"read as a video of {source.rate():g} frames/s (--rate); name pictures to search them one by one"
         terminal.log(f"{options.frames[0]} is {how}")
     tracker = VisionTracker(settings, setup.scene)
+    if options.tip is not None:
+        tracker.point_at_tip(np.array(options.tip))
     warm_up()
     rows = []
     # Two files may differ in their folder or their ending alone; their overlays must not overwrite each other.
@@ -106,6 +119,7 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
                 drawn = draw_overlay(picture, seen, settings.needle_length, frame.name)
                 if seen.view is not None:
                     draw_dish(drawn, seen.view.centre_px, setup.scene.dish.radius / seen.view.metres_per_pixel)
+                draw_region(drawn, settings.region_px)
                 writer.write(files[index] if files else f"frame_{index:06d}", drawn)
             advance((index + 1) / max(source.count, 1))
     source.log_refused(terminal.log)
@@ -117,7 +131,7 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
         median, high = np.percentile([1e3 * row["time_s"] for row in rows], (50, 95))
         terminal.log(f"{counts}; {median:.1f} ms a frame in the median, {high:.1f} ms in the 95th")
     command.write_json(options.json, rows)
-    return command.DONE if any(row["status"] == State.TRACKED.value for row in rows) else command.FAILED
+    return command.DONE if any(row["axis_m"] for row in rows) else command.FAILED
 
 
 @dataclass(frozen=True)
@@ -352,6 +366,10 @@ def _row(frame: FrameFile, track: Track, duration: float) -> dict[str, Any]:
         "status": track.state.value,
         "reason": track.reason or None,
         "warning": track.warning or None,
+        "axis_m": track.axis.tolist() if len(track.axis) else None,
+        "dish_centre_px": None if track.view is None else list(track.view.centre_px),
+        "metres_per_pixel": None if track.view is None else track.view.metres_per_pixel,
+        "scale_doubt": None if track.view is None else track.scale_error,
         **pose,
         "needle_length_m": None if length is None else finite_or_none(float(length)),
         "complete": track.observation.complete,

@@ -300,6 +300,19 @@ def plane_velocity(message: Any, field: str) -> NDArray[np.float64]:
     return np.array([linear.x, linear.y])
 
 
+def plane_point(message: Any, field: str) -> NDArray[np.float64]:
+    """Return the place of a PointStamped in the dish plane, shape (2,) [m].
+
+    Raises:
+        InvalidInputError: wrong frame, or not finite.
+    """
+    require_dish_frame(message.header.frame_id, field)
+    place = np.array([message.point.x, message.point.y])
+    if not np.isfinite(place).all():
+        raise InvalidInputError(f"{field}.point", place.tolist(), "finite numbers [m]")
+    return place
+
+
 def stamp_of(record: RecordedMessage) -> int:
     """Return the stamp of a message that begins with a header [ns]; when it was recorded, if it is too short."""
     stamp = header_stamp(record.data)

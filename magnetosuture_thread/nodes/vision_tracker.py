@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
@@ -43,6 +44,7 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         self._last_frame = time.monotonic()
         self.follower: Callable[[Time, Track], None] | None = None
         topics.CAMERA_INFO.subscribe(self, self.on_camera_info)
+        topics.NEEDLE_TIP.subscribe(self, self.on_tip)
         self.start()
 
     def allocate(self, settings: VisionTrackerSettings) -> None:
@@ -93,6 +95,16 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             self.refuse(error)
         if self._session is not None:
             self._set_lens(self._session)
+
+    def on_tip(self, message: PointStamped) -> None:
+        """Take which end of the needle is its tip."""
+        try:
+            place = reading.plane_point(message, topics.NEEDLE_TIP.name)
+        except InvalidInputError as error:
+            self.refuse(error)
+        else:
+            if self._session is not None:
+                self._session.point_at_tip(place)
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""
@@ -150,6 +162,8 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
         values: dict[str, Any] = {"frames": session.frames, "tracked": session.tracked}
         if track.needle_length is not None:
             values["needle_length_mm"] = round(1e3 * track.needle_length, 3)
+        if len(track.axis):
+            values["axis_mm"] = " to ".join(f"{1e3 * x:.2f}, {1e3 * y:.2f}" for x, y in track.axis)
         if seen.problem is not None:
             self.health.refuse(seen.problem, **values)
         else:

@@ -165,6 +165,10 @@ class MeasuredNeedle:
         arc = self.arc.reversed_at(self.length_px)
         return replace(self, arc=arc, covariance=covariance, size_measured=False, tail_shift_px=0.0)
 
+    def pointing(self, toward: np.ndarray) -> MeasuredNeedle:
+        """Return the needle the way round that a direction is nearer to, shape (2,)."""
+        return self if self.arc.direction(0.5 * self.length_px) @ toward > 0.0 else self.reversed()
+
     @property
     def tail_px(self) -> np.ndarray:
         """The blunt end as it is drawn, shape (2,) [px]."""
@@ -199,11 +203,13 @@ class NeedleSize:
         length_px: along its axis [px].
         width_px: of its body [px].
         tolerance: share of the length by which it may be off, two standard deviations; 0: it is known.
+        max_brightness: greatest brightness of a pixel that may be the needle's, as a share of the floor's.
     """
 
     length_px: float
     width_px: float
     tolerance: float = 0.0
+    max_brightness: float = 0.55
 
 
 class LengthEstimator:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -17,9 +17,9 @@ from magnetosuture_thread.parameter_files import EVERY_NODE
 from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.arc import FRAMES, SET_TOLERANCE
-from magnetosuture_thread.vision.dish import find_dish
-from magnetosuture_thread.vision.images import check_image, measured_channel
-from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.dish import NO_DISH, RING_ERROR, see_dish
+from magnetosuture_thread.vision.images import check_image, measured_channel, shrunk
+from magnetosuture_thread.vision.settings import VisionTrackerSettings, scaled_homography
 from magnetosuture_thread.vision.tracker import VisionTracker
 
 MAX_RESIDUAL_PX = 1.5  # of the markers' corners, root of mean square; beyond, they are not where they should be
@@ -40,6 +40,8 @@ class Calibration:
         dish_diameter: inner diameter of the dish [m].
         homography: from a tilted camera's frame to the one in which the view holds, shape (3, 3); None if straight.
         needle_length: measured [m]; None if it was not asked for. See `measure_needle_length`.
+        scale_error: standard deviation of the scale by the dish, as a share.
+        remark: what a user should know of the view; empty if nothing.
     """
 
     view: DishView
@@ -49,6 +51,8 @@ class Calibration:
     dish_diameter: float
     homography: np.ndarray | None = None
     needle_length: float | None = None
+    scale_error: float = 0.0
+    remark: str = ""
 
     def to_yaml(self) -> str:
         """Return a section of a ROS 2 parameter file for the vision tracker, and the needle's length for every node."""
@@ -97,26 +101,53 @@ def measure_needle_length(images: Sequence[np.ndarray], calibration: Calibration
     raise InvalidInputError("frames", f"no needle's length in {len(images)} frames", expected)
 
 
-def calibrate_by_dish(images: Sequence[np.ndarray], dish_diameter: float) -> Calibration:
-    """Return the mean of the dish's circle over several frames; the rotation is 0.
+def calibrate_by_dish(
+    images: Sequence[np.ndarray], dish_diameter: float, settings: VisionTrackerSettings | None = None
+) -> Calibration:
+    """Return the median of the dishes over several frames, as the tracker finds them; the rotation is 0.
 
     Args:
         images: of one size, BGR or grey, uint8.
         dish_diameter: inner diameter of the dish [m].
+        settings: of the tracker, whose view is not used.
 
     Raises:
         InvalidInputError: no images, images of different sizes, too few with a dish, or dishes that differ.
     """
-    grays = _grays(images)
-    views = [view for view in (find_dish(gray, dish_diameter) for gray in grays) if view is not None]
-    if not views or len(views) < 0.5 * len(grays):
-        raise InvalidInputError("frames", f"{len(views)} of {len(grays)} with a dish", "a dish in at least half")
-    circles = np.array([(*view.centre_px, 0.5 * dish_diameter / view.metres_per_pixel) for view in views])
-    u, v, radius = np.median(circles, axis=0) if len(circles) > 2 else circles.mean(axis=0)
-    scatter = float(np.sqrt(np.mean(np.sum((circles - (u, v, radius)) ** 2, axis=1))))
-    _check_scatter("dishes", scatter)
+    _check_images(images)
+    given = replace(settings or VisionTrackerSettings(), dish_centre_px=(), metres_per_pixel=0.0, straightening=())
+    box = given.region_in(images[0].shape)
+    factor = given.working_factor((box[3] - box[1], box[2] - box[0]), dish_diameter)
+    left, top, right, bottom = (value // factor for value in box)
+    parts = (shrunk(image, factor)[top:bottom, left:right] for image in images)
+    seen = (see_dish(np.ascontiguousarray(part), given, dish_diameter) for part in parts)
+    dishes = [dish for dish in seen if dish is not None]
+    if not dishes or len(dishes) < 0.5 * len(images):
+        expected = f"a dish in at least half; else {NO_DISH}"
+        raise InvalidInputError("frames", f"{len(dishes)} of {len(images)} with a dish", expected)
+    circles = np.array([(*dish.view.centre_px, 0.5 * dish_diameter / dish.view.metres_per_pixel) for dish in dishes])
+    slack = max(MAX_SCATTER_PX, RING_ERROR * float(np.median(circles[:, 2])))
+    apart = circles[:, None] - circles
+    still = np.hypot(apart[..., 0], apart[..., 1]) < slack
+    if 2 * still.sum(axis=1).max() <= len(dishes):
+        _check_scatter("dishes", float(np.sqrt(np.mean(np.sum((circles - circles.mean(axis=0)) ** 2, axis=1)))))
+    # In some frames another edge of the wall may be found, which is no motion: what most agree on is taken.
+    alike = still & (np.abs(apart[..., 2]) < slack)
+    kept = alike[alike.sum(axis=1).argmax()]
+    u, v, radius = np.median(circles[kept], axis=0) if kept.sum() > 2 else circles[kept].mean(axis=0)
+    scatter = factor * float(np.sqrt(np.mean(np.sum((circles[kept] - (u, v, radius)) ** 2, axis=1))))
+    nearest = dishes[int(np.where(kept, np.abs(circles[:, 2] - radius), np.inf).argmin())]
+    view = DishView((float(u) + left, float(v) + top), 0.5 * dish_diameter / radius).shrunk(1.0 / factor)
+    straight = nearest.straightening()
     return Calibration(
-        DishView((float(u), float(v)), 0.5 * dish_diameter / radius), len(views), 0.0, scatter, dish_diameter
+        view,
+        int(kept.sum()),
+        0.0,
+        scatter,
+        dish_diameter,
+        None if straight is None else scaled_homography(scaled_homography(straight, 1.0, -left, -top), 1.0 / factor),
+        scale_error=nearest.scale_error,
+        remark=nearest.warning,
     )
 
 
@@ -227,10 +258,15 @@ def _homography(points: np.ndarray, pixels: np.ndarray) -> tuple[DishView, np.nd
 
 
 def _grays(images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    _check_images(images)
+    return [measured_channel(image) for image in images]
+
+
+def _check_images(images: Sequence[np.ndarray]) -> None:
+    """Refuse what are no images of one size."""
     for image in images:
         check_image(image)
     sizes = sorted({image.shape[1::-1] for image in images})
     if len(sizes) != 1:
         given = " and ".join(f"{wide} x {high}" for wide, high in sizes) or "none"
         raise InvalidInputError("frames", given, "frames of one size")
-    return [measured_channel(image) for image in images]

@@ -1,7 +1,8 @@
 """Finds the petri dish, how far the camera over it is tilted, and whether it moves.
 
 The dish is a bright disc within a dark rim; without one, as in a photograph, an ellipse that the edges of its wall
-agree on, whatever is brighter.
+agree on, whatever is brighter. A wall and a lid have several edges, its rings: by how much they differ is the doubt of
+the scale, and a tilt is one that two of them agree on.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ BINS = 72  # directions
 ALIGNMENT = math.cos(math.radians(20.0))  # of an edge's gradient with the direction from the centre
 AGREEMENT, FINE_AGREEMENT = 0.012, 0.006  # of the radius, within which an edge agrees with an ellipse
 MIN_RATIO = 0.8  # of the axes: a camera tilted by 37 degrees
-INNER_RADIUS = 0.82  # of the best supported ellipse, that the wall's inner edge has at least
+INNER_RADIUS = 0.82  # of one ring of a wall, that another one has at least
+MAX_RINGS = 5  # edges of wall and lid
 NORMALS, FINE_REACH = 180, 0.03  # along which the edge is measured; how far, of the radius
 
 RAYS, RIM_RAYS = 180, 72  # along which the rim is looked for, and of the quick check
@@ -36,11 +38,17 @@ EDGE_LEVEL = 60  # of the circle transform, as of Canny's upper threshold; the l
 MIN_CONTRAST = 12.0  # grey levels; of the rim at least, and 0.15 of the floor's brightness
 
 MIN_ANGLE = math.radians(3.5)  # below, light from one side moves the rim as much
+TILT_ERROR = math.radians(2.0)  # of a ring's tilt, by light and noise
 NEAR = 0.1  # of its distance from the camera, that the dish's radius is at most; more is hardly used over a dish
 
 DARK_FLOOR = 130.0  # grey levels; a dish, or with a given view a frame, whose median is below may have a dark floor
-SCALE_ERROR = 0.001  # of a scale by the dish's rim: how far its light moves the edge
+SCALE_ERROR = 0.001  # of a scale by a dark rim: how far its light moves the edge
+RING_ERROR = 0.01  # of a radius and a centre by a ring of any other look
+GIVEN_ERROR = 0.03  # of a given scale against the dish's diameter, that light and tolerances of a mould may make
+WALL = 0.001  # m; thickness of a moulded dish's wall, of which one edge that is seen alone may be either
 LONG_SEARCH = 4  # frames without a dish, in one of which it is looked for as in a photograph
+
+NO_DISH = "no dish in the image: show its whole rim in even light, limit the search by region_px, or give its view"
 
 Circle = tuple[float, float, float, int]  # u, v and radius [px], and how many points agree
 
@@ -111,35 +119,59 @@ class _Edges:
 
 
 def find_ellipse(image: np.ndarray) -> Ellipse | None:
-    """Find the inner edge of a dish's wall, by gradients alone.
+    """Return the inner edge of a dish's wall, by gradients alone; None if no edges agree on one. See `find_rings`."""
+    rings = find_rings(image)
+    return inner_ring(rings) if rings else None
+
+
+@dataclass(frozen=True)
+class Ring:
+    """An edge of a dish's wall or lid: its ellipse [px], and the share of the directions in which it is seen."""
+
+    ellipse: Ellipse
+    support: float
+
+
+def find_rings(image: np.ndarray, known: Ellipse | None = None) -> list[Ring]:
+    """Find the edges of a dish's wall by gradients alone, the best supported one first.
 
     In a small image edges vote for the centres of circles along their gradients; where no circle is certain the image
     is stretched in a few directions, in which the ellipse of a tilted camera is nearly a circle. Around the centres
     with the most votes, random samples of five edges give ellipses, and the one is kept that edges in the most
-    directions agree on, within a share of its radius. Of the edges of a wall and a lid the innermost is taken that is
-    about as well supported. In the full image the edge is measured along its normals.
+    directions agree on, within a share of its radius; then others near it. In the full image each edge is measured
+    along its normals.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3), uint8.
-
-    Returns:
-        The ellipse, or None if no edges agree on one.
+        known: an edge that was found before, which comes first [px].
     """
     factor = max(1.0, min(image.shape[:2]) / COARSE_SIDE)
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     if max(size) > 4 * COARSE_SIDE:  # no frame of a camera
-        return None
+        return []
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor > 1.0 else image
+    factor = image.shape[1] / small.shape[1]
     edges = _edges_of(small)
     if len(edges.points) < 40:
-        return None
+        return []
+    if known is not None:
+        others = _rings_near(edges, Ring(known.scaled(1.0 / factor), 1.0))
+        return [Ring(known, 1.0), *_refined(image, others, factor)]
     found = _candidates(edges, 1.0, 0.0)
     if not found or max(share for _, share, _ in found) < 0.8:
         found += [each for way in range(4) for each in _candidates(edges, 1.0 / 0.9, 0.25 * math.pi * way)]
     if not found:
-        return None
-    _, share, best = max(found, key=lambda each: each[0])
-    return _refined(image, _innermost(edges, best, share).scaled(image.shape[1] / small.shape[1]))
+        return []
+    _, share, ellipse = max(found, key=lambda each: each[0])
+    best = Ring(ellipse, share)
+    return _refined(image, [best, *_rings_near(edges, best)], factor)
+
+
+def inner_ring(rings: list[Ring], *, outer: bool = False) -> Ellipse:
+    """Return the smallest of the rings that are about as well supported as the best, or the largest of them."""
+    best = max(ring.support for ring in rings)
+    ellipses = [ring.ellipse for ring in rings if ring.support >= 0.85 * best]
+    return (max if outer else min)(ellipses, key=lambda each: each.major)
 
 
 def edge_along(gray: Gray, at: Ellipse, reach: float = FINE_REACH) -> Points:
@@ -304,28 +336,28 @@ def _needed(seen: float) -> float:
     return 0.6 + 0.5 * (1.0 - seen)
 
 
-def _innermost(edges: _Edges, best: Ellipse, support: float) -> Ellipse:
-    """Return the innermost of the edges within the best, whose support is given, that are about as well supported.
+def _rings_near(edges: _Edges, best: Ring) -> list[Ring]:
+    """Return other edges of a wall or a lid than the best supported one, about as large as it.
 
     Wall and lid are at different heights: seen by a tilted camera their edges are not concentric.
     """
-    inner, enough = best, 0.85 * support
-    for _ in range(4):  # edges of wall and lid
-        at, facing = edges.radii(inner)
-        away = np.hypot(*at.T)
-        outer = 1.0 - max(1.5 * AGREEMENT, 2.0 / inner.major)
-        least = INNER_RADIUS * best.major / inner.major
-        near = facing & (away > least) & (away < 1.0 + INNER_RADIUS - least)
-        near &= (away < outer) | (away > 2.0 - outer)  # not those of the one that is known
-        points = _through(at[near], max(0.8 / inner.major, AGREEMENT))
-        found = _fitted(inner.at(points)) if points is not None else None
-        if found is None or not INNER_RADIUS * best.major < found.major < 0.99 * inner.major:
+    at, near = edges.radii(best.ellipse)
+    away = np.hypot(*at.T)
+    near &= (away > INNER_RADIUS) & (away < 2.0 - INNER_RADIUS)
+    found = [best]
+    while len(found) < MAX_RINGS:
+        last = found[-1].ellipse
+        own = np.abs(np.hypot(*edges.radii(last)[0].T) - 1.0) < max(1.5 * AGREEMENT, 2.0 / last.major)
+        near &= ~own
+        points = _through(at[near], max(0.8 / best.ellipse.major, AGREEMENT))
+        ellipse = _fitted(best.ellipse.at(points)) if points is not None else None
+        if ellipse is None:
             break
-        share, seen = _support(edges, found)
-        if share < max(enough, _needed(seen)):
+        share, seen = _support(edges, ellipse)
+        if share < _needed(seen):
             break
-        inner = found
-    return inner
+        found.append(Ring(ellipse, share))
+    return found[1:]
 
 
 def _through(offsets: Points, tolerance: float) -> Points | None:
@@ -372,17 +404,21 @@ def _harmonics(turns: np.ndarray) -> np.ndarray:
     )
 
 
-def _refined(image: np.ndarray, ellipse: Ellipse) -> Ellipse | None:
-    """Return an ellipse measured along its normals, in the image's own pixels."""
+def _refined(image: np.ndarray, rings: list[Ring], scale: float) -> list[Ring]:
+    """Return rings of an image shrunk by a scale, measured along their normals in the image's own pixels."""
     gray = measured_channel(image)
     factor = max(1, round(min(gray.shape) / 960))  # rows or columns are enough to measure in
-    gray, at = shrunk(gray, factor), ellipse.scaled(1.0 / factor)
-    for reach in (FINE_REACH, 0.5 * FINE_REACH):
-        fitted = fitted_robustly(edge_along(gray, at, reach), at)
-        if fitted is None:
-            break
-        at = fitted
-    return at.scaled(float(factor)) if at.minor > MIN_RATIO * at.major else None
+    gray, result = shrunk(gray, factor), []
+    for ring in rings:
+        at = ring.ellipse.scaled(scale / factor)
+        for reach in (FINE_REACH, 0.5 * FINE_REACH):
+            fitted = fitted_robustly(edge_along(gray, at, reach), at)
+            if fitted is None:
+                break
+            at = fitted
+        if at.minor > MIN_RATIO * at.major:
+            result.append(Ring(at.scaled(float(factor)), ring.support))
+    return result
 
 
 def _fitted(points: Points) -> Ellipse | None:
@@ -409,6 +445,11 @@ class Tilt:
 
     angle: float
     direction: float
+
+    def apart(self, other: Tilt) -> float:
+        """Return by how much another tilt differs [rad]; a direction and its opposite are one."""
+        ends = [each.angle * np.exp(2j * each.direction) for each in (self, other)]
+        return float(abs(ends[0] - ends[1]))
 
 
 def perspective(tail: np.ndarray, heading: np.ndarray, radius: float) -> np.ndarray:
@@ -478,8 +519,7 @@ class FoundDish:
         angle = -self.tilt.direction - self.view.rotation
         along = np.array([math.cos(angle), math.sin(angle)])  # in the dish frame
         either = perspective(tail, heading, radius) @ (math.tan(self.tilt.angle) * along)
-        # Light and noise change a tilt by 2 degrees.
-        return np.outer(either, either) + unseen_tilt_covariance(tail, heading, math.radians(2.0), radius)
+        return np.outer(either, either) + unseen_tilt_covariance(tail, heading, TILT_ERROR, radius)
 
     @property
     def warning(self) -> str:
@@ -487,17 +527,22 @@ class FoundDish:
         tilted = f"the camera is tilted by {math.degrees(self.tilt.angle):.0f} degrees" if self.tilt is not None else ""
         return "; ".join(filter(None, (tilted, self.remark)))
 
+    def straightening(self) -> np.ndarray | None:
+        """Return the homography to the frame in which the dish is round: a tilted one is stretched by 1 / cos."""
+        if self.tilt is None:
+            return self.homography
+        along = np.array([math.cos(self.tilt.direction), math.sin(self.tilt.direction)])
+        homography = np.eye(3)
+        homography[:2, :2] += (1.0 / math.cos(self.tilt.angle) - 1.0) * np.outer(along, along)
+        centre = np.array(self.view.centre_px)
+        homography[:2, 2] = centre - homography[:2, :2] @ centre
+        return homography
+
     def prepared(self, image: np.ndarray) -> np.ndarray:
-        """Return a frame with a bright floor and a round dish: a tilted one is stretched by 1 / cos of the angle."""
+        """Return a frame with a bright floor and a round dish."""
         if self.dark_field:
             image = 255 - image
-        homography = self.homography
-        if self.tilt is not None:
-            along = np.array([math.cos(self.tilt.direction), math.sin(self.tilt.direction)])
-            homography = np.eye(3)
-            homography[:2, :2] += (1.0 / math.cos(self.tilt.angle) - 1.0) * np.outer(along, along)
-            centre = np.array(self.view.centre_px)
-            homography[:2, 2] = centre - homography[:2, :2] @ centre
+        homography = self.straightening()
         if homography is None:
             return image
         size = image.shape[1::-1]
@@ -519,65 +564,117 @@ def see_dish(
     fixed = settings.fixed_view()
     if fixed is not None:
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
-        dark = middle(gray[::8, ::8]) < DARK_FLOOR and _with_given(find_dish(gray, diameter), settings) is None
-        dark = dark and _with_given(find_dish(255 - gray, diameter), settings) is not None
+        dark = middle(gray[::8, ::8]) < DARK_FLOOR and not _fits(find_dish(gray, diameter), fixed)
+        dark = dark and _fits(find_dish(255 - gray, diameter), fixed)
         return FoundDish(fixed, dark, homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
-        found = _with_given(find_dish(gray, diameter), settings)
-        if found is None:
-            continue
-        view, remark = found
-        if dark_field and floor_level(gray, view, diameter) < 255.0 - DARK_FLOOR:
+        view = find_dish(gray, diameter)
+        if view is None or (dark_field and floor_level(gray, view, diameter) < 255.0 - DARK_FLOOR):
             continue  # A bright rim around a bright floor, as of clear walls.
-        if settings.dish_centre_px or settings.metres_per_pixel:  # measured by a calibration
-            error = 0.0 if settings.metres_per_pixel and not remark else SCALE_ERROR
-            return FoundDish(view, dark_field, scale_error=error, remark=remark)
-        tilt, view = find_tilt(gray, view, diameter)
-        return FoundDish(view, dark_field, tilt, SCALE_ERROR, 0.0 if tilt is not None else MIN_ANGLE)
+        radius = 0.5 * diameter / view.metres_per_pixel
+        circle = Ellipse(view.centre_px, radius, radius, 0.0)
+        rings = find_rings(image, circle)
+        edge = circle if not settings.rim else inner_ring(rings, outer=settings.rim == "outer")
+        if edge is circle:
+            found = _by_dark_rim(gray, view, rings, settings, diameter)
+        else:
+            found = _by_ring(edge, rings, settings, diameter)
+        given = _with_given(replace(found, dark_field=dark_field), settings)
+        if given is not None:
+            return given
     return _photographed(image, settings, diameter) if photographed else None
 
 
-def _with_given(found: DishView | None, settings: VisionTrackerSettings) -> tuple[DishView, str] | None:
-    """Return a view that was found with what is given of it, and a remark; None if they don't fit at all.
+def _fits(found: DishView | None, given: DishView) -> bool:
+    return found is not None and abs(found.metres_per_pixel / given.metres_per_pixel - 1.0) < 1.0 - INNER_RADIUS
 
-    Where a given scale and the dish differ by more than a rim's light can make, all that is known of the scene is
-    relative to its dish: the dish gives the scale.
-    """
-    if found is None:
-        return None
-    scale, remark = settings.metres_per_pixel or found.metres_per_pixel, ""
-    apart = found.metres_per_pixel / scale - 1.0
-    if abs(apart) > 0.1:  # It is another dish.
-        return None
-    if abs(apart) > 0.03:  # more than the rim's light can make
-        scale = found.metres_per_pixel
-        remark = f"metres_per_pixel is {100.0 * abs(apart):.0f} % off what the dish's diameter makes it, which is used"
-    centre = settings.dish_centre_px
-    return DishView((centre[0], centre[1]) if centre else found.centre_px, scale, settings.camera_rotation), remark
+
+def _by_dark_rim(
+    gray: Gray, view: DishView, rings: list[Ring], settings: VisionTrackerSettings, diameter: float
+) -> FoundDish:
+    """Return the dish by a dark rim's inner edge; in doubt as any ring's, unless the wall is as dark as steel."""
+    radius = 0.5 * diameter / view.metres_per_pixel
+    _, darkest = rim_points(gray, view.centre_px, radius, REACH * radius, 0.5, RIM_RAYS)
+    level = settings.max_needle_brightness * floor_level(gray, view, diameter)
+    is_wall = len(darkest) > 0 and middle(sampled(gray, darkest)) < level
+    error = SCALE_ERROR if is_wall else _doubt(rings, radius, settings, diameter)
+    tilt, straight = find_tilt(gray, view, diameter)
+    if tilt is not None and not _is_confirmed(tilt, radius, rings):
+        return FoundDish(view, scale_error=error, unseen_tilt=tilt.angle)
+    return FoundDish(straight, tilt=tilt, scale_error=error, unseen_tilt=0.0 if tilt is not None else MIN_ANGLE)
+
+
+def _doubt(rings: list[Ring], radius: float, settings: VisionTrackerSettings, diameter: float) -> float:
+    """Return the doubt of a scale by a ring of a radius [px]: that of another ring, if the user names none."""
+    if len(rings) == 1:
+        return max(RING_ERROR, 2.0 * WALL / diameter)
+    return max(RING_ERROR, *(abs(ring.ellipse.major / radius - 1.0) for ring in rings if not settings.rim), 0.0)
+
+
+def _by_ring(edge: Ellipse, rings: list[Ring], settings: VisionTrackerSettings, diameter: float) -> FoundDish:
+    """Return the dish by one of its rings; where none was named, all of them make the doubt of the scale."""
+    error = _doubt(rings, edge.major, settings, diameter)
+    tilt = tilt_of(edge)
+    if tilt is not None and not _is_confirmed(tilt, edge.major, rings):
+        # One edge that is no circle may be a tilted one, or two edges of which each is seen in a part.
+        radius = 0.5 * (edge.major + edge.minor)
+        error = max(error, edge.major / radius - 1.0)
+        return FoundDish(DishView(edge.centre_px, 0.5 * diameter / radius), False, None, error, tilt.angle)
+    view = DishView(edge.centre_px, 0.5 * diameter / edge.major)
+    return FoundDish(view, False, tilt, error, MIN_ANGLE if tilt is None else 0.0)
+
+
+def _is_confirmed(tilt: Tilt, radius: float, rings: list[Ring]) -> bool:
+    """Say whether another ring than that of a radius [px] has the same tilt."""
+    for ring in rings:
+        other = tilt_of(ring.ellipse)
+        if other is not None and abs(ring.ellipse.major / radius - 1.0) > AGREEMENT and tilt.apart(other) < TILT_ERROR:
+            return True
+    return False
+
+
+def _with_given(found: FoundDish, settings: VisionTrackerSettings) -> FoundDish | None:
+    """Return a dish with what is given of its view, as by a calibration; None if it is another one."""
+    centre, scale = settings.dish_centre_px, settings.metres_per_pixel
+    view = replace(found.view, rotation=settings.camera_rotation)
+    remark = ""
+    if not (centre or scale):
+        if found.scale_error > RING_ERROR:
+            percent = f"{100.0 * found.scale_error:.0f} %"
+            remark = f"the scale is known to {percent} only: name the wall's edge by rim, or give metres_per_pixel"
+        return replace(found, view=view, remark=remark)
+    error = found.scale_error
+    if scale:
+        apart = abs(view.metres_per_pixel / scale - 1.0)
+        if apart > 1.0 - INNER_RADIUS:
+            return None
+        if apart > max(error, GIVEN_ERROR):
+            by_dish = f"{1e3 * view.metres_per_pixel:.4g} mm by the dish's diameter"
+            remark = f"metres_per_pixel is {1e3 * scale:.4g} mm, which is used, but {by_dish}: one of them is wrong"
+        error = apart if remark else 0.0
+        view = replace(view, metres_per_pixel=scale)
+    if centre:
+        view = replace(view, centre_px=(centre[0], centre[1]))
+    unseen_tilt = found.unseen_tilt if found.unseen_tilt > MIN_ANGLE else 0.0
+    return replace(found, view=view, tilt=None, scale_error=error, unseen_tilt=unseen_tilt, remark=remark)
 
 
 def _photographed(image: np.ndarray, settings: VisionTrackerSettings, diameter: float) -> FoundDish | None:
-    """Find a dish by its ellipse alone, as in a photograph: cut, saturated, with a lid, on any ground."""
-    ellipse = find_ellipse(image)
-    if ellipse is None:
+    """Find a dish by its rings alone, as in a photograph: cut, saturated, with a lid, on any ground."""
+    rings = find_rings(image)
+    if not rings:
         return None
-    gray, found = measured_channel(image), DishView(ellipse.centre_px, 0.5 * diameter / ellipse.major)
-    tilt, unseen_tilt = tilt_of(ellipse), MIN_ANGLE
-    if tilt is not None and ellipse.is_cut(image.shape):
-        cut = _find_cut_dish(gray, ellipse, diameter)
-        if cut is None:
+    gray, edge = measured_channel(image), inner_ring(rings, outer=settings.rim == "outer")
+    found = _by_ring(edge, rings, settings, diameter)
+    if tilt_of(edge) is not None and edge.is_cut(image.shape):
+        view = _find_cut_dish(gray, edge, diameter)
+        if view is None:
             return None
-        found = cut
-        tilt, unseen_tilt = None, math.radians(10.0)
-    if (given := _with_given(found, settings)) is None:
-        return None
-    view, remark = given
-    dark_field = floor_level(gray, found, diameter) < 64.0
-    tilt = None if settings.dish_centre_px or settings.metres_per_pixel else tilt
-    # The scale is off by 1 %: which edge of the wall it is, and where light moves it.
-    return FoundDish(view, dark_field, tilt, 0.01, 0.0 if tilt is not None else unseen_tilt, remark)
+        found = replace(found, view=view, tilt=None, unseen_tilt=math.radians(10.0))
+    dark_field = floor_level(gray, found.view, diameter) < 64.0
+    return _with_given(replace(found, dark_field=dark_field), settings)
 
 
 class DishWatch:
@@ -605,6 +702,11 @@ class DishWatch:
         """Where the dish is; None if it was not found yet."""
         return self._fixed or (self.found.view if self.found is not None else None)
 
+    @property
+    def scale_error(self) -> float:
+        """Standard deviation of the view's scale, as a share; see `FoundDish`."""
+        return self.found.scale_error if self.found is not None else 0.0
+
     def forget(self) -> None:
         """Begin anew, as with a camera of another size."""
         self.found, self._anew, self._searched = None, [], 0
@@ -622,7 +724,7 @@ class DishWatch:
         if self._fixed is not None or self.found is None:
             self.found = self._search(image)
             if self.found is None:
-                return "no dish in the image", image
+                return NO_DISH, image
             return "", self.found.prepared(image)
         prepared = self.found.prepared(image)
         gray, view = measured_channel(prepared), self.found.view
@@ -633,7 +735,7 @@ class DishWatch:
         found = self._search(image)
         if found is None:
             self._anew = []
-            return "too little of the dish is seen", prepared
+            return "too little of the dish is seen: uncover its rim, or give its view", prepared
         if self._agree(found, self.found):  # A rim that is not dark is seen by its ellipse only.
             self._anew = []
             return "", prepared
@@ -657,7 +759,7 @@ class DishWatch:
         slack = 2.0 * max(one.scale_error, other.scale_error)
         scale = one.view.metres_per_pixel
         apart = math.dist(one.view.centre_px, other.view.centre_px)
-        near = apart < max(1.0, slack * 0.5 * self._diameter / scale)
+        near = apart < max(1.0, min(slack, 2.0 * RING_ERROR) * 0.5 * self._diameter / scale)
         return near and abs(scale / other.view.metres_per_pixel - 1.0) < max(0.005, slack)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
-from magnetosuture_thread.vision.images import RIM_PX, Picture, SceneMask, middle
+from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, SceneMask, middle
 from magnetosuture_thread.vision.template import (
     BESIDE_PX,
     BLOOM_PX,
@@ -38,7 +38,7 @@ MAX_MISSING_END, END_ROWS = 0.15, 3  # share of steel that the image may lack at
 MAX_BEYOND = 0.6  # of the body's width beyond an end that may be dark; beyond a tail more, where a thick thread leaves
 BLUNT = 0.7  # bluntness of a tail at least
 CORE = 0.33  # of the body's width: what lies deeper in the dark than this is no thin thread
-ALIKE, NO_SHAPE = "ends that look alike", "no needle's shape"
+NO_SHAPE = "no needle's shape"
 
 
 def find_needles(
@@ -62,7 +62,32 @@ def find_needles(
         # What of a dark shape the tolerance leaves may have grown together with the needle, or the wall is beside it.
         needles, again = _measured(picture, size, toward, tight=True)
         refused = [reason for reason in refused if reason != AT_WALL] or again or refused
+    if not needles and refused:
+        dull, _ = _measured(_without_gleam(picture, size.width_px), size, toward, tight=False)
+        needles = [_undirected(needle) if toward is None else needle.pointing(toward) for needle in dull]
     return needles, refused
+
+
+def _undirected(needle: MeasuredNeedle) -> MeasuredNeedle:
+    """Return a needle whose tail may be where its tip is taken to be."""
+    chord, ahead = needle.tip_px - needle.tail_px, needle.direction_px
+    tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
+    assert needle.covariance is not None
+    covariance = needle.covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
+    confidence = 0.5 * needle.confidence
+    return replace(needle, covariance=covariance, confidence=confidence, heading_known=False, tail_shift_px=0.0)
+
+
+def _without_gleam(picture: Picture, width: float) -> Picture:
+    """Return a picture without bright lines that are narrower than a needle [px], as of a lamp along a bare rod."""
+    side = 2 * int(0.35 * width) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+    def dull(layer: Layer) -> Layer:
+        return replace(layer, pixels=np.asarray(cv2.morphologyEx(layer.pixels, cv2.MORPH_OPEN, kernel)))
+
+    one, is_gray = dull(picture.brightest), picture.darkest is picture.brightest
+    return replace(picture, brightest=one, darkest=one if is_gray else dull(picture.darkest))
 
 
 def _measured(
@@ -74,7 +99,7 @@ def _measured(
     cut = 0.0 if tight or mask is None else mask.tolerance_px
     needles: list[MeasuredNeedle] = []
     refused: list[str] = []
-    candidates = _dark_components(picture, radius, cut, size.length_px * size.width_px)
+    candidates = _dark_components(picture, radius, cut, size.length_px * size.width_px, size.max_brightness)
     if len(candidates) > 6:
         return [], [f"{len(candidates)} dark things"]
     for points in candidates:
@@ -97,7 +122,7 @@ def _measured(
     return needles, refused
 
 
-def _dark_components(picture: Picture, radius: float, cut: float, area: float) -> list[np.ndarray]:
+def _dark_components(picture: Picture, radius: float, cut: float, area: float, limit: float) -> list[np.ndarray]:
     """Return the pixels of each dark component of at least a part `MIN_AREA` of an area [px^2], shape (m, 2).
 
     Args:
@@ -105,8 +130,9 @@ def _dark_components(picture: Picture, radius: float, cut: float, area: float) -
         radius: around the dish's centre, beyond which nothing is searched [px].
         cut: depth in a shape of the scene from which on nothing is searched [px].
         area: of a needle [px^2].
+        limit: share of the floor's brightness, below which a pixel is dark.
     """
-    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=0.55)
+    bound = cv2.convertScaleAbs(picture.brightest.floor, alpha=limit)
     dark = cv2.compare(picture.brightest.pixels, bound, cv2.CMP_LT)
     inside = np.zeros(picture.shape, np.uint8)
     u, v, reach = (round(16.0 * value) for value in (*picture.wall.centre, radius))
@@ -148,8 +174,6 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
     Returns:
         The needle, in the picture's pixels, or in words why there is none.
     """
-    if steel.depth < 0.3:  # of the floor's brightness
-        return "too faint"
     length, width = size.length_px, size.width_px
     ends = np.array([0.0, length])
     guesses: list[np.ndarray] = []  # both ends of each
@@ -174,8 +198,6 @@ def measure_needle(steel: SteelMap, size: NeedleSize, toward: np.ndarray | None 
             if corners.min() < 3.0 or (corners > np.array(steel.size) - 4.0).any():
                 return "cut by the image's border"
             return found
-        if found == ALIKE:
-            return found  # A worse fit of the same needle must not tell what this one does not.
     return found
 
 
@@ -214,10 +236,7 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         if rod.cost > HOPELESS * pointed.cost:  # and so was given up
             tolerance = size.tolerance if is_measured else 0.0
             rod = fit_template(steel, rod.arc, size.length_px, width, tolerance=tolerance, start=rod.length, rod=True)
-        settled = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
-        if settled is None:
-            return ALIKE
-        fit, is_known = settled
+        fit, is_known = _settled(steel, rod if is_rod else pointed, rod, toward, is_rod=is_rod)
     beyond_tip, beyond_tail, _ = _excess(steel.surely, fit, width)
     if reason := _what_prolongs(steel, fit, (beyond_tip, beyond_tail), is_known):
         return reason
@@ -230,24 +249,18 @@ def _checked(steel: SteelMap, rough: TemplateFit, size: NeedleSize, toward: np.n
         pull = math.hypot(pull, length_error * size.length_px)
     lengthwise = np.array([1.0, 0.0, fit.arc.curvature])
     covariance = covariance + pull**2 * np.outer(lengthwise, lengthwise)
-    if not is_known:
-        # The tail may be where the tip is taken to be.
-        chord, ahead = fit.arc.at(fit.length) - fit.arc.start, fit.arc.direction()
-        tip = np.array([chord @ ahead, chord @ [-ahead[1], ahead[0]], 0.0])
-        covariance = covariance + np.outer(tip, tip) + np.diag([0.0, 0.0, math.pi**2])
-        confidence *= 0.5
-    return MeasuredNeedle(
+    needle = MeasuredNeedle(
         arc=fit.arc,
         length_px=fit.length,
         width_px=fit.width,
         contrast=steel.depth,
         confidence=max(0.05, float(confidence)),
         covariance=covariance,
-        heading_known=is_known,
         size_measured=is_measured,
-        tail_shift_px=(tail_shift(steel, fit) or 0.0) if is_known else 0.0,
+        tail_shift_px=tail_shift(steel, fit) or 0.0,
         direction_is_clear=is_clear,
     )
+    return needle if is_known else _undirected(needle)
 
 
 def _fits(
@@ -338,18 +351,15 @@ def _what_prolongs(steel: SteelMap, fit: TemplateFit, beyond: tuple[float, float
 
 def _settled(
     steel: SteelMap, fit: TemplateFit, rod: TemplateFit, toward: np.ndarray | None, *, is_rod: bool
-) -> tuple[TemplateFit, bool] | None:
+) -> tuple[TemplateFit, bool]:
     """Return a needle whose shape does not tell tail and tip apart, and whether something else does.
 
     A thread leaves a rod's tail through its middle, and does not lie over the rod there. One that passes beside one end
     of a pointed needle hides the shape of that end; the other is the tail if it is blunt and no thread goes on there.
-    Where no thread is seen at either end of what is no rod, and does not look more like one, None: the length may be
-    another's.
     """
     offsets = _thread_offsets(steel, rod)
-    if not is_rod and offsets == (None, None):
-        is_blunt = CLEARLY * rod.cost < fit.cost or (rod.cost < fit.cost and _is_rod(steel, rod))
-        return (rod, False) if is_blunt else None
+    if not is_rod and offsets == (None, None) and rod.cost < fit.cost:
+        fit = rod
     blunt = _bluntness(steel.surely, rod)
     bound = 0.3 * rod.width + 0.3
     is_pointed = rod.cost > CLEARLY * fit.cost

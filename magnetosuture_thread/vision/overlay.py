@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -26,7 +27,8 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     """Draw dish, thread and needle over a frame, and the state as text.
 
     Pieces of the thread whose place along it is known are green, and joined by thin lines; others are red. A dot is the
-    thread's end, a ring where it goes on unseen, and thin lines surround what may hide it.
+    thread's end, a ring where it goes on unseen, and thin lines surround what may hide it. Of a needle whose direction
+    is unknown both ends are rings.
 
     Args:
         image: shape (rows, columns) or (rows, columns, 3) in BGR order, uint8.
@@ -42,7 +44,7 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
     view = track.view
     if view is not None:
         _circle(drawn, np.asarray(view.centre_px), 2.5 * unit, DISH, -1)
-    if view is not None and not track.reason:
+    if view is not None and len(track.tail):
         if track.observation.pieces:
             _pieces(drawn, view, track.observation, unit)
         elif len(track.centreline) > 1:
@@ -52,7 +54,10 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
         axis = view.to_pixels(points)
         _line(drawn, axis, NEEDLE, unit)
         _circle(drawn, axis[0], 4.0 * unit, NEEDLE, unit)
-        _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, (40, 200, 255), -1)
+        if track.reason:
+            _circle(drawn, view.to_pixels(track.tip), 4.0 * unit, NEEDLE, unit)
+        else:
+            _circle(drawn, view.to_pixels(track.tip), 2.0 * unit, (40, 200, 255), -1)
     _plate(drawn, track, title, unit)
     return drawn
 
@@ -60,6 +65,13 @@ def draw_overlay(image: np.ndarray, track: Track, needle_length: float, title: s
 def draw_dish(image: np.ndarray, centre_px: tuple[float, float], radius_px: float) -> None:
     """Draw the dish's circle into a BGR image."""
     _circle(image, np.asarray(centre_px), radius_px, DISH, 1)
+
+
+def draw_region(image: np.ndarray, region_px: Sequence[float]) -> None:
+    """Draw the part of the frame that is looked at, left, top, right and bottom [px], into a BGR image."""
+    if region_px:
+        left, top, right, bottom = (int(value) for value in region_px)
+        cv2.rectangle(image, (left, top), (right - 1, bottom - 1), DISH, 1)
 
 
 class OverlayWriter:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.shared_parameters import shared_parameter
 
@@ -30,6 +30,20 @@ class VisionTrackerSettings(Configuration):
     needle_length: float = shared_parameter("needle_length")
     needle_width: float = shared_parameter("needle_width")
     thread_length: float = shared_parameter("thread_length")
+    region_px: tuple[float, ...] = quantity(
+        (),
+        "part of the frame that is looked at: left, top, right, bottom; not given: all of it",
+        unit="px",
+        minimum=0.0,
+        maximum=1e5,
+        multiple=4,
+    )
+    max_needle_brightness: float = quantity(
+        0.55,
+        "greatest brightness of a pixel that may be the needle's, as a share of the floor's; more for a bright needle",
+        minimum=0.1,
+        maximum=0.95,
+    )
     outline_tolerance: float = quantity(
         0.0003,
         "what the outline of a shape of the scene and the visible one may differ by, for parallax and calibration",
@@ -38,10 +52,20 @@ class VisionTrackerSettings(Configuration):
         maximum=0.01,
     )
     dish_centre_px: tuple[float, ...] = quantity(
-        (), "the dish's centre in the image, u and v; not given: found", unit="px", minimum=0.0, maximum=1e5, multiple=2
+        (),
+        "the dish's centre in the image, u and v; not given: found",
+        unit="px",
+        minimum=-1e5,
+        maximum=1e5,
+        multiple=2,
     )
     metres_per_pixel: float = quantity(
         0.0, "the image's scale; 0: from the dish's diameter", unit="m", minimum=0.0, maximum=0.01
+    )
+    rim: str = quantity(
+        "",
+        "edge of the dish's wall that the scene's diameter is of; not given: the inner one, in doubt by the others",
+        choices=("", "inner", "outer"),
     )
     camera_rotation: float = quantity(
         0.0,
@@ -75,6 +99,8 @@ class VisionTrackerSettings(Configuration):
         if len(self.dish_centre_px) > 2:
             name = f"{self.GROUP}.dish_centre_px"
             raise ConfigurationError(name, self.dish_centre_px, "u and v [px], or no entries to find the dish")
+        if len(self.region_px) > 4:
+            raise ConfigurationError(f"{self.GROUP}.region_px", self.region_px, "left, top, right, bottom [px]")
         if self.straightening:
             name, matrix = f"{self.GROUP}.straightening", self.homography()
             if len(self.straightening) > 9 or matrix is None or abs(np.linalg.det(matrix)) < 1e-12:
@@ -96,6 +122,20 @@ class VisionTrackerSettings(Configuration):
             return DishView((u, v), self.metres_per_pixel, self.camera_rotation)
         return None
 
+    def region_in(self, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+        """Return left, top, right and bottom of what is looked at of a frame of a shape (rows, columns) [px].
+
+        Raises:
+            InvalidInputError: the region leaves too little of it.
+        """
+        rows, columns = shape[:2]
+        left, top, right, bottom = (int(value) for value in self.region_px or (0, 0, columns, rows))
+        right, bottom = min(right, columns), min(bottom, rows)
+        if min(right - left, bottom - top) < MIN_SIDE_PX:
+            expected = f"left, top, right, bottom of {MIN_SIDE_PX} x {MIN_SIDE_PX} px or more of {columns} x {rows}"
+            raise InvalidInputError(f"{self.GROUP}.region_px", list(self.region_px), expected)
+        return left, top, right, bottom
+
     def working_factor(self, shape: tuple[int, ...], diameter: float) -> int:
         """Return by how much frames of a shape (rows, columns) of a dish are shrunk before they are measured on.
 
@@ -106,21 +146,24 @@ class VisionTrackerSettings(Configuration):
         scale = self.metres_per_pixel or diameter / side
         return max(1, min(int(self.needle_width / scale / WORKING_NEEDLE_PX), side // MIN_SIDE_PX))
 
-    def shrunk(self, factor: int) -> VisionTrackerSettings:
-        """Return the settings for frames shrunk by a factor."""
-        if factor == 1:
-            return self
+    def shrunk(self, factor: int, left: int = 0, top: int = 0) -> VisionTrackerSettings:
+        """Return the settings for frames shrunk by a factor, of which a part is looked at, from (left, top) on [px]."""
         shift = 0.5 * (factor - 1.0)
-        centre = tuple(max(0.0, (value - shift) / factor) for value in self.dish_centre_px)  # the frame's corner is 0
+        corner = zip(self.dish_centre_px, (left, top), strict=False)
+        centre = tuple((value - shift) / factor - begin for value, begin in corner)
         matrix = self.homography()
         if matrix is not None:
-            small = np.array(
-                [[1.0 / factor, 0.0, -shift / factor], [0.0, 1.0 / factor, -shift / factor], [0.0, 0.0, 1.0]]
-            )
-            matrix = small @ matrix @ np.linalg.inv(small)
+            matrix = scaled_homography(matrix, factor, left, top)
         return replace(
             self,
             dish_centre_px=centre,
             metres_per_pixel=self.metres_per_pixel * factor,
             straightening=tuple(float(value) for value in matrix.ravel()) if matrix is not None else (),
         )
+
+
+def scaled_homography(matrix: np.ndarray, factor: float, left: float = 0.0, top: float = 0.0) -> np.ndarray:
+    """Return a homography between frames, shape (3, 3), for parts of these frames shrunk by a factor; see `shrunk`."""
+    shift = 0.5 * (factor - 1.0) / factor
+    small = np.array([[1.0 / factor, 0.0, -shift - left], [0.0, 1.0 / factor, -shift - top], [0.0, 0.0, 1.0]])
+    return np.asarray(small @ matrix @ np.linalg.inv(small))

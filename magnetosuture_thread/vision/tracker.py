@@ -41,6 +41,9 @@ from magnetosuture_thread.vision.walk import Ridge, smoothed, walk_on, worth
 MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
+UNDIRECTED = "the needle's axis is found, but not which end is the tip: give a point near it by --tip or needle/tip"
+REMEDY = "check light, needle_length, needle_width, max_needle_brightness"
+TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 REPEATED = "camera repeats frames"
 MAX_CYCLE = 100  # frames; after more of them a repetition is not found
@@ -63,8 +66,8 @@ class Track:
             found anew, or seen but not yet often enough.
         reason: why there is no pose, or why its heading is unknown; empty when tracked.
         confidence: of the pose, 0 to 1; 0 without one.
-        tail: the needle's blunt end, shape (2,) [m]; empty without a pose.
-        tip: its point, shape (2,) [m]; empty without a pose.
+        tail: the needle's blunt end, shape (2,) [m]; either end where the heading is unknown, empty without an axis.
+        tip: its point, shape (2,) [m]; the other end.
         heading: unit tangent at the tail, towards the tip, shape (2,); empty without a pose.
         curvature: of the needle's axis, positive to the left of the heading [1/m]; 0 without a pose.
         covariance: of (x, y, heading angle), shape (3, 3) [m, m, rad]; empty without a pose. Where nothing tells which
@@ -75,6 +78,7 @@ class Track:
         warning: what makes the measurement worse than it could be; empty if nothing does.
         needle_length: measured over the first frames [m]; None until it is, and of a frame looked at alone.
         observation: the pieces of the thread that are seen, in the dish frame.
+        scale_error: standard deviation of the view's scale, as a share; 0 where the scale is given.
     """
 
     state: State
@@ -90,6 +94,12 @@ class Track:
     warning: str = ""
     needle_length: float | None = None
     observation: ThreadObservation = field(default_factory=ThreadObservation)
+    scale_error: float = 0.0
+
+    @property
+    def axis(self) -> Points:
+        """Both ends of the needle, its tail first, which may be either if there is a reason, shape (2, 2) or (0, 2)."""
+        return np.vstack([self.tail, self.tip]) if len(self.tail) else np.empty((0, 2))
 
 
 def no_pose(state: State, reason: str, view: DishView | None) -> Track:
@@ -137,6 +147,7 @@ class VisionTracker:
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
         self._given = settings
         self._scene = scene
+        self._tip: Points | None = None
         self._lens: Lens | None = None
         self._mask: tuple[Any, SceneMask | None] = ((), None)  # what it was made for, and the mask
         self._shape: tuple[int, ...] = ()
@@ -170,13 +181,25 @@ class VisionTracker:
     def _begin_anew(self) -> None:
         """Choose the size that frames are looked at in, and forget what was seen, not the time of the last frame."""
         diameter = self._scene.dish.diameter
-        self._factor = self._given.working_factor(self._shape, diameter) if self._shape else 1
-        self._settings = self._given.shrunk(self._factor)
+        box = self._given.region_in(self._shape) if self._shape else (0, 0, 0, 0)
+        self._factor = self._given.working_factor((box[3] - box[1], box[2] - box[0]), diameter) if self._shape else 1
+        self._region_px = [value // self._factor for value in box]
+        self._settings = self._given.shrunk(self._factor, *self._region_px[:2])
         self._dish = DishWatch(self._settings, diameter)
         self._length = LengthEstimator()
         self._last: _Pose | None = None
         self._anew: list[_Pose] = []
         self._thread: Points = np.empty((0, 2))  # in pixels, with the needle's ends
+
+    def point_at_tip(self, place: Points) -> None:
+        """Take a point near the needle's tip, shape (2,) [m], as a person gives it.
+
+        It is used in the next frame in which a needle is found, where nothing else tells its direction, and if an end
+        of it is nearer to the point than a third of its length. From then on the direction is carried from frame to
+        frame as long as the needle cannot have turned round unseen.
+        """
+        self._tip = np.array(place, dtype=float)
+        self._last, self._anew = None, []
 
     def look(self, image: np.ndarray) -> Track:
         """Look at one frame alone; what other frames showed doesn't matter.
@@ -188,9 +211,9 @@ class VisionTracker:
             InvalidInputError: the image is not of this kind.
         """
         alone = VisionTracker(replace(self._given, confirm_frames=1), self._scene)
-        alone._lens, alone._mask = self._lens, self._mask
+        alone._lens, alone._mask, alone._tip = self._lens, self._mask, self._tip
         found = alone.track(image, 0.0)
-        self._mask = alone._mask
+        self._mask, self._tip = alone._mask, alone._tip
         return replace(found, state=State.TRACKED if found.state is State.TRACKED else State.LOST, needle_length=None)
 
     def track(self, image: np.ndarray, time_s: float) -> Track:
@@ -210,17 +233,23 @@ class VisionTracker:
         check_image(image)
         self._advance(time_s)
         if image.shape[:2] != self._shape:
+            self._given.region_in(image.shape)
             self._shape = image.shape[:2]
             self._begin_anew()
         small, problem = shrunk(image, self._factor), None
         if self._lens is not None:
             problem = self._lens.problem_with(image.shape)
             small = self._lens.undistorted(small, self._factor) if problem is None else small
-        found = self._track(small, time_s)
+        left, top, right, bottom = self._region_px
+        found = self._track(np.ascontiguousarray(small[top:bottom, left:right]), time_s)
         dish = self._dish.found.warning if self._dish.found is not None else ""
         warning = "; ".join(filter(None, (dish, f"{problem}; it is not used" if problem is not None else "")))
-        view = found.view.shrunk(1.0 / self._factor) if found.view is not None else None
-        return replace(found, view=view, warning=warning, needle_length=self._length.length)
+        found = replace(found, warning=warning, needle_length=self._length.length, scale_error=self._dish.scale_error)
+        if found.view is None:
+            return found
+        u, v = found.view.centre_px
+        view = replace(found.view, centre_px=(u + left, v + top)).shrunk(1.0 / self._factor)
+        return replace(found, view=view)
 
     def _track(self, image: np.ndarray, time_s: float) -> Track:
         """Look at the next frame, shrunk."""
@@ -300,14 +329,14 @@ class VisionTracker:
         """Return the needle, the picture it is in, whether that shows all of the dish, and why there is none."""
         view, last, settings = self._found_dish().view, self._last, self._settings
         size = self._length.size(settings.needle_length, settings.needle_width, view.metres_per_pixel)
+        size = replace(size, max_brightness=settings.max_needle_brightness)
         for whole in (False, True) if last is not None else (True,):
-            box: tuple[int, int, int, int] | None = None
-            toward: np.ndarray | None = None
-            if last is not None and not whole:
-                box, (_, angle) = self._region(image, view, time), last.at(time)
-                toward = view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
-            picture = self._picture(image, box)
+            picture = self._picture(image, None if whole else self._region(image, view, time))
+            toward = self._toward(view, time)
             needles, refused = find_needles(picture, size, toward)
+            if toward is None and (pointed := self._pointed_at(needles, picture)) is not None:
+                needles, _ = find_needles(picture, size, pointed.direction_px)
+                needles = [each for each in needles if math.dist(each.tip_px, pointed.tip_px) < 0.5 * each.length_px]
             needles = [self._as_before(needle, picture, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, time), last)]
             if len(within) == 1 and not (whole and not within[0].heading_known):
@@ -316,12 +345,17 @@ class VisionTracker:
         if not needles:
             self._anew = []
             others = f"; dark things: {', '.join(refused)}" if refused else ""
-            return None, None, True, f"no needle in the dish{others}"
+            return None, None, True, f"no needle in the dish; {REMEDY}{others}"
         chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
             if chosen is None:
-                return None, None, True, f"{len(needles)} needles in the dish"
+                return (
+                    None,
+                    None,
+                    True,
+                    f"{len(needles)} needles in the dish: point at the tip of one, or limit region_px",
+                )
             return chosen, picture, True, ""
         pose = _pose(chosen, picture, time)
         if self._fits(pose, last):
@@ -336,6 +370,23 @@ class VisionTracker:
         if last is not None:
             return None, None, True, "a needle farther from the last one than it can move"
         return None, None, True, f"a needle seen in {len(self._anew)} of {settings.confirm_frames} frames"
+
+    def _toward(self, view: DishView, time: float) -> Points | None:
+        """Return where the needle must point, u right and v down; None where it may have turned round unseen."""
+        before = self._last or (self._anew[-1] if self._anew else None)
+        if before is None or self._most_turned(time - before.time) > 0.5 * math.pi:
+            return None
+        _, angle = before.at(time)
+        return view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
+
+    def _pointed_at(self, needles: list[MeasuredNeedle], picture: Picture) -> MeasuredNeedle | None:
+        """Return the needle that a person points at, with its tip there; see `point_at_tip`."""
+        if self._tip is None or not needles:
+            return None
+        tip, self._tip = picture.view.to_pixels(self._tip), None
+        ways = [way for needle in needles if not needle.heading_known for way in (needle, needle.reversed())]
+        near = [way for way in ways if math.dist(way.tip_px, tip) < TIP_REACH * way.length_px]
+        return min(near, key=lambda way: math.dist(way.tip_px, tip), default=None)
 
     def _with_thread(self, picture: Picture, needles: list[MeasuredNeedle]) -> MeasuredNeedle | None:
         """Return the only needle that a thread leaves, of those that were found; one that is alone needs no thread."""
@@ -376,7 +427,7 @@ class VisionTracker:
             observation = replace(observation, pieces=pieces)
         return Track(
             state=State.TRACKED if needle.heading_known else self._missing(),
-            reason="" if needle.heading_known else "a needle of which nothing tells which end is the tail",
+            reason="" if needle.heading_known else UNDIRECTED,
             confidence=needle.confidence,
             tail=tail,
             tip=view.to_dish(needle.tip_px),
@@ -423,8 +474,11 @@ class VisionTracker:
         # 3 px and 6 degrees off the prediction, beside what the needle's greatest speed allows.
         reach = self._settings.max_needle_speed * after + 3.0 * self._found_dish().view.metres_per_pixel
         turn = abs(_wrapped(pose.angle - angle))
-        max_shift = min(self._settings.max_turn_rate * after + math.radians(6.0), 0.5 * math.pi)
-        return math.dist(pose.tail, tail) < reach and turn < max_shift
+        return math.dist(pose.tail, tail) < reach and turn < min(self._most_turned(after), 0.5 * math.pi)
+
+    def _most_turned(self, after: float) -> float:
+        """Return by how much a needle can have turned off the prediction after a time [rad]."""
+        return self._settings.max_turn_rate * after + math.radians(6.0)
 
     def _take(self, pose: _Pose, before: _Pose | None) -> None:
         """Keep a pose, with the velocity that the one before gives it, no greater than a needle's can be.
@@ -548,6 +602,10 @@ class TrackerSession:
     def set_scene(self, scene: Scene) -> None:
         """Take another scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
+
+    def point_at_tip(self, place: Points) -> None:
+        """Take a point near the needle's tip; see `VisionTracker.point_at_tip`."""
+        self._tracker.point_at_tip(place)
 
     def set_lens(self, lens: Lens | None) -> None:
         """Take the camera's lens; see `VisionTracker.set_lens`."""

@@ -23,11 +23,15 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
 from test.bags.bags import copy_with_notes, make, stamped
+from magnetosuture_thread.vision.overlay import NEEDLE
+from test.bags.bags import copy_with_notes
+from test.vision.scenes import VIEW, rod
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
 KEYS = {
     *("file", "status", "reason", "warning", "tail_m", "heading_rad", "tip_m", "curvature_per_m", "thread_m"),
     *("needle_length_m", "pieces", "complete", "confidence", "time_s", "stamp_s"),
+    *("axis_m", "dish_centre_px", "metres_per_pixel", "scale_doubt"),
 }
 
 
@@ -64,6 +68,50 @@ def test_pictures_give_one_entry_each(tmp_path: Path, capsys: pytest.CaptureFixt
     assert rows[1]["tail_m"] is rows[1]["heading_rad"] is rows[1]["tip_m"] is rows[1]["thread_m"] is None
     assert sorted(picture.name for picture in overlay.iterdir()) == ["frame_00.png", "frame_03.png", "frame_09.png"]
     assert "2 tracked, 2 lost" in capsys.readouterr().out
+
+
+def test_a_needle_without_a_thread_has_an_axis_and_a_pose_once_its_tip_is_given(tmp_path: Path):
+    picture, ends = tmp_path / "rod.png", np.array([[-0.004, 0.002], [0.003, 0.002]])
+    cv2.imwrite(str(picture), rod(ends))
+    file, drawn = tmp_path / "seen.json", tmp_path / "drawn"
+    for tip, tail in ((None, None), (ends[1], ends[0]), (ends[0], ends[1]), (np.array([0.012, 0.002]), None)):
+        given = [] if tip is None else ["--tip", *map(str, tip)]
+        assert cli.main(["track", str(picture), "--json", str(file), "--overlay", str(drawn), *given]) == 0
+        (row,) = json.loads(file.read_text())
+        assert sorted(row["axis_m"])[0] == pytest.approx(ends[0], abs=2e-4)
+        assert sorted(row["axis_m"])[1] == pytest.approx(ends[1], abs=2e-4)
+        assert row["dish_centre_px"] == pytest.approx([322.0, 238.0], abs=0.5)
+        if tail is None:
+            assert row["status"] == "lost"
+            assert "the needle's axis is found, but not which end is the tip" in row["reason"]
+            assert row["tail_m"] is None
+            u, v = np.round(VIEW.to_pixels(ends.mean(axis=0))).astype(int)
+            overlay = cv2.imread(str(drawn / "rod.png"))
+            assert overlay is not None
+            assert overlay[v, u].tolist() == pytest.approx(NEEDLE, abs=80)
+        else:
+            assert row["status"] == "tracked"
+            assert row["tail_m"] == pytest.approx(tail, abs=2e-4)
+            assert row["tip_m"] == pytest.approx(tip, abs=2e-4)
+
+
+def test_a_part_of_a_frame_is_looked_at_and_a_bright_needle_is_found(tmp_path: Path):
+    ends = np.array([[-0.004, 0.002], [0.003, 0.002]])
+    pair = np.hstack([rod(ends, level=150), rod(ends, level=150)])
+    cv2.imwrite(str(tmp_path / "pair.png"), pair)
+    file = tmp_path / "seen.json"
+    given = ["--region", "640", "0", "1280", "480", "--tip", *map(str, ends[1]), "--json", str(file)]
+    for options, status in ((["--needle-brightness", "0.9"], "tracked"), ([], "lost")):
+        assert cli.main(["track", str(tmp_path / "pair.png"), *given, *options]) == 0
+        (row,) = json.loads(file.read_text())
+        assert row["dish_centre_px"] == pytest.approx([962.0, 238.0], abs=0.5)
+        assert row["status"] == status
+    camera = tmp_path / "camera.yaml"
+    calibrated = ["calibrate-camera", str(tmp_path / "pair.png"), *given[:5], "--dish-diameter", "0.035"]
+    assert cli.main([*calibrated, "--output", str(camera)]) == 0
+    again = ["--setup", str(camera), "--scene", "dish_35mm", "--json", str(file)]
+    assert cli.main(["track", str(tmp_path / "pair.png"), *again]) == 0
+    assert json.loads(file.read_text())[0]["dish_centre_px"] == pytest.approx([962.0, 238.0], abs=0.5)
 
 
 def test_a_bag_is_followed_over_time(short_bag: Path, tmp_path: Path):

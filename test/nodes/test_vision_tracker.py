@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from geometry_msgs.msg import PointStamped
 from magnetosuture_msgs.msg import TrackerState
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
@@ -12,6 +13,7 @@ from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.vision.lens import Lens
+from test.vision.scenes import rod
 
 TAIL = np.array([0.002, 0.001])
 
@@ -76,6 +78,30 @@ def test_lost_is_said_and_no_pose_is_guessed(graph, camera, thread_arc):
     graph.wait(lambda: "tracking" in states(diagnostics), "tracking")
 
 
+def test_the_axis_of_a_needle_without_a_thread_is_published_and_its_pose_once_a_person_points_at_the_tip(graph):
+    node = graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
+    poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
+    tracking = graph.listen(topics.TRACKER_STATE)
+    ends = np.array([[-0.004, 0.002], [0.003, 0.002]])
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(rod(ends), graph.now()))
+    graph.wait(lambda: bool(poses and tracking), "an axis")
+    assert tracking[-1].state != TrackerState.STATE_TRACKED
+    assert "not which end is the tip" in tracking[-1].reason
+    assert np.reshape(poses[-1].pose.covariance, (6, 6))[5, 5] > 1.0
+    graph.wait(lambda: any(value.key == "axis_mm" for value in diagnostics[-1].status[0].values), "the axis")
+    tip = PointStamped()
+    tip.header.frame_id, (tip.point.x, tip.point.y) = "camera", ends[0].tolist()
+    graph.publish(topics.NEEDLE_TIP, tip)
+    graph.wait(lambda: any("needle/tip" in text for text in states(diagnostics)), "a refusal")
+    tip.header.frame_id = "dish"
+    graph.publish(topics.NEEDLE_TIP, tip)
+    graph.wait(lambda: node._session is not None and node._session._tracker._tip is not None, "the point")
+    graph.publish(topics.COMPRESSED_IMAGE, compressed(rod(ends), graph.now()))
+    graph.wait(lambda: tracking[-1].state == TrackerState.STATE_TRACKED and len(poses) > 1, "a pose")
+    position = poses[-1].pose.pose.position
+    assert np.hypot(position.x - ends[1, 0], position.y - ends[1, 1]) < 2e-4
+
+
 def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_arc):
     graph.add(VisionTrackerNode, scene="dish_35mm", confirm_frames=1)
     poses, diagnostics = graph.listen(topics.NEEDLE_POSE), graph.listen(topics.DIAGNOSTICS)
@@ -84,8 +110,11 @@ def test_hostile_images_are_refused_and_the_node_goes_on(graph, camera, thread_a
         message = CompressedImage(format="jpeg", data=data)
         message.header.stamp = graph.now()
         graph.publish(topics.COMPRESSED_IMAGE, message)
-        graph.wait(lambda n=count: len(tracking) == n, "a state for each")
-    assert all("expected a JPEG or PNG image" in state.reason for state in tracking)
+        # On a busy machine the camera seems to be silent in between.
+        graph.wait(
+            lambda n=count: sum("expected a JPEG or PNG image" in state.reason for state in tracking) == n,
+            "a refusal of each",
+        )
     graph.publish(topics.COMPRESSED_IMAGE, compressed(frame(camera, thread_arc), graph.now()))
     graph.wait(lambda: bool(poses), "a pose")
     graph.wait(lambda: "tracking" in states(diagnostics), "tracking")

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 
 from magnetosuture_thread.geometry.camera import DishView
@@ -123,3 +124,12 @@ def finger(end: np.ndarray, angle: float, width: float, bgr: tuple[float, float,
     cap = middle + 0.5 * width * (np.cos(turn)[:, None] * inwards + np.sin(turn)[:, None] * across)
     back = middle - 0.1 * inwards
     return Cover(np.vstack([back - 0.5 * width * across, cap, back + 0.5 * width * across]), bgr)
+
+
+def rod(ends: np.ndarray, level: int = 50) -> np.ndarray:
+    """Draw a blunt rod without a thread, from one end to the other, in a dish; shape (2, 2) [m]."""
+    frame = render(Pose(np.array([0.5, 0.5]), 0.0))
+    (x, y), (x_end, _) = VIEW.to_pixels(ends)
+    outline = np.array([(x, y - 2.5), (x_end, y - 2.5), (x_end, y + 2.5), (x, y + 2.5)])
+    cv2.fillPoly(frame, [np.round(outline * 16).astype(np.int32)], (level,) * 3, cv2.LINE_AA, 4)
+    return cv2.GaussianBlur(frame, (0, 0), 0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import cv2
 import numpy as np
@@ -66,15 +67,50 @@ def test_of_the_edges_of_a_wall_and_a_lid_the_inner_one_is_the_dish(ratio: float
     assert found.view.metres_per_pixel == pytest.approx(0.0175 / 176.0, rel=0.01)
 
 
-def test_a_given_scale_that_differs_from_the_dish_by_up_to_a_tenth_gives_way_and_is_warned_of():
+def test_a_given_scale_is_used_and_a_warning_names_it_and_the_dishs_where_they_differ():
     frame = render(Pose(np.zeros(2), 0.3))
-    for share, remark in ((1.02, False), (1.07, True), (0.94, True)):
+    for share, remark in ((1.02, ""), (1.07, r"0\.0856 mm, .* 0\.0799"), (0.94, r"0\.0752 mm, .* 0\.0799")):
         found = see_dish(frame, VisionTrackerSettings(metres_per_pixel=share * 8e-5), 0.035)
         assert found is not None
-        assert bool(found.warning) == remark
-        expected = 8e-5 if remark else share * 8e-5
-        assert found.view.metres_per_pixel == pytest.approx(expected, rel=5e-3)
-    assert see_dish(frame, VisionTrackerSettings(metres_per_pixel=1.15 * 8e-5), 0.035) is None
+        assert re.search(remark, found.warning)
+        assert bool(found.warning) == bool(remark)
+        assert found.view.metres_per_pixel == pytest.approx(share * 8e-5, rel=1e-9)
+        assert found.scale_error == pytest.approx(abs(1.0 / share - 1.0) if remark else 0.0, abs=5e-3)
+    assert see_dish(frame, VisionTrackerSettings(metres_per_pixel=1.3 * 8e-5), 0.035) is None
+
+
+@pytest.mark.parametrize("light", [(200, 150, 120), (120, 200, 150)])
+def test_a_wall_of_two_edges_makes_the_doubt_of_the_scale_unless_the_user_names_one(light: tuple[int, int, int]):
+    floor, wall, ground = light
+    inner, outer = (Ellipse((331.3, 238.6), radius, radius, 0.0) for radius in (170.0, 184.0))
+    frame = drawn(outer, (640, 480), wall, ground) // 2 + drawn(inner, (640, 480), floor, wall) // 2
+    for size in (1.0, 0.5):
+        image = cv2.resize(frame, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
+        for rim, radius, doubt in (("", 170.0, 14.0 / 170.0), ("inner", 170.0, 0.01), ("outer", 184.0, 0.01)):
+            found = see_dish(image, VisionTrackerSettings(rim=rim), 0.035)
+            assert found is not None
+            if not rim:
+                assert abs(0.0175 / found.view.metres_per_pixel / size / radius - 1.0) < doubt + 0.01
+                assert "name the wall's edge by rim" in found.warning
+            else:
+                assert 0.0175 / found.view.metres_per_pixel / size == pytest.approx(radius, rel=0.01)
+                assert found.warning == ""
+            assert found.scale_error == pytest.approx(doubt, rel=0.25)
+
+
+def test_one_edge_that_is_no_circle_is_no_tilt_and_two_that_agree_are():
+    wall, lid = (Ellipse((330.3, 238.6), radius, 0.985 * radius, 0.7) for radius in (160.0, 182.0))
+    for edges, degrees in (([wall], None), ([wall, lid], 9.9)):
+        image = np.asarray(np.mean([drawn(edge, (640, 480), 90, 40) for edge in edges], axis=0), dtype=np.uint8)
+        found = see_dish(image, VisionTrackerSettings(), 0.035)
+        assert found is not None
+        if degrees is None:
+            assert found.tilt is None
+            assert "tilted" not in found.warning
+            assert math.degrees(found.unseen_tilt) == pytest.approx(9.9, abs=1.0)
+        else:
+            assert found.tilt is not None
+            assert math.degrees(found.tilt.angle) == pytest.approx(degrees, abs=1.0)
 
 
 def test_the_covariance_of_an_unknown_tilt_holds_the_perspective_of_any_below_it():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.rig.camera import Cover
+from magnetosuture_thread.vision.dish import NO_DISH
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import PIXEL, SCENE, Pose, blob, finger, random_pose, random_thread, render
@@ -123,7 +124,7 @@ def test_of_two_needles_the_one_with_a_thread_is_taken_and_none_if_both_have_one
     threads = [each.tail - np.linspace(0.0, 0.01, 40)[:, None] * np.array([1.0, 0.1]) for each in (one, other)]
     with_thread = render(one, threads[0])
     assert check(one, np.minimum(with_thread, render(other))) == ""
-    assert TRACKER.look(np.minimum(with_thread, render(other, threads[1]))).reason == "2 needles in the dish"
+    assert TRACKER.look(np.minimum(with_thread, render(other, threads[1]))).reason.startswith("2 needles in the dish")
 
 
 def something_else(kind: str, size: tuple[int, int] = (640, 480)) -> np.ndarray:
@@ -146,13 +147,14 @@ def something_else(kind: str, size: tuple[int, int] = (640, 480)) -> np.ndarray:
 def test_a_video_of_something_else_is_lost_with_its_reason_and_the_needle_is_back_with_the_dish(kind: str):
     pose = Pose(np.array([0.003, -0.002]), 0.4)
     frame, other = render(pose, random_thread(np.random.default_rng(1), pose)), something_else(kind)
-    assert VisionTracker(VisionTrackerSettings(), SCENE).look(other).reason == "no dish in the image"
+    assert VisionTracker(VisionTrackerSettings(), SCENE).look(other).reason == NO_DISH
     tracker = VisionTracker(VisionTrackerSettings(), SCENE)
     states = [tracker.track(frame, 0.02 * index).state for index in range(4)]
     assert states[-1] is State.TRACKED
     for index in range(4, 12):
         seen = tracker.track(other, 0.02 * index)
-        assert (seen.state, seen.reason) == (State.LOST, "too little of the dish is seen")
+        assert seen.state is State.LOST
+        assert seen.reason.startswith("too little of the dish is seen")
     back = tracker.track(frame, 0.24)
     assert back.state is State.TRACKED
     assert pose.is_right(back)

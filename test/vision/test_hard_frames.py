@@ -87,15 +87,18 @@ def test_needles_that_were_wrong_once_are_not(name: str, index: int, seed: int):
 
 
 @pytest.mark.parametrize("degrees", [6, 10])
-def test_a_tilted_camera_is_warned_of_and_its_errors_are_within_the_covariance(degrees: int):
+def test_a_tilt_that_two_rings_agree_on_is_warned_of_and_errors_of_any_are_within_the_covariance(degrees: int):
     figures = row(f"tilt_{degrees}deg")
     assert (figures.found, figures.reversed, figures.dishonest) == (FRAMES, 0, 0)
+    warned = 0
     for index in range(FRAMES):
         _, image = frame_of(f"tilt_{degrees}deg", index, SEED)
-        tracker = VisionTracker(VisionTrackerSettings(), SCENE)
-        warned = re.fullmatch(r"the camera is tilted by (\d+) degrees", tracker.look(image).warning)
-        assert warned is not None
-        assert abs(int(warned[1]) - degrees) <= 1
+        warning = VisionTracker(VisionTrackerSettings(), SCENE).look(image).warning
+        angle = re.fullmatch(r"the camera is tilted by (\d+) degrees", warning)
+        assert angle is not None or warning == ""
+        assert angle is None or abs(int(angle[1]) - degrees) <= 1
+        warned += angle is not None
+    assert warned >= FRAMES // 2
     assert not VisionTracker(VisionTrackerSettings(), SCENE).look(frame_of("usual", 0, SEED)[1]).warning
 
 

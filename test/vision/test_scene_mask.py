@@ -60,7 +60,7 @@ def test_an_instrument_that_looks_like_a_needle_is_not_taken_for_one():
     frame = frame_of(scene, STEEL, pose, np.array([[0.5, 0.5], [0.51, 0.5]]))
     masked, plain = seen_with_and_without(scene, frame)
     assert pose.is_right(masked)
-    assert plain.reason == "2 needles in the dish"  # no thread tells which
+    assert plain.reason.startswith("2 needles in the dish")  # no thread tells which
 
 
 def test_without_a_needle_an_instrument_that_looks_like_one_gives_no_pose():

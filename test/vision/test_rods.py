@@ -1,0 +1,133 @@
+"""Needles without a thread, blunt or rounded at both ends: their axis is found, their direction is never guessed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+from magnetosuture_thread.vision.tracker import UNDIRECTED, State, Track, VisionTracker
+
+DIAMETER = 0.05  # m
+RATE = 30.0
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A rod in a drawn photograph of 640 x 480 pixels.
+
+    Attributes:
+        seed: of dish, light, place, size and noise.
+        rounded: whether its ends are half discs.
+        gleam: grey levels by which the lamp's line along it is brighter than the rod.
+        share: of its width, of the dish's diameter.
+        turned: by how much more it is turned [rad].
+    """
+
+    seed: int
+    rounded: bool = False
+    gleam: float = 0.0
+    share: float = 0.02
+    turned: float = 0.0
+
+    def drawn(self) -> tuple[np.ndarray, np.ndarray, VisionTrackerSettings]:
+        """Return the picture, the rod's ends (u, v), shape (2, 2) [px], and what the tracker is told."""
+        random = np.random.default_rng(self.seed)
+        radius, centre = random.uniform(182.0, 220.0), np.array([320.0, 240.0]) + random.uniform(-8.0, 8.0, 2)
+        u, v = np.meshgrid(np.arange(640) - centre[0], np.arange(480) - centre[1])
+        away = np.hypot(u, v) / radius
+        picture = random.uniform(150.0, 225.0) + random.uniform(-12.0, 12.0) * u / radius
+        for ring, depth in ((1.02, random.uniform(40.0, 90.0)), (1.07, random.uniform(20.0, 70.0))):
+            picture -= depth * np.exp(-(((away - ring) / 0.012) ** 2))
+        width = self.share * 2.0 * radius * random.uniform(0.8, 1.2)
+        length = width * random.uniform(8.0, 14.0)
+        angle = random.uniform(-np.pi, np.pi) + self.turned
+        ahead, place = np.array([math.cos(angle), math.sin(angle)]), random.uniform(-0.45, 0.45, 2) * radius
+        x, y = (
+            (u - place[0]) * ahead[0] + (v - place[1]) * ahead[1],
+            (v - place[1]) * ahead[0] - (u - place[0]) * ahead[1],
+        )
+        outside = np.maximum(np.abs(x) - 0.5 * length, np.abs(y) - 0.5 * width)
+        if self.rounded:
+            outside = np.hypot(np.maximum(np.abs(x) - 0.5 * (length - width), 0.0), y) - 0.5 * width
+        picture *= 1.0 - 0.18 * np.clip(0.5 - (outside + 3.0) / 4.0, 0.0, 1.0)  # its shadow
+        covered = np.clip(0.5 - outside, 0.0, 1.0)
+        steel = 40.0 + self.gleam * np.exp(-(((y + 0.15 * width) / (0.18 * width)) ** 2))
+        noise = np.random.default_rng([self.seed, int(1e6 * abs(self.turned))]).standard_normal(picture.shape)
+        picture = cv2.GaussianBlur(picture + covered * (steel - picture), (0, 0), 0.9) + 2.5 * noise
+        scale = 0.5 * DIAMETER / radius
+        told = VisionTrackerSettings(needle_length=1.03 * length * scale, needle_width=0.95 * width * scale)
+        ends = centre + place + 0.5 * length * np.array([-ahead, ahead])
+        return np.clip(picture, 0.0, 255.0).astype(np.uint8), ends, told
+
+
+def is_along(seen: Track, ends: np.ndarray) -> bool:
+    """Say whether tail and tip lie at two ends (u, v), in this order, within 2 px and 6 % of the length."""
+    assert seen.view is not None
+    apart = np.abs(seen.view.to_pixels(seen.axis) - ends).max()
+    return bool(apart < 2.0 + 0.06 * math.dist(*ends))
+
+
+@pytest.mark.parametrize("rounded", [False, True])
+@pytest.mark.parametrize(("gleam", "least"), [(0.0, 10), (40.0, 9), (90.0, 4)])
+def test_the_axis_is_found_and_a_point_near_the_tip_gives_its_direction(rounded: bool, gleam: float, least: int):
+    found = 0
+    for seed in range(12):
+        image, ends, told = Rod(seed, rounded, gleam, (0.012, 0.02, 0.04)[seed % 3]).drawn()
+        tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+        seen = tracker.look(image)
+        assert seen.state is not State.TRACKED
+        if not len(seen.axis):
+            continue
+        found += 1
+        assert seen.reason == UNDIRECTED
+        assert seen.covariance[2, 2] > 1.0
+        assert is_along(seen, ends) or is_along(seen, ends[::-1])
+        assert seen.view is not None
+        for way in (ends, ends[::-1]):
+            tracker.point_at_tip(seen.view.to_dish(way[1]))
+            told_seen = tracker.look(image)
+            assert told_seen.state is State.TRACKED
+            assert is_along(told_seen, way)
+            assert told_seen.covariance[2, 2] < 1.0
+        assert tracker.look(image).reason == UNDIRECTED  # the next picture is another
+    assert found >= least
+
+
+def test_a_direction_is_carried_over_while_the_rod_turns_round_and_not_over_a_gap_in_which_it_could():
+    _, ends, told = Rod(4).drawn()
+    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+    view = tracker.look(Rod(4).drawn()[0]).view
+    assert view is not None
+    assert tracker.track(Rod(4).drawn()[0], 0.0).reason == UNDIRECTED
+    tracker.point_at_tip(view.to_dish(ends[1]))
+    tracked = 0
+    for index in range(1, 50):  # by 3.9 rad
+        image, ends, _ = Rod(4, turned=0.08 * index).drawn()
+        seen = tracker.track(image, index / RATE)
+        tracked += seen.state is State.TRACKED
+        assert seen.state is not State.TRACKED or is_along(seen, ends)
+    assert tracked >= 46
+    assert tracker.track(Rod(4, turned=0.01 + 0.08 * 49).drawn()[0], 49 / RATE + 0.6).reason == UNDIRECTED
+
+
+def test_a_point_far_from_both_ends_and_one_that_was_used_tell_nothing():
+    image, ends, told = Rod(4).drawn()
+    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+    view = tracker.look(image).view
+    assert view is not None
+    across = np.array([ends[0, 1] - ends[1, 1], ends[1, 0] - ends[0, 0]])
+    for place, state in (
+        (ends[1] + 0.8 * across, State.LOST),
+        (ends[1], State.TRACKED),
+        (ends.mean(axis=0), State.LOST),
+    ):
+        tracker.point_at_tip(view.to_dish(place))
+        assert tracker.look(image).state is state
+        assert tracker.look(image).reason == UNDIRECTED
