@@ -54,10 +54,10 @@ class RigFrame:
 class Rig:
     """Needle and thread in the coils' field, under a camera. Time comes in as seconds since the start.
 
-    Until the first current that is not zero the needle is held, as a thread that is bent at the start would pull it away.
-    The thread is not: what a model of it predicts meanwhile is what it does. A power stage that gets no new currents for `driver_timeout` switches
-    off, as real ones do. The times of faults count from the first current that is not zero, so that they do not depend
-    on how long the other nodes take to start.
+    Until the first current that is not zero the needle is held, as a thread that is bent at the start would pull it
+    away; the thread moves meanwhile where `is_watched`, as a model of it predicts. A power stage that gets no new
+    currents for `driver_timeout` switches off, as real ones do. The times of faults count from the first current that
+    is not zero, so that they do not depend on how long the other nodes take to start.
 
     Where the mechanics find no next state, as of a needle that is wedged, the coils are off and everything stays where
     it is, until no currents have been asked for during `RELEASE_TIME` and then some are.
@@ -74,6 +74,7 @@ class Rig:
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
         problem: why everything stays where it is; empty if it does not.
+        is_watched: whether the thread moves before the first current; a node waits for a model that follows it.
 
     Raises:
         ConfigurationError: needle or thread would start in the wall or in a shape.
@@ -98,7 +99,7 @@ class Rig:
         self.currents = np.zeros(len(settings.coil_angles))
         self._applied_at = 0.0
         self._max_time, self._max_iterations = max_time, max_iterations
-        self.problem = ""
+        self.problem, self.is_watched = "", True
         self._asked_at = -math.inf  # last time that currents were asked for since the problem
 
     def warm_up(self) -> None:
@@ -206,8 +207,8 @@ class Rig:
         self.currents[0] = stuck
 
     def _hold(self, span: float) -> None:
-        """Let the thread alone move for a time [s]."""
-        if span > 0.0:
+        """Let the thread alone move for a time [s], if somebody watches."""
+        if span > 0.0 and self.is_watched:
             self._dynamics.drive(self._dynamics.tail, self._dynamics.heading, span)
 
     def _move(self, time: float) -> bool:

@@ -51,6 +51,9 @@ def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
 
 def test_a_bent_thread_straightens_behind_a_needle_that_is_held_until_the_first_current_and_pulled_then():
     made = rig(thread_start_curvature=-60.0)
+    made.is_watched = False
+    np.testing.assert_array_equal(made.look(0.1).thread, made.look(0.0).thread)
+    made = rig(thread_start_curvature=-60.0)
     before, after = made.look(0.0), made.look(0.5)
     ends = [float(np.linalg.norm(frame.thread[-1] - frame.thread[0])) for frame in (before, after)]
     assert ends[1] > ends[0] + 1e-4

@@ -100,6 +100,7 @@ function showCoils({ graph, host, since, canCommand, hasControl, open }) {
   const why = graph?.nodes?.coil_bridge?.values?.["last refusal"] ?? "none";
   const refused = bridge?.refused ? `commands and poses refused: ${bridge.refused}${why === "none" ? "" : `, the last: ${why}`}` : "";
   write("driver", refused ? `${driver} · ${refused}` : driver);
+  find("driver").title = refused;
 }
 
 function showControl({ lease, client, hasControl, canCommand, open, maxSpeed, speed }) {
