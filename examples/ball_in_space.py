@@ -21,5 +21,5 @@ for step in range(1, 151):
     prediction = predictor.step(NeedlePose(step / 100.0, tail, east))
 
 print(f"{len(prediction.margins.in_contact)} nodes lie on the ball")
-print(f"least clearance: {1e6 * prediction.margins['obstacle'].minimum:.4f} um")
+print(f"least clearance: {1e6 * prediction.margins['obstacle'].minimum:.4f} µm")
 print(f"lowest node: {1e3 * prediction.positions[:, 2].min():.2f} mm")

@@ -18,4 +18,4 @@ with TemporaryDirectory() as folder:
 print(f"needle found in {summary.tracked} of {summary.frames} frames")
 print(f"prediction error: {summary.error_seen['mean']:.2f} % of the length on average")
 for margin in summary.least_margins:
-    print(f"{margin.kind}: minimum {1e6 * margin.clearance:.1f} um at node {margin.node}, {margin.time:.2f} s")
+    print(f"{margin.kind}: minimum {1e6 * margin.clearance:.1f} µm at node {margin.node}, {margin.time:.2f} s")

@@ -27,4 +27,4 @@ for step in range(1, 151):
     least = {name: min(value, prediction.margins[name].minimum_clearance) for name, value in least.items()}
 
 for name, clearance in least.items():
-    print(f"{name}: at least {1e6 * clearance:.3f} um")
+    print(f"{name}: at least {1e6 * clearance:.3f} µm")

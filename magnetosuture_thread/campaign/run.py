@@ -139,7 +139,7 @@ class RunFigures:
         deep, rest, ratio = self.max_thread_penetration_m, self.longest_rest_s, MAX_TIME_RATIO * self.ideal_time_s
         tension, friction = self.max_tension_excess_n, self.max_friction_excess
         near = f"the needle's axis {1e3 * clearance:.3f} mm from wall or shape ({1e3 * allowed:.3f} allowed)"
-        within = f"a node of the thread {1e6 * deep:.1f} um in wall or shape"
+        within = f"a node of the thread {1e6 * deep:.1f} µm in wall or shape"
         strong = f"a tension {1e3 * tension:.3g} mN above the limit of its goal"
         checks = (
             ("min_needle_clearance_m", clearance < allowed, near),

@@ -53,9 +53,9 @@ def run_calibrate_coils(options: argparse.Namespace, terminal: command.Terminal)
     terminal.print(_coil_table(found))
     x, y = (1e6 * value for value in found["background"])
     line, worst = found["worst"]
-    residual = f"{found['readings']} readings, residual {1e6 * found['residual']:.1f} uT"
-    terminal.log(f"{residual}, background {x:.1f}, {y:.1f} uT")
-    terminal.log(f"the largest difference, {1e6 * worst:.1f} uT, is in line {line}")
+    residual = f"{found['readings']} readings, residual {1e6 * found['residual']:.1f} µT"
+    terminal.log(f"{residual}, background {x:.1f}, {y:.1f} µT")
+    terminal.log(f"the largest difference, {1e6 * worst:.1f} µT, is in line {line}")
     for coil in found["coils"]:
         if coil["poor"]:
             terminal.log(f"{coil['name']}: poorly determined {', '.join(coil['poor'])}; measure all over the dish")

@@ -56,7 +56,7 @@ def disturbance_text(arc_length: float, force: float, direction: Sequence[float]
 
 
 def _amount(force: float) -> str:
-    value, unit = (1e3 * force, "mN") if force >= 1e-4 else (1e6 * force, "uN")
+    value, unit = (1e3 * force, "mN") if force >= 1e-4 else (1e6 * force, "µN")
     return f"{value:.0f} {unit}" if value >= 10.0 else f"{value:.2g} {unit}"
 
 

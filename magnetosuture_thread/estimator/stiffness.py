@@ -81,11 +81,11 @@ class SlowParameter:
         """Return value and interval in words.
 
         >>> str(SlowParameter("stiffness_over_drag", "m^4/s", 1.3e-9, 1.2e-9, 1.5e-9, False))
-        '1.3e-09 m^4/s, 95 % in 1.2e-09 to 1.5e-09, frozen: not excited'
+        '1.3e-09 m^4/s, 95 % in 1.2e-09 to 1.5e-09; kept, as this motion does not show it'
         """
         value = f"{self.value:.3g} {self.unit}".strip()
-        frozen = "" if self.excited else ", frozen: not excited"
-        return f"{value}, 95 % in {self.low:.3g} to {self.high:.3g}{frozen}"
+        kept = "" if self.excited else "; kept, as this motion does not show it"
+        return f"{value}, 95 % in {self.low:.3g} to {self.high:.3g}{kept}"
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ class RigSimulatorNode(GuardedNode):
         with self.health.load("the rig's kernels"):
             self.rig = Rig(settings, scene, max_time=self._catch_up, max_iterations=iterations)
             self.rig.warm_up()
+        self._model = self.resolve_topic_name(topics.PREDICTED_THREAD.name)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.time = Timeline(EPOCH if self._simulated else self.get_clock().now().nanoseconds, rate)
         self.time.begin()
@@ -164,6 +165,8 @@ class RigSimulatorNode(GuardedNode):
             self._phase = None if self._phase is None else self._phase - behind
 
     def _take(self, elapsed: float) -> None:
+        # How long the other nodes take to start has no effect on where the thread is.
+        self.rig.is_watched = not self.rig.held or self.count_publishers(self._model) > 0
         try:
             frame = self.rig.look(elapsed, rendered=False)
         except MagnetosutureError as error:

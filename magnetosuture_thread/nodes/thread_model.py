@@ -241,7 +241,7 @@ class ThreadHealth:
         self._waiting = self._waiting if result.late else result.waiting
         figures: dict[str, object] = {}
         if prediction is not None:
-            figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} us"}
+            figures = {"residual": f"{prediction.residual:.1e}", "step_time": f"{step_time * 1e6:.0f} µs"}
         if estimate is not None:
             figures |= self._estimate_figures(estimate)
         if result.problem is not None:

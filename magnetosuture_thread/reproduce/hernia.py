@@ -368,7 +368,7 @@ def hernia_lines(figures: dict[str, Any]) -> list[str]:
     return [
         "{duration:.1f} s at {rate:g} Hz, {nodes} segments, formulation {formulation}".format(**figures),
         f"deepest node in an obstacle {figures['deepest']:.1e} m, middle of a chord "
-        f"{1e6 * figures['chord_deepest']:.0f} um, maximum stretch {100.0 * figures['stretch']:.4f} %",
+        f"{1e6 * figures['chord_deepest']:.0f} µm, maximum stretch {100.0 * figures['stretch']:.4f} %",
         f"a step takes {1e3 * figures['median_step']:.2f} ms (99th percentile {1e3 * figures['high_step']:.2f}): "
         f"{figures['room']:.0f} times faster than its period",
     ]

@@ -54,10 +54,10 @@ class RigFrame:
 class Rig:
     """Needle and thread in the coils' field, under a camera. Time comes in as seconds since the start.
 
-    Until the first current that is not zero, needle and thread are held fixed, as a thread that is bent at the start
-    would straighten and pull the needle away. A power stage that gets no new currents for `driver_timeout` switches
-    off, as real ones do. The times of faults count from the first current that is not zero, so that they do not depend
-    on how long the other nodes take to start.
+    Until the first current that is not zero the needle is held, as a thread that is bent at the start would pull it
+    away; the thread moves meanwhile where `is_watched`, as a model of it predicts. A power stage that gets no new
+    currents for `driver_timeout` switches off, as real ones do. The times of faults count from the first current that
+    is not zero, so that they do not depend on how long the other nodes take to start.
 
     Where the mechanics find no next state, as of a needle that is wedged, the coils are off and everything stays where
     it is, until no currents have been asked for during `RELEASE_TIME` and then some are.
@@ -74,6 +74,7 @@ class Rig:
         currents: in force, shape (m,) [A].
         began: time of the first current that was not zero, inf before [s].
         problem: why everything stays where it is; empty if it does not.
+        is_watched: whether the thread moves before the first current; a node waits for a model that follows it.
 
     Raises:
         ConfigurationError: needle or thread would start in the wall or in a shape.
@@ -98,7 +99,7 @@ class Rig:
         self.currents = np.zeros(len(settings.coil_angles))
         self._applied_at = 0.0
         self._max_time, self._max_iterations = max_time, max_iterations
-        self.problem = ""
+        self.problem, self.is_watched = "", True
         self._asked_at = -math.inf  # last time that currents were asked for since the problem
 
     def warm_up(self) -> None:
@@ -169,7 +170,7 @@ class Rig:
 
     @property
     def held(self) -> bool:
-        """Whether needle and thread are held where they are."""
+        """Whether the needle is held where it is."""
         return self.began == math.inf or bool(self.problem)
 
     def advance(self, time: float) -> None:
@@ -178,12 +179,17 @@ class Rig:
         Raises:
             SolverError: they have no next state; they stay where they are from now on.
         """
-        if self.held:
+        if self.problem:
             self.time = max(self.time, time)
             return
-        time = min(time, self.time + self._max_time)
+        limit = self.time + self._max_time
         off_at = max(self.time, self._applied_at + self._settings.driver_timeout)
         try:
+            if self.began == math.inf:  # what it has no time for is left out, as nothing else waits for the thread
+                self._hold(min(time, limit) - self.time)
+                self.time = max(self.time, time)
+                return
+            time = min(time, limit)
             if off_at < time:
                 if not self._move(off_at):
                     return
@@ -199,6 +205,11 @@ class Rig:
         stuck = self.currents[0] if COIL_STUCK in self.faults.kinds(self.running) else 0.0
         self.currents = np.zeros_like(self.currents)
         self.currents[0] = stuck
+
+    def _hold(self, span: float) -> None:
+        """Let the thread alone move for a time [s], if somebody watches."""
+        if span > 0.0 and self.is_watched:
+            self._dynamics.drive(self._dynamics.tail, self._dynamics.heading, span)
 
     def _move(self, time: float) -> bool:
         """Move up to a time [s]; return whether it was reached within the iterations."""
@@ -219,7 +230,7 @@ class Rig:
     def status(self) -> str:
         """What goes on, for a person."""
         faults = ", ".join(sorted(self.faults.kinds(self.running)))
-        text = "running" if self.running >= 0.0 else "held until the first current"
+        text = "running" if self.running >= 0.0 else "the needle is held until the first current"
         return f"{text}, with {faults}" if faults else text
 
     @property

@@ -69,7 +69,7 @@ def test_reasons_tiles_and_limits_follow_from_the_figures():
     ("name", "change", "words"),
     [
         ("min_needle_clearance_m", {"min_needle_clearance_m": 0.00029}, "0.290 mm from wall or shape (0.295 allowed)"),
-        ("max_thread_penetration_m", {"max_thread_penetration_m": 2e-6}, "2.0 um in wall or shape"),
+        ("max_thread_penetration_m", {"max_thread_penetration_m": 2e-6}, "2.0 µm in wall or shape"),
         ("longest_rest_s", {"longest_rest_s": 3.1}, "3.1 s (3 allowed)"),
         ("max_tension_n", {"max_tension_excess_n": 2e-5}, "0.02 mN above the limit of its goal"),
         ("max_friction_nodes", {"max_friction_excess": 3}, "3 more nodes under friction than its goal allows"),

@@ -32,6 +32,18 @@ def nanoseconds(stamp) -> int:
     return stamp.sec * 10**9 + stamp.nanosec
 
 
+def test_the_thread_is_held_until_there_is_a_model_that_follows_it(graph):
+    threads = graph.listen_later(topics.GROUND_TRUTH_THREAD)
+    graph.add(RigSimulatorNode, **SMALL, thread_start_curvature=-60.0)
+    graph.wait(lambda: len(threads) > 3, "frames")
+    places = [
+        [(pose.pose.position.x, pose.pose.position.y) for pose in thread.poses] for thread in (threads[0], threads[-1])
+    ]
+    assert places[0] == places[1]
+    graph.probe.create_publisher(topics.PREDICTED_THREAD.message, topics.PREDICTED_THREAD.name, 1)
+    graph.wait(lambda: threads[-1].poses[-1] != threads[0].poses[-1], "the thread's end to move")
+
+
 def test_frames_come_with_their_truth_and_the_camera(graph):
     frames, infos = graph.listen_later(topics.COMPRESSED_IMAGE), graph.listen_later(topics.CAMERA_INFO)
     needles, threads, pulls = (graph.listen_later(topic) for topic in topics.GROUND_TRUTH)

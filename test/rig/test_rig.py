@@ -49,13 +49,18 @@ def test_currents_move_the_needle_and_the_frame_shows_where_it_is():
     assert before.image[round(where[1]), round(where[0])].max() < 255
 
 
-def test_a_bent_thread_is_held_until_the_first_current_and_pulls_the_needle_then():
+def test_a_bent_thread_straightens_behind_a_needle_that_is_held_until_the_first_current_and_pulled_then():
     made = rig(thread_start_curvature=-60.0)
-    before, after = made.look(0.0), made.look(60.0)
-    np.testing.assert_array_equal(after.thread, before.thread)
-    assert after.time == 60.0
-    made.apply(1e-9 * EASTWARDS, 60.0)
-    assert np.abs(made.look(65.0).thread - before.thread).max() > 1e-4
+    made.is_watched = False
+    np.testing.assert_array_equal(made.look(0.1).thread, made.look(0.0).thread)
+    made = rig(thread_start_curvature=-60.0)
+    before, after = made.look(0.0), made.look(0.5)
+    ends = [float(np.linalg.norm(frame.thread[-1] - frame.thread[0])) for frame in (before, after)]
+    assert ends[1] > ends[0] + 1e-4
+    np.testing.assert_allclose([*after.tail, after.heading], [*before.tail, before.heading], atol=1e-12)
+    assert after.time == 0.5
+    made.apply(1e-9 * EASTWARDS, 0.5)
+    assert np.abs(made.look(1.5).tail - after.tail).max() > 1e-6
 
 
 def test_what_one_call_has_no_time_for_is_left_out():

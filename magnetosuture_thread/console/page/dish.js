@@ -1,6 +1,6 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-ruler (what it measures), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
   AHEAD, ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, forecastOf, nodeLook, onGround, tensionColour, threadLook, threadOf,
@@ -33,7 +33,7 @@ export class Dish {
     return needleArc(graph.needle, graph.needle_length, graph.needle_curvature).map((point) => this.placement.at(point));
   }
 
-  draw(graph, { since, drag, maxSpeed, showTension }) {
+  draw(graph, { since, drag, maxSpeed, showTension, ruler }) {
     const { canvas, context } = this;
     const ratio = devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -73,10 +73,11 @@ export class Dish {
     }
     if (drag) this.#drawDrag(drag);
     this.#drawScaleBar(width, height);
+    if (ruler.ends) this.#drawRuler(ruler);
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
-      plan: String(plan.length), ghosts: String(ghosts.length),
+      plan: String(plan.length), ruler: ruler.text, ghosts: String(ghosts.length),
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }
@@ -198,14 +199,15 @@ export class Dish {
     }
     this.#head([x - 5 * right, y - 5 * down], Math.atan2(down, right), 12, NEAR);
     context.font = '600 13px system-ui, "DejaVu Sans", sans-serif';
-    const size = context.measureText(text).width;
+    const lines = text.split(/(?<=:) /);
+    const size = Math.max(...lines.map((line) => context.measureText(line).width));
     const left = Math.min(Math.max(from[0] - 9 * right - (right > 0 ? size : 0), 8), width - size - 8);
-    const base = from[1] - 14 * down + 4;
+    const base = from[1] - 14 * down + 4 - (down > 0 ? 17 * (lines.length - 1) : 0);
     context.fillStyle = this.halo;
-    context.fillRect(left - 5, base - 14, size + 10, 20);
+    context.fillRect(left - 5, base - 14, size + 10, 3 + 17 * lines.length);
     context.fillStyle = NEAR;
     context.textAlign = "left";
-    context.fillText(text, left, base);
+    lines.forEach((line, at) => context.fillText(line, left, base + 17 * at));
   }
 
   // The thread that the margins are of, in the colour of its friction; an estimated one with an edge of its own colour,
@@ -320,6 +322,30 @@ export class Dish {
     context.beginPath();
     context.arc(...to, 9, 0, 2 * Math.PI);
     context.stroke();
+  }
+
+  #drawRuler({ ends, text }) {
+    const { context } = this;
+    const [from, to] = ends.map((end) => this.placement.at(end));
+    const size = Math.hypot(to[0] - from[0], to[1] - from[1]) || 1;
+    const [u, v] = [(-6 * (to[1] - from[1])) / size, (6 * (to[0] - from[0])) / size]; // across it
+    for (const [wide, colour] of [[5, this.halo], [2, this.ink]]) {
+      context.beginPath();
+      for (const [a, b] of [[from, to], ...[from, to].map(([x, y]) => [[x - u, y - v], [x + u, y + v]])]) {
+        context.moveTo(...a);
+        context.lineTo(...b);
+      }
+      context.lineWidth = wide;
+      context.strokeStyle = colour;
+      context.stroke();
+    }
+    context.font = '600 13px system-ui, "DejaVu Sans", sans-serif';
+    context.textAlign = "center";
+    context.lineWidth = 4;
+    context.strokeStyle = this.halo;
+    context.strokeText(text, to[0], to[1] - 14);
+    context.fillStyle = this.ink;
+    context.fillText(text, to[0], to[1] - 14);
   }
 
   #drawScaleBar(width, height) {

@@ -6,6 +6,7 @@ import { Input } from "./input.js";
 import { showPanel } from "./panel.js";
 import { Plots } from "./plots.js";
 import { ProcedureBar } from "./procedure.js";
+import { Ruler } from "./ruler.js";
 import { SetupPicker } from "./setup_picker.js";
 import { SILENCE_TIMEOUT } from "./status.js";
 
@@ -32,8 +33,9 @@ const state = {
 const dish = new Dish(find("dish"));
 const plots = new Plots(document);
 const input = new Input(find("dish"), find("directions"), {
-  changed: () => sendJog(), stop: () => emergencyStop(), needle: () => dish.needlePoints(state.graph),
+  changed: () => sendJog(), stop: () => emergencyStop(), needle: () => (ruler.on ? null : dish.needlePoints(state.graph)),
 });
+const ruler = new Ruler(find("dish"), drawSoon, () => dish.placement);
 const connection = new Connection({ opened, closed, received, frame });
 
 const procedure = new ProcedureBar((message) => connection.send(message));
@@ -147,6 +149,22 @@ find("tension").addEventListener("click", ({ currentTarget }) => {
   find("dish").focus({ preventScroll: true });
   drawSoon();
 });
+find("ruler").addEventListener("click", ({ currentTarget }) => {
+  ruler.toggle();
+  input.clear();
+  currentTarget.setAttribute("aria-pressed", String(ruler.on));
+  find("dish").focus({ preventScroll: true });
+  drawSoon();
+});
+function showLegend(shown) {
+  find("legend").hidden = !shown;
+  find("fold").setAttribute("aria-expanded", String(shown));
+}
+find("fold").addEventListener("click", () => {
+  showLegend(find("legend").hidden);
+  find("dish").focus({ preventScroll: true });
+});
+showLegend(!matchMedia("(max-width: 1000px)").matches);
 find("speed").addEventListener("input", ({ target }) => {
   state.adjusted = true;
   state.speed = Number(target.value) / 1e3;
@@ -168,7 +186,7 @@ function drawSoon() {
 function draw() {
   scheduled = false;
   stats.drawn += 1;
-  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed, showTension: state.showTension });
+  dish.draw(state.graph, { since: since(), drag: hasControl() ? input.drag() : null, maxSpeed: state.maxSpeed, showTension: state.showTension, ruler });
 }
 
 let counted = { at: clock(), drawn: 0 };

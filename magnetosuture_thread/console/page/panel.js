@@ -2,7 +2,7 @@
 
 import { capital, isNumber, leastClearance, micronewtons, millimetres, plural, seconds } from "./format.js";
 import { estimateState, forecastOf, threadOf } from "./colours.js";
-import { SILENCE_TIMEOUT, motionStatus } from "./status.js";
+import { SILENCE_TIMEOUT, motionStatus, slowness } from "./status.js";
 
 const NODE_TIMEOUT = 3.0; // [s]
 const KINDS = { connectivity: "Connectivity", compression: "Compression", obstacle: "Obstacle", wall: "Wall" };
@@ -32,6 +32,9 @@ export function showPanel(view) {
   if (lease) write("pages", `${plural(lease.pages, "page")} watching`);
   find("plan-legend").hidden = !Number(find("dish").dataset.plan ?? 0);
   find("simulated").hidden = !host?.simulated;
+  const slow = slowness(view);
+  find("slow").hidden = !slow;
+  find("slow").title = slow;
 }
 
 function showStatus(view) {
@@ -87,7 +90,7 @@ function showCoils({ graph, host, since, canCommand, hasControl, open }) {
   else if (bridge.emergency_stopped) write("coils", "emergency stop", "error");
   else if (bridge.state === "fault") write("coils", "fault", "error");
   else if (bridge.state !== "active") write("coils", bridge.state, "silent");
-  else write("coils", armed ? "armed" : "disarmed", armed ? "ok" : "warn");
+  else write("coils", armed ? "armed" : "disarmed", armed ? "ok" : "rest");
   find("stop").disabled = open && !canCommand;
   find("arm").disabled = !(open && hasControl && !host?.busy && bridge && !armed && !latched && bridge.driver_ready && bridge.state === "active");
   find("disarm").disabled = !(open && canCommand && armed);
@@ -95,8 +98,9 @@ function showCoils({ graph, host, since, canCommand, hasControl, open }) {
   const warnings = bridge?.driver_warnings ?? [];
   const driver = bridge ? [`Driver ${bridge.driver}: ${bridge.driver_ready ? "ready" : "not ready"}`, ...warnings].join(" · ") : "Driver: no data";
   const why = graph?.nodes?.coil_bridge?.values?.["last refusal"] ?? "none";
-  const refused = bridge?.refused ? `${plural(bridge.refused, "message")} not followed${why === "none" ? "" : `, the last: ${why}`}` : "";
+  const refused = bridge?.refused ? `commands and poses refused: ${bridge.refused}${why === "none" ? "" : `, the last: ${why}`}` : "";
   write("driver", refused ? `${driver} · ${refused}` : driver);
+  find("driver").title = refused;
 }
 
 function showControl({ lease, client, hasControl, canCommand, open, maxSpeed, speed }) {
@@ -163,9 +167,9 @@ function showThread({ graph, since }) {
     }[state] ?? ["friction unknown", "silent"];
     write("friction", ...words);
   }
-  if (margins && !margins.valid && margins.reason) rows.push([margins.reason, null]);
-  if (estimate !== "none") for (const { text } of estimated.disturbances) rows.push([capital(text), null]);
-  if (estimate === "prediction") rows.push([`Prediction only for ${seconds(estimated.unmeasured_for)}`, null]);
+  if (margins && !margins.valid && margins.reason) rows.push([margins.reason, null, "error"]);
+  if (estimate !== "none") for (const { text } of estimated.disturbances) rows.push([capital(text), null, "error"]);
+  if (estimate === "prediction") rows.push([`Prediction only for ${seconds(estimated.unmeasured_for)}`, null, "error"]);
   rows.push(["Clearance", margins?.valid ? clearanceText(margins) : "–"]);
   if (margins?.valid && isNumber(margins.bound)) rows.push(["99 % bound", millimetres(margins.bound)]);
   if (estimate === "measured") {
@@ -175,24 +179,24 @@ function showThread({ graph, since }) {
   for (const [kind, value] of Object.entries(margins?.valid ? margins.least : {})) {
     rows.push([KINDS[kind] ?? capital(kind.replaceAll("_", " ")), millimetres(value, 3)]);
   }
-  if (estimate !== "none") for (const [key, value] of Object.entries(graph.nodes?.thread_model?.values ?? {})) {
-    if (key.startsWith("learned ")) rows.push([`${capital(key.slice(8).replaceAll("_", " "))}: ${value}`, null]);
-  }
   if (margins?.valid) rows.push(["In contact", plural(margins.contact.length, "node")]);
   if (predicted?.tension?.length) {
     rows.push(["Peak tension", micronewtons(Math.max(...predicted.tension))]);
-    rows.push(["Pull on the needle", micronewtons(Math.hypot(...predicted.needle_force))]);
+    rows.push(["Needle pull", micronewtons(Math.hypot(...predicted.needle_force))]);
   }
   if (predicted) rows.push(["Step", isNumber(predicted.step_time) ? `${(predicted.step_time * 1e3).toFixed(2)} ms` : "–"]);
+  if (estimate !== "none") for (const [key, value] of Object.entries(graph.nodes?.thread_model?.values ?? {})) {
+    if (key.startsWith("learned ")) rows.push([`${capital(key.slice(8).replaceAll("_", " "))}: ${value}`, null]);
+  }
   const list = find("margins");
   list.classList.toggle("stale", Boolean(old));
-  fill(list, rows, ([name, value]) => {
+  fill(list, rows, ([name, value, level]) => {
     const row = document.createElement("div");
     const [term, figure] = [document.createElement("dt"), document.createElement("dd")];
     term.textContent = name;
     figure.textContent = value ?? "";
     row.append(term, figure);
-    if (value === null) row.className = "words";
+    if (value === null) row.className = `words ${level ?? ""}`;
     return row;
   });
 }
@@ -202,19 +206,20 @@ const clearanceText = (margins) => {
   return least === null ? "none near" : millimetres(least);
 };
 
-function showNodes({ graph, since }) {
+function showNodes({ graph, since, host }) {
   const rows = Object.entries(graph.nodes ?? {}).map(([name, { level, message, age }]) => {
     const total = isNumber(age) ? age + since : null;
     const stale = level === "silent" || total === null || total > NODE_TIMEOUT;
     const lastSeen = stale ? `no data for ${seconds(total)}` : total < 1 ? "now" : `${Math.floor(total)} s ago`;
-    return [name, stale ? "silent" : level, lastSeen, message ?? ""];
+    const starting = host?.busy && level === "warn";
+    return [name, stale || starting ? "silent" : level, lastSeen, message ?? "", starting && !stale];
   });
-  if (!rows.length) rows.push(["no node yet", "", "", ""]);
-  fill(find("nodes"), rows, ([name, level, age, message]) => {
+  if (!rows.length) rows.push(["no node yet", "", "", "", false]);
+  fill(find("nodes"), rows, ([name, level, age, message, starting]) => {
     const item = document.createElement("li");
     const title = document.createElement("b");
     title.dataset.level = level || "silent";
-    title.textContent = name.replaceAll("_", " ") + (level ? `: ${LEVELS[level] ?? level}` : "");
+    title.textContent = name.replaceAll("_", " ") + (level ? `: ${starting ? "starting" : LEVELS[level] ?? level}` : "");
     const when = document.createElement("span");
     when.className = "age";
     when.textContent = age;
@@ -225,7 +230,7 @@ function showNodes({ graph, since }) {
       text.textContent = text.title = message;
       item.append(text);
     }
-    item.classList.toggle("stale", level === "silent");
+    item.classList.toggle("stale", level === "silent" && !starting);
     return item;
   });
 }

@@ -1,7 +1,8 @@
 // The bar of procedures: one is chosen, planned, and seen on the dish before it runs; goals, pause, resume, abort; and the
 // button that has to be held where the needle may move only while somebody holds it.
 
-import { capital } from "./format.js";
+import { capital, millimetres } from "./format.js";
+import { needleArc } from "./geometry.js";
 
 const LEVELS = { idle: "silent", ready: "rest", running: "ok", paused: "warn", done: "ok", failed: "error" };
 const find = (id) => document.getElementById(id);
@@ -84,6 +85,9 @@ export class ProcedureBar {
     find("procedure-state").dataset.level = LEVELS[state] ?? "silent";
     const marks = goals.map((each, at) => (at < met ? `✓ ${kind(each)}` : at === goal && active ? `▸ ${kind(each)}` : kind(each)));
     write("goals", marks.join(" · "));
+    const end = active || state === "ready" ? graph.plan?.at(-1) : null;
+    const tip = end && graph.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop() : null;
+    write("distance", tip ? `tip ${millimetres(Math.hypot(end[0] - tip[0], end[1] - tip[1]), 1)} from the end of the way` : "");
     write("procedure-reason", resumes ? `${reason}; it goes on by itself` : reason);
   }
 }

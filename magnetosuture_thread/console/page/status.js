@@ -6,7 +6,7 @@ import { capital, isNumber, length, plural, seconds, speedText } from "./format.
 export const SILENCE_TIMEOUT = 1.0; // [s] after which states of bridge, needle and camera are stale
 const NODE_TIMEOUT = 3.0; // [s] after which the diagnostics of a node are
 const MIN_SPEED = 1e-5; // [m/s]
-const MIN_REAL_TIME_FACTOR = 0.9; // below which it is reported as late
+const MIN_REAL_TIME_FACTOR = 0.9; // below which a machine is too slow
 
 // view: {link: "open"|"closed"|"connecting", since: s, graph, host, lease, client, canCommand, jogging, stale, late: s}
 // `stale`: a key is held that has to be released first; `late`: delay of a jog message that came too late, else 0.
@@ -18,15 +18,19 @@ export function motionStatus(view) {
   if (since > SILENCE_TIMEOUT) return result("error", `No data from the server for ${seconds(since)}`, ["The drawing is old. The jog has ended."]);
   const bridge = graph.bridge;
   if (bridge?.emergency_stopped) return result("error", "Emergency stop is pressed", ["The bridge keeps all coils at zero. To resume: Reset, then Arm.", ...others(bridge, ["emergency stop"])]);
-  if (host?.busy) return result("warn", capital(host.busy), ["Please wait."]);
-  if (host?.paused) return result("warn", "Paused", []);
+  if (host?.busy) return result("silent", capital(host.busy), ["Please wait."]);
+  if (host?.paused) return result("rest", "Paused", []);
   const blocked = bridgeStatus(view) ?? perceptionStatus(view);
   if (blocked) return blocked;
   const { level, headline, reasons } = readiness(view) ?? (speeds(view).applied > MIN_SPEED ? moving(view) : resting(view));
-  const factor = Number(graph.nodes?.rig_simulator?.values?.real_time_factor ?? 1);
-  return factor < MIN_REAL_TIME_FACTOR
-    ? result(level === "error" ? level : "warn", headline, [...reasons, `Computer late: simulated time runs at ${(100 * factor).toFixed(0)} %.`])
-    : result(level, headline, reasons);
+  return result(level, headline, [slowness(view), ...reasons].filter(Boolean));
+}
+
+// What a machine cannot keep up with, and what to do; empty where it can, or while nodes start.
+export function slowness({ graph, host }) {
+  const { real_time_factor: factor = 1, skipped = 0 } = graph?.nodes?.rig_simulator?.values ?? {};
+  if (host?.busy || !(Number(factor) < MIN_REAL_TIME_FACTOR)) return "";
+  return `Simulated time runs at ${(100 * factor).toFixed(0)} %, with ${plural(Number(skipped), "frame")} skipped: close other programs.`;
 }
 
 function bridgeStatus({ since, graph: { bridge }, host }) {
@@ -41,7 +45,8 @@ function perceptionStatus({ since, graph, host }) {
   const { bridge, tracker, needle, camera } = graph;
   const age = (part) => (part?.age ?? 0) + since;
   if (tracker && tracker.state !== "tracked" && age(tracker) <= SILENCE_TIMEOUT) {
-    return result("error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
+    const unfound = tracker.state === "searching" && !needle;
+    return result(unfound ? "silent" : "error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
   }
   const rig = graph.nodes?.rig_simulator;
   const again = host?.mode === "simulated" ? "If that does not help: Start again." : "Check its node.";
@@ -56,7 +61,7 @@ function perceptionStatus({ since, graph, host }) {
 function readiness({ graph: { bridge }, late }) {
   if (!bridge.driver_ready) return result("error", `Driver ${bridge.driver} is not ready`, others(bridge, []));
   if (late) return result("error", `Computer or network late: key presses come ${seconds(late)} late`, ["The needle rests until they come in time.", ...others(bridge, [])]);
-  if (!bridge.armed) return result("warn", "Disarmed: press Arm to enable commands", others(bridge, ["disarmed"]));
+  if (!bridge.armed) return result("rest", "Disarmed: press Arm to enable commands", others(bridge, ["disarmed"]));
   return null;
 }
 
