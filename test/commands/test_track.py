@@ -22,9 +22,8 @@ from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.recorded import read_image
 from magnetosuture_thread.interface import COMPRESSED_IMAGE
-from test.bags.bags import copy_with_notes, make, stamped
 from magnetosuture_thread.vision.overlay import NEEDLE
-from test.bags.bags import copy_with_notes
+from test.bags.bags import copy_with_notes, make, stamped
 from test.vision.scenes import VIEW, rod
 
 SAMPLES = Path(__file__).parents[1] / "vision" / "samples"
