@@ -66,6 +66,7 @@ FIELDS: dict[str, dict[str, Field]] = {
         "hold_to_run": _SWITCH,
     },
     "hold": {"sent": _NUMBER},
+    "tip": {"position": (tuple, Quantity("", "m", multiple=2))},
 }
 
 
@@ -106,10 +107,11 @@ def parse_client_message(text: str, max_speed: float) -> ClientMessage:
     if not isinstance(kind, str) or kind not in FIELDS:
         raise _refusal("type", kind, f"one of {', '.join(FIELDS)}")
     values = {name: _checked(name, fields.get(name), *about) for name, about in FIELDS[kind].items()}
+    for name in values.keys() & {"direction", "position"}:
+        if len(values[name]) != 2:
+            raise _refusal(name, list(values[name]), "a list of two numbers")
     if kind == "jog":
         direction, speed = values.pop("direction"), values.pop("speed")
-        if len(direction) != 2:
-            raise _refusal("direction", list(direction), "a list of two numbers")
         largest = max(abs(direction[0]), abs(direction[1]), 1.0)  # avoids overflow of the squares
         x, y = direction[0] / largest, direction[1] / largest
         factor = min(speed, max_speed) / max(1.0, math.hypot(x, y))
@@ -162,6 +164,7 @@ class Graph(Protocol):
                                 "disc": [x, y, r]}   # or, in place of the disc,
                                | {..., "outline": [[x, y], ...], "holes": [[[x, y], ...], ...]}]} | None,
           "needle": {"tail": [x, y], "heading": rad, "age": s} | None,
+          "axis": the same | None,         # in place of the needle, where nothing tells which end is the tip
           "camera": {"age": s} | None,     # of the latest image
           "tracker": {"state": "tracked|lost|searching", "reason": str, "confidence": float,
                       "view": {"centre": [u, v], "scale": m_per_px, "rotation": rad} | None, "age": s} | None,
@@ -206,6 +209,9 @@ class Graph(Protocol):
 
     async def execute_action(self, action: str) -> str:
         """Execute arm, disarm, stop or reset; return an empty text, or the reason of a refusal."""
+
+    async def point_at_tip(self, position: tuple[float, float]) -> str:
+        """Tell the tracker of a point near the needle's tip [m]; return an empty text, or the reason of a refusal."""
 
     def publish_hold(self) -> None:
         """Publish that the page is held, so that a procedure may go on."""
@@ -363,6 +369,8 @@ class RequestHandler:
         values = message.values
         if message.type == "bridge_action":
             return self._graph.execute_action(values["action"])
+        if message.type == "tip":
+            return self._graph.point_at_tip(values["position"])
         if message.type == "procedure":
             return self._graph.execute_procedure(values["action"], values["procedure"], values["hold_to_run"])
         if message.type == "select_setup":

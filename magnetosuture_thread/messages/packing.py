@@ -93,6 +93,11 @@ def packed_path(stamp: Stamp, points: Points) -> bytes:
     return pack("header uint32 raw", stamp, len(points), data)
 
 
+def packed_point(stamp: Stamp, point: Vector) -> bytes:
+    """Return a point in the dish plane, shape (2,) [m], as a PointStamped."""
+    return pack("header float64[3]", stamp, (point[0], point[1], 0.0))
+
+
 def packed_twist(stamp: Stamp, velocity: Vector) -> bytes:
     """Return a velocity of shape (2,) [m/s] as a TwistStamped."""
     return pack("header float64[6]", stamp, (velocity[0], velocity[1], 0.0, 0.0, 0.0, 0.0))

@@ -69,21 +69,28 @@ def require_dish_frame(frame: str, field: str) -> None:
         raise InvalidInputError(f"{field}.header.frame_id", repr(frame), repr(interface.DISH_FRAME))
 
 
-def needle_pose(message: Any) -> NeedlePose:
+def needle_pose(message: Any, directed: bool = True) -> NeedlePose:
     """Return the needle's pose in the plane, of a PoseWithCovarianceStamped.
+
+    Args:
+        message: the pose.
+        directed: whether to refuse one whose heading is unknown.
 
     Raises:
         InvalidInputError: wrong frame, no stamp, no unit quaternion, or a heading that is unknown by its covariance.
     """
     tail, heading, deviation = _plane_pose(message, interface.NEEDLE_POSE.name)
     checked_nanoseconds(message.header.stamp, _STAMP)  # the prediction could not be stamped by another
-    variance = float(message.pose.covariance[-1])
-    if variance > 1.0:  # rad^2; beyond, it is unknown which end of the needle is the tail
+    if directed and not heading_known(message):
         expected = "a standard deviation of at most 1 rad: the heading is unknown"
-        raise InvalidInputError(
-            f"{interface.NEEDLE_POSE.name}.pose.covariance", f"{math.sqrt(variance):g} rad", expected
-        )
+        found = f"{math.sqrt(message.pose.covariance[-1]):g} rad"
+        raise InvalidInputError(f"{interface.NEEDLE_POSE.name}.pose.covariance", found, expected)
     return NeedlePose(seconds(message.header.stamp), tail, heading, deviation)
+
+
+def heading_known(message: Any) -> bool:
+    """Return whether a PoseWithCovarianceStamped tells which end of the needle is the tail."""
+    return not float(message.pose.covariance[-1]) > 1.0  # rad^2
 
 
 def _plane_pose(message: Any, field: str) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[float, float]]:

@@ -27,7 +27,7 @@ from magnetosuture_thread.console.settings import ConsoleSettings
 from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.interface import Service
 from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_header, packed_twist
+from magnetosuture_thread.messages.packing import packed_header, packed_point, packed_twist
 from magnetosuture_thread.nodes import console_state as page
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Latest, Services, answer_requests
@@ -105,6 +105,7 @@ class ConsoleGraph:
         self._action = 0  # number of the latest
         self._commands = topics.OPERATOR_COMMAND.publisher(node)
         self._holds = topics.PROCEDURE_HOLD.publisher(node)
+        self._tips = topics.NEEDLE_TIP.publisher(node)
         self._procedures = {name: read_procedure(name).shape_names for name in shipped_procedures()}
         self._clock = Inbox(node, topics.CLOCK, 1) if node.get_parameter("use_sim_time").value else None
         self._number = 0
@@ -131,6 +132,12 @@ class ConsoleGraph:
         """Publish that the page is held; nothing while commands are blocked."""
         if not self.blocked:
             self._holds.publish(packed_header(self.now().to_msg()))
+
+    async def point_at_tip(self, position: tuple[float, float]) -> str:
+        """Tell the tracker of a point near the needle's tip [m]; return an empty text, or the reason of a refusal."""
+        if not self.blocked:
+            self._tips.publish(packed_point(self.now().to_msg(), np.asarray(position, dtype=float)))
+        return self.blocked
 
     async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
         """Plan, resume, pause or abort a procedure; return an empty text, or the reason of a refusal."""
@@ -174,6 +181,9 @@ class ConsoleGraph:
         for name, latest in self._latest.items():
             latest.poll()
             parts[name] = latest.aged() if READERS[name][3] else latest.value
+        needle, parts["axis"] = parts["needle"], None
+        if needle is not None and not needle.pop("directed"):
+            parts["needle"], parts["axis"] = None, needle
         for name in ("measured", "plan"):
             parts[name] = parts[name] or []
         if self.blocked:

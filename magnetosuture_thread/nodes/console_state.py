@@ -14,7 +14,7 @@ from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
 from magnetosuture_thread.messages.markers import forecast_events
-from magnetosuture_thread.messages.reading import constant_name, margins_of, needle_pose
+from magnetosuture_thread.messages.reading import constant_name, heading_known, margins_of, needle_pose
 from magnetosuture_thread.messages.scene import parse_scene_message
 from magnetosuture_thread.texts import shortened
 from magnetosuture_thread.thread.margins import node_clearance
@@ -24,13 +24,13 @@ MAX_LISTED = 24  # entries of a list of texts or figures that are sent to the pa
 
 
 def needle(message: PoseWithCovarianceStamped) -> dict[str, Any]:
-    """Return the needle's tail [m] and the angle of its heading there [rad].
+    """Return the needle's tail [m], the angle of its heading there [rad], and whether that is not the opposite one.
 
     Raises:
         InvalidInputError: the pose is none in the dish plane.
     """
-    pose = needle_pose(message)
-    return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading)}
+    pose = needle_pose(message, directed=False)
+    return {"tail": pose.tail.tolist(), "heading": heading_angle(pose.heading), "directed": heading_known(message)}
 
 
 def tracker(message: msg.TrackerState) -> dict[str, Any]:

@@ -33,6 +33,7 @@ def state(friction: str = "free", count: int = 0) -> dict[str, Any]:
         "needle_length": 0.007,
         "needle_curvature": 0.0,
         "needle": {"tail": list(TAIL), "heading": 0.0, "age": 0.02},
+        "axis": None,
         "tracker": {
             "state": "tracked",
             "reason": "",
@@ -142,6 +143,7 @@ class RecordingGraph:
         self.actions: list[str] = []
         self.procedures: list[tuple[str, str, bool]] = []
         self.holds: list[float] = []
+        self.tips: list[tuple[float, float]] = []
         self.refusal = ""
 
     @property
@@ -164,6 +166,12 @@ class RecordingGraph:
     def publish_hold(self) -> None:
         """Record that the page is held."""
         self.holds.append(time.monotonic())
+
+    async def point_at_tip(self, position: tuple[float, float]) -> str:
+        """Keep a point; from then on the needle's heading is known."""
+        self.tips.append(position)
+        self.shown.update(needle=self.shown["axis"], axis=None)
+        return self.refusal
 
     async def execute_procedure(self, action: str, procedure: str, hold_to_run: bool) -> str:
         """Record a request, and change the state of the procedure."""

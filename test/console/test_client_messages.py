@@ -29,6 +29,7 @@ def test_messages_are_parsed():
     assert parsed('{"type": "hello", "token": "abc"}') == ClientMessage("hello", {"token": "abc", "automated": None})
     assert parsed('{"type": "end_jog"}') == ClientMessage("end_jog")
     assert parsed('{"type": "bridge_action", "action": "stop"}') == ClientMessage("bridge_action", {"action": "stop"})
+    assert parsed('{"type": "tip", "position": [0.001, -0.002]}') == ClientMessage("tip", {"position": (0.001, -0.002)})
     assert parsed(jog([1, 0])).values == {"velocity": (0.003, 0.0), "sent": 1.0}
     assert parsed(jog([0.0, -0.5])).values["velocity"] == (0.0, -0.0015)
 
@@ -60,6 +61,7 @@ def test_jog_velocity_is_limited(direction: list[float], speed: float):
         (jog({"x": 1}), "message.direction"),
         (jog([None, 1]), "message.direction"),
         (jog([1, 0], sent=None), "message.sent"),
+        ('{"type": "tip", "position": [0.001]}', "message.position"),
         ('{"type": "bridge_action", "action": "explode"}', "message.action"),
         ('{"type": "bridge_action", "action": {}}', "message.action"),
         ('{"type": "pause", "paused": 1}', "message.paused"),

@@ -103,6 +103,26 @@ def test_the_page_loads_and_draws_every_state(operator: Operator):
     assert operator.stats("frames") == 1
 
 
+def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
+    shown = operator.served.graph.shown
+    shown.update(needle=None, axis=shown["needle"])
+    dish = operator.page.locator("#dish")
+    expect(dish).to_have_attribute("data-axis", "yes")
+    expect(operator.page.locator("#headline")).to_have_text("Which end of the needle is the tip?")
+    scale, ratio = float(dish.get_attribute("data-scale") or 0), operator.page.evaluate("devicePixelRatio")
+    u, v = (float(entry) / ratio for entry in (dish.get_attribute("data-centre") or "").split(","))
+    tip = (TAIL[0] + 0.007, TAIL[1])
+    place = {"x": u + tip[0] * scale / ratio, "y": v - tip[1] * scale / ratio}
+    dish.click(position=place)  # without control
+    assert operator.served.graph.tips == []
+    operator.take_control()
+    dish.click(position=place)
+    operator.until(lambda: operator.served.graph.tips)
+    assert operator.served.graph.tips == [pytest.approx(tip, abs=1e-4)]
+    expect(dish).to_have_attribute("data-axis", "no")
+    assert operator.served.graph.commands == []
+
+
 KEYS = [
     (["ArrowRight"], (1.0, 0.0)),
     (["ArrowUp"], (0.0, 1.0)),

@@ -117,6 +117,24 @@ def report(names: list[str], text: str = "") -> DiagnosticArray:
     )
 
 
+def test_the_axis_of_a_needle_is_told_and_a_point_at_its_tip_is_published(graph, console):
+    tips, tail = graph.listen(topics.NEEDLE_TIP), np.array([0.002, -0.001])
+    for deviation, known, unknown in ((10.0, "axis", "needle"), (0.1, "needle", "axis"), (np.inf, "axis", "needle")):
+        pose = wire.pose_message(graph.now(), tail, np.array([1.0, 0.0]), np.diag([1e-9, 1e-9, deviation**2]))
+        tell(graph, topics.NEEDLE_POSE, pose, lambda known=known: console.state()[known], known)
+        assert console.state()[known]["tail"] == pytest.approx(tail)
+        assert console.state()[unknown] is None
+
+    def told() -> bool:
+        assert asyncio.run(console.point_at_tip((0.004, -0.001))) == ""
+        return bool(tips)
+
+    graph.wait(told, "the point")
+    assert (tips[0].point.x, tips[0].point.y) == (0.004, -0.001)
+    console.blocked = "starting"
+    assert asyncio.run(console.point_at_tip((0.0, 0.0))) == "starting"
+
+
 def test_a_flood_of_diagnostics_keeps_the_state_small_and_our_own_nodes_in_it(graph, console, monkeypatch):
     graph.add(CoilBridgeNode)
     graph.wait(lambda: "coil_bridge" in console.nodes(), "the bridge's report")

@@ -125,6 +125,7 @@ PACKED = {
     "pose": (interface.NEEDLE_POSE, packing.packed_pose(7, TAIL, HEADING, np.eye(3))),
     "pose before 1970": (interface.NEEDLE_POSE, packing.packed_pose(-7, TAIL, HEADING)),
     "setpoint": (interface.TIP_SETPOINT, packing.packed_pose_stamped(7, TAIL, 0.3)),
+    "point": (interface.NEEDLE_TIP, packing.packed_point(7, TAIL)),
     "twist": (interface.NEEDLE_COMMAND, packing.packed_twist(7, TAIL)),
     "wrench": (interface.GROUND_TRUTH_PULL, packing.packed_wrench(7, TAIL, 1e-9)),
     "path": (interface.MEASURED_THREAD, packing.packed_path(7, POINTS)),

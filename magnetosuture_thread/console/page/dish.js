@@ -1,12 +1,13 @@
 // The drawing of the dish. For tests and other programs the canvas says in data attributes what it shows:
 // data-friction (free, sliding, stuck, unknown, invalid, old, none) and data-colour of the thread that the margins are of,
-// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-ruler (what it measures), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
+// data-tension (shown or not), data-estimate (none, measured, prediction), data-disturbances (how many), data-plan (places of the planned way), data-ghosts (instants of the forecast thread), data-image (yes or no), data-axis (of a needle whose tip is unknown), data-ruler (what it measures), data-scale [px/m] and data-centre [px] of the canvas's own pixels, data-tip of the needle [m].
 
 import {
   AHEAD, ESTIMATED, GREY, MEASURED, MIDDLING, MODEL, NEAR, VELOCITY, estimateState, forecastOf, nodeLook, onGround, tensionColour, threadLook, threadOf,
 } from "./colours.js";
 import { Placement, needleArc } from "./geometry.js";
 import { drawShapes } from "./shapes.js";
+import { undirectedAxis } from "./status.js";
 
 const DIAMETER = 0.035; // [m] of the dish that is drawn dashed while no scene is known
 const STALE = 0.5; // [s] a needle that is older is drawn grey
@@ -54,6 +55,7 @@ export class Dish {
     context.drawImage(this.ground, 0, 0);
     plain(context, ratio);
     const thread = threadOf(graph);
+    const axis = undirectedAxis(graph, since);
     const look = threadLook(thread, graph?.margins, since);
     const estimate = graph ? estimateState(graph, since) : "none";
     const tip = graph?.needle ? needleArc(graph.needle, graph.needle_length, graph.needle_curvature).pop().join(",") : "";
@@ -68,6 +70,7 @@ export class Dish {
       if (thread !== graph.predicted) this.#drawModel(graph, since);
       this.#drawThread(thread, graph.margins, look, thread === graph.estimated ? estimate : "none", tension);
       if (estimate !== "none") graph.estimated.disturbances.forEach((found) => this.#drawDisturbance(found, width));
+      if (axis) this.#line(needleArc(axis, graph.needle_length, graph.needle_curvature), 4.5, this.velocity);
       this.#drawNeedle(graph, since);
       this.#drawVelocities(graph, since, maxSpeed);
     }
@@ -77,7 +80,7 @@ export class Dish {
     Object.assign(canvas.dataset, {
       friction: look.state, colour: look.colour, estimate, tension: tension ? "shown" : "not",
       disturbances: String(estimate === "none" ? 0 : graph.estimated.disturbances.length), image: shown ? "yes" : "no", tip,
-      plan: String(plan.length), ruler: ruler.text, ghosts: String(ghosts.length),
+      plan: String(plan.length), ruler: ruler.text, axis: axis ? "yes" : "no", ghosts: String(ghosts.length),
       scale: String(this.placement.scale * ratio), centre: this.placement.centre.map((entry) => entry * ratio).join(","),
     });
   }

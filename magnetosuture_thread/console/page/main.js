@@ -8,7 +8,7 @@ import { Plots } from "./plots.js";
 import { ProcedureBar } from "./procedure.js";
 import { Ruler } from "./ruler.js";
 import { SetupPicker } from "./setup_picker.js";
-import { SILENCE_TIMEOUT } from "./status.js";
+import { SILENCE_TIMEOUT, undirectedAxis } from "./status.js";
 
 const JOG_PERIOD = 30; // [ms] between two jog messages
 const PANEL_PERIOD = 100; // [ms]
@@ -155,6 +155,11 @@ find("ruler").addEventListener("click", ({ currentTarget }) => {
   currentTarget.setAttribute("aria-pressed", String(ruler.on));
   find("dish").focus({ preventScroll: true });
   drawSoon();
+});
+// Where nothing else tells which end of the needle is its tip, a click does.
+find("dish").addEventListener("click", ({ offsetX, offsetY }) => {
+  if (!hasControl() || ruler.on || !undirectedAxis(state.graph, since()) || !dish.placement) return;
+  connection.send({ type: "tip", position: dish.placement.back([offsetX, offsetY]) });
 });
 function showLegend(shown) {
   find("legend").hidden = !shown;

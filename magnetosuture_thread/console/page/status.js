@@ -41,9 +41,15 @@ function bridgeStatus({ since, graph: { bridge }, host }) {
   return null;
 }
 
+// The needle's axis where nothing tells which end is its tip, else null.
+export function undirectedAxis(graph, since) {
+  return graph?.axis && graph.axis.age + since <= SILENCE_TIMEOUT ? graph.axis : null;
+}
+
 function perceptionStatus({ since, graph, host }) {
   const { bridge, tracker, needle, camera } = graph;
   const age = (part) => (part?.age ?? 0) + since;
+  if (undirectedAxis(graph, since)) return result("warn", "Which end of the needle is the tip?", ["Take control, then click on the tip.", ...others(bridge, [])]);
   if (tracker && tracker.state !== "tracked" && age(tracker) <= SILENCE_TIMEOUT) {
     const unfound = tracker.state === "searching" && !needle;
     return result(unfound ? "silent" : "error", `Needle ${tracker.state}${tracker.reason ? `: ${tracker.reason}` : ""}`, others(bridge, []));
