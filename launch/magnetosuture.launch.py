@@ -16,6 +16,7 @@ not: a person arms the bridge, planner and path follower would begin anew amid a
 forget the shapes that were added since.
 """
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -80,7 +81,11 @@ def generate_launch_description() -> LaunchDescription:
                 choices=["", "unconfigured", "inactive", "active"],
             ),
             argument("parent_frame", "map", "frame that the dish's is in; empty if others publish it"),
-            argument("frame_prefix", "", "before the frames dish and camera, for example left/"),
+            argument(
+                "frame_prefix",
+                os.environ.get("MAGNETOSUTURE_FRAME_PREFIX", "").lstrip("/"),
+                "before the frames dish and camera, for example left/",
+            ),
             switch("use_sim_time", "take the time from /clock"),
             switch("simulated", "with a rig in software"),
             switch("planner", "with the needle planner, in place of the path follower"),

@@ -14,7 +14,7 @@ MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of
 
 
 _DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
-_ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|builtin|action|rosidl)_?.*|.+_(msgs|srvs)")
+_ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|rosidl)_?.*|.+_(msgs|srvs|interfaces)(_py)?")
 
 
 def missing_module(error: ModuleNotFoundError) -> str:

@@ -70,10 +70,7 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     """
     if is_url(path):
         with open_ranges(path) as stream:
-            content = stream.read(max_bytes + 1)
-        if len(content) > max_bytes:
-            raise OSError(errno.EFBIG, "a larger file", str(path))
-        return content
+            return _checked(stream.read(max_bytes + 1), path, max_bytes)
     _require_regular(os.stat(path), path)  # before it is opened, which may do something to a device
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -84,9 +81,12 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
             left -= len(part)
     finally:
         os.close(descriptor)
-    if not left:
+    return _checked(b"".join(parts), path, max_bytes)
+
+
+def _checked(content: bytes, path: Path, max_bytes: int) -> bytes:
+    if len(content) > max_bytes:
         raise OSError(errno.EFBIG, "a larger file", str(path))
-    content = b"".join(parts)
     if problem := substitute_problem(content):
         raise OSError(errno.EINVAL, f"it {problem}", str(path))
     return content

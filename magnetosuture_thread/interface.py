@@ -24,7 +24,7 @@ STANDBY_NODES = ("vision_tracker", "thread_model", SCENE_SERVER, PLANNER, "path_
 ALL_NODES = (*NODES, SCENE_SERVER, PLANNER, *RIG_NODES)
 # Before the frames of this process's rig, for example "left/"; all that the process packs and reads has it.
 FRAME_PREFIX_VARIABLE = "MAGNETOSUTURE_FRAME_PREFIX"
-FRAME_PREFIX = os.environ.get(FRAME_PREFIX_VARIABLE, "")
+FRAME_PREFIX = os.environ.get(FRAME_PREFIX_VARIABLE, "").lstrip("/")  # tf2 takes no frame that begins with one
 DISH_FRAME = f"{FRAME_PREFIX}dish"
 CAMERA_FRAME = f"{FRAME_PREFIX}camera"
 STORAGE_SUFFIXES = (".mcap", ".db3")  # of files of messages, which make a folder a bag
@@ -246,4 +246,5 @@ PROCEDURES = (PROCEDURE_STATE, PROCEDURE_PLAN, PROCEDURE_HOLD)  # of the needle 
 
 def is_rectified(topic: str) -> bool:
     """Return whether a camera's topic is named as one of frames without distortion, as image_proc's image_rect."""
-    return re.search("(?:^|[/_])rect(?:ified)?(?:[/_]|$)", topic) is not None
+    camera = "/".join(topic.split("/")[-2:])  # as camera/image_rect, or image_rect/compressed
+    return re.search("(?:^|[/_])rect(?:ified)?(?:[/_]|$)", camera) is not None

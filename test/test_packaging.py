@@ -60,7 +60,7 @@ def test_maintainer_and_addresses_are_those_of_pyproject_everywhere():
     assert re.search(rf'^SPDX-FileCopyrightText = "\d{{4}}(-\d{{4}})? {re.escape(name)}"$', REUSE, re.MULTILINE)
 
 
-LINK = "ln -s magnetosuture_thread/msg_defs src/magnetosuture_msgs"
+LINK = "ln -sfn magnetosuture_thread/msg_defs src/magnetosuture_msgs"
 
 
 def test_the_documented_link_makes_the_messages_a_sibling_of_the_package(tmp_path: Path):
@@ -125,6 +125,8 @@ def test_every_import_has_a_key_of_rosdep_or_is_in_the_list_for_pip():
         ("lz4.frame", "pip install 'lz4'"),
         ("rclpy", "source the setup.bash of ROS"),
         ("magnetosuture_msgs", "and of the workspace where this package is built"),
+        ("sensor_msgs_py", "source the setup.bash of ROS"),
+        ("type_description_interfaces", "source the setup.bash of ROS"),
         ("upath", r"pip install '\.\[cluster\]'"),
     ],
 )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread import interface
+from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DISH_FRAME, Channel, is_rectified
@@ -169,7 +170,7 @@ class Recording:
         is_converted = channel.type_name in CONVERTED
         is_ours = record.type_name == channel.type_name and record.decoder.is_ours
         if is_ours and (not is_converted or (self._dish_frame == DISH_FRAME and is_in_dish_frame(record.data))):
-            return RecordedMessage(channel.recorded, channel.type_name, record.time, record.data)
+            return RecordedMessage(channel.recorded, channel.type_name, record.time, self._in_our_frame(record))
         if not is_converted:
             raise UnfitError(f"its type {record.type_name} has another definition than ours")
         frame, stamp = self._dish_frame, record.time  # of a Twist, which has none
@@ -188,6 +189,17 @@ class Recording:
         except struct.error:
             raise UnfitError("a value out of range of our type") from None
         return RecordedMessage(channel.recorded, channel.type_name, record.time, data)
+
+    def _in_our_frame(self, record: RecordedMessage) -> bytes:
+        """Return the bytes of a message of ours, where it is in the bag's dish frame in ours."""
+        if self._dish_frame == DISH_FRAME:
+            return record.data
+        with suppress(BagError):  # it has no frame, or cannot be decoded, which whoever takes it reports
+            if stamp_and_frame(record.topic, record.data)[1].lstrip("/") == self._dish_frame:
+                message = record.decode()
+                message.header.frame_id = DISH_FRAME
+                return bytes(typestore().serialize_cdr(message, record.type_name))
+        return record.data
 
     def _transform_to_dish(self, topic: str, frame: str, stamp: int) -> Matrix:
         """Return the transform from a frame to the dish frame at a time [ns].

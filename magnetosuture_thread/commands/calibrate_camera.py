@@ -44,9 +44,13 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     With --needle the needle's length is measured over eight frames that show both of its ends, and written for every
     node.
     """
+    by_markers = options.markers is not None
+    if by_markers and (options.region or options.rim):
+        raise BagError(options.frames[0], "is calibrated by --markers, so --region and --rim have no meaning for it")
     source = FrameSource(options, terminal.log)
     every = max(1, -(-source.count // 50))  # evenly over a long bag or video
-    images, unused = [], ""
+    images: list[np.ndarray] = []
+    unused = ""
     for index, frame in enumerate(source):
         if index % every or frame.image is None:
             continue
@@ -54,6 +58,8 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
         if problem is not None and options.camera_info is not None:
             raise problem
         unused = f"{problem}; it is not used" if problem is not None else unused
+        if len(images) == 50:  # of a video that does not say how many it has
+            break
         images.append(np.asarray(frame.image if frame.lens is None or problem else frame.lens.undistorted(frame.image)))
     source.log_refused(terminal.log)
     if unused:
@@ -61,7 +67,6 @@ def run_calibrate_camera(options: argparse.Namespace, terminal: command.Terminal
     if not images:
         why = "; ".join(problem for problem, _ in source.problems.most_common(3))
         raise BagError(options.frames[0], f"holds no frame that can be read: {why}")
-    by_markers = options.markers is not None
     if by_markers:
         found = calibrate_by_markers(images, options.dish_diameter, *options.markers)
     else:

@@ -156,10 +156,10 @@ def add_frames(parser: argparse.ArgumentParser) -> None:
 
 def add_dish(parser: argparse.ArgumentParser) -> None:
     """Add --region and --rim: where a dish is looked for, and by which edge."""
-    region = "part of the frame to look at [px] (default: the setup's, or all)"
+    region = "part of the frame to look at [px] (default: a setup's, or all)"
     box = ("LEFT", "TOP", "RIGHT", "BOTTOM")
     parser.add_argument("--region", type=number_argument(0.0, 1e5), nargs=4, metavar=box, help=region)
-    rim = "edge of the dish's wall that its diameter is of (default: the setup's, or the inner one, in doubt)"
+    rim = "edge of the dish's wall that its diameter is of (default: a setup's, or the inner one, in doubt)"
     parser.add_argument("--rim", choices=("inner", "outer"), help=rim)
 
 

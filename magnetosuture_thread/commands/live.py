@@ -134,7 +134,7 @@ class GraphInput:
         self.nodes = tuple(name for name in interface.NODES if self.transport or name != "vision_tracker")
         self.processes = interface.PROCESSES if self.transport else self.nodes
         poses = (interface.NEEDLE_POSE, interface.MEASURED_THREAD, interface.THREAD_OBSERVATION)
-        source = (camera, interface.CAMERA_INFO) if camera is not None else poses
+        source = (camera, interface.CAMERA_INFO, interface.NEEDLE_TIP) if camera is not None else poses
         possible = (*source, interface.NEEDLE_COMMAND, interface.MATERIAL)
         counts = given.recording.counts
         self.channels = [interface.SCENE, *(channel for channel in possible if counts.get(channel.recorded))]
@@ -183,6 +183,7 @@ class GraphInput:
         return LiveReplay(
             domain,
             Timeline(self.given.begin, rate),
+            bag_start=self.given.recording.start,
             played=[topic for topic in known if topic.channel in self.channels],
             nodes=len(self.nodes),
             receive=receive,

@@ -30,6 +30,7 @@ from magnetosuture_thread.geometry.orientation import round_trip_heading
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
 from magnetosuture_thread.interface import Channel
 from magnetosuture_thread.messages.reading import (
+    plane_point,
     pose_deviation,
     read_force,
     read_observation,
@@ -136,7 +137,7 @@ class ObservationReader(Iterator[Observation]):
         if recording.camera is not None and self.source == "camera":
             warm_up()
             self._tracker = TrackerSession(setup.vision, setup.scene)
-            own = (recording.camera, interface.CAMERA_INFO)
+            own = (recording.camera, interface.CAMERA_INFO, interface.NEEDLE_TIP)
         possible = (interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL, *CHANGING, *own)
         channels = [channel for channel in possible if recording.counts.get(channel.recorded)]
         earlier = recording.records(CHANGING, duration=given.start) if given.start > 0.0 else ()
@@ -190,6 +191,8 @@ class ObservationReader(Iterator[Observation]):
                 waiting.append(self._pose(record))
             elif record.topic == interface.CAMERA_INFO.recorded:
                 self._take_lens(record, self._tracker)
+            elif record.topic == interface.NEEDLE_TIP.recorded:
+                self._take_tip(record, self._tracker)
             else:
                 waiting.append(self._frame(record, self._tracker))
             while waiting and (len(waiting) > MAX_WAITING_POSES or self._complete(waiting[0])):
@@ -232,6 +235,14 @@ class ObservationReader(Iterator[Observation]):
         except MagnetosutureError as error:
             self.refused[f"{record.topic}: {error}"] += 1
         tracker.set_lens(lens)
+
+    def _take_tip(self, record: RecordedMessage, tracker: TrackerSession) -> None:
+        """Take which end of the needle is its tip, as `vision_tracker` does."""
+        try:
+            taken = min(stamp_of(record), record.time) or record.time
+            tracker.point_at_tip(plane_point(record.decode(), record.topic), taken * 1e-9)
+        except MagnetosutureError as error:
+            self.refused[f"{record.topic}: {error}"] += 1
 
     def _keep(self, record: RecordedMessage) -> None:
         """Keep what belongs to a frame; nothing where it isn't valid."""

@@ -93,12 +93,12 @@ def run_simulate(options: argparse.Namespace, terminal: command.Terminal) -> int
     terminal.log(f"bag: {options.output}")
     command.write_json(options.json, summary.to_json())
     outcome = summary.procedure
-    return command.FAILED if outcome and outcome["state"] in ("not begun", "failed", TOO_SLOW) else command.DONE
+    return command.FAILED if outcome and outcome["state"] != clients.DONE else command.DONE
 
 
 def too_slow(skipped: int, taken: int, rate: float) -> str:
     """Return that a run skipped more frames than `MAX_SKIPPED`, and what to do; empty if it did not."""
-    if skipped <= MAX_SKIPPED * (skipped + taken):
+    if not skipped or skipped < MAX_SKIPPED * (skipped + taken):
         return ""
     remedy = f"try --rate {max(MIN_RATE, 0.5 * rate):g}" if rate > MIN_RATE else "end other programs"
     return f"{skipped} of {skipped + taken} frames skipped; {remedy}"

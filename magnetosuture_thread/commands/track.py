@@ -8,7 +8,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -68,7 +68,8 @@ def run_track(options: argparse.Namespace, terminal: command.Terminal) -> int:
     """Find needle and thread in camera frames, without a graph.
 
     FRAMES are pictures, a folder of them, a video, or a bag. Pictures that are named are searched one by one; the
-    frames of a bag, a video or a folder are followed over time, as the node vision_tracker does.
+    frames of a bag, a video, or a folder of pictures of one size are followed over time, as the node vision_tracker
+    does.
 
     --json writes a list with an entry for each frame: file (for a bag or video, with the stamp), status (tracked,
     lost or searching) and its reason, warning (of the dish's scale and tilt, and of the lens), axis_m (both ends of
@@ -164,7 +165,8 @@ class FrameSource:
     Attributes:
         count: number of frames.
         names: of picture files; empty for a bag or video.
-        is_sequence: whether the frames follow one another in time: those of a bag, a video, or one folder.
+        is_sequence: whether the frames follow one another in time: those of a bag, a video, or one folder of pictures
+            of one size.
         unverified: why any frame of a bag may be wrong; empty if nothing speaks against them.
         problems: why frames that were gone through could not be taken, with their number.
 
@@ -197,12 +199,12 @@ class FrameSource:
             else:
                 self._video = Video(path, options.rate)
                 self._rate, self.count = self._video.rate, self._video.count
-        is_folder = len(paths) == 1 and bool(self._files) and paths[0].is_dir()
+        is_folder = len(paths) == 1 and len(self._files) > 1 and paths[0].is_dir() and _of_one_size(self._files)
         self.is_sequence = is_folder or not self._files
         if options.remap and self._recording is None:
             raise BagError(paths[0], "is no bag, so there is no topic in it to remap")
         if options.rate is not None and not (is_folder or self._video):
-            raise BagError(paths[0], "is no video and no folder, so --rate has no meaning for it")
+            raise BagError(paths[0], "is no video and no folder of frames of one size, so --rate has no meaning for it")
         names = [file.name for file in self._files]
         unique = len(set(names)) == len(names)
         self.names = numbered(names if unique else [str(file) for file in self._files], "{} ({})")
@@ -244,12 +246,12 @@ class FrameSource:
         return FrameFile(name, None, problem, stamp, lens)
 
     def _filmed(self, video: Video) -> Iterator[FrameFile]:
-        index = -1
-        for index, image in enumerate(video.frames()):
-            stamp = index / video.rate
+        found = 0
+        for stamp, image in video.frames():
+            found += 1
             yield FrameFile(f"{self._path.name} {stamp:.6f}", image, "", stamp, self._lens)
-        if index + 1 < self.count:
-            self.problems[f"{self._path} is damaged"] += self.count - index - 1
+        if found < self.count:
+            self.problems[f"{self._path} is damaged"] += self.count - found
 
     def _recorded(self, recording: Recording) -> Iterator[FrameFile]:
         lens: Lens | None = None
@@ -290,6 +292,15 @@ class FrameSource:
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts frame_2 before frame_10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def _of_one_size(files: list[Path]) -> bool:
+    """Return whether pictures may be of one camera, by the first of them."""
+    sizes = set()
+    for file in files[:10]:
+        with suppress(OSError, BagError, InvalidInputError):  # reported when it is its turn
+            sizes.add(_read_picture(file).shape[:2])
+    return len(sizes) < 2
 
 
 def _read_picture(file: Path) -> np.ndarray:

@@ -180,7 +180,10 @@ class SensorSilence:
 
     @classmethod
     def of(cls, times: Array, begin: float, end: float) -> SensorSilence:
-        """Return the gaps between frames, and before the first and after the last, where they are of one clock.
+        """Return the gaps between frames, and before the first and after the last.
+
+        Frames that are not within what is evaluated are of another clock, as of a camera that stamped one with 0; where
+        most are, only the gaps between them tell anything.
 
         Args:
             times: of the frames, since the bag's start [s].
@@ -190,8 +193,9 @@ class SensorSilence:
         times = np.sort(times)
         if len(times) < 2:  # no interval is usual
             return cls(1, end - begin, end - begin, begin) if end > begin else cls()
-        within = begin - 1.0 <= times[0] and times[-1] <= end + 1.0  # else they are of another clock
-        edges = np.concatenate([[begin], times, [end]]) if within else times
+        within = times[(times >= begin - 1.0) & (times <= end + 1.0)]
+        times = within if 2 * len(within) > len(times) else times
+        edges = np.concatenate([[begin], times, [end]]) if times is within else times
         steps = np.diff(edges)
         gaps = steps[steps > SILENT_PERIODS * float(np.median(np.diff(times)))]
         if not len(gaps):
@@ -206,11 +210,11 @@ class MinimumMargin:
 
     Attributes:
         kind: name of the barrier.
-        clearance: as a distance [m].
-        value: least h of all rows at all times, which may be another row's, in the unit of its barrier.
-        node: index.
-        obstacle: index, -1 where there is none.
-        time: since the bag's start [s].
+        clearance: least distance of all rows at all times [m].
+        value: least h of them, which may be another row's, in the unit of its barrier.
+        node: index, of the row that `promised` is of.
+        obstacle: index, the same; -1 where there is none.
+        time: since the bag's start [s], the same.
     """
 
     kind: str
@@ -227,7 +231,7 @@ class MinimumMargin:
 
     @property
     def chord(self) -> float | None:
-        """The clearance of the chord between two nodes where it lies in a shape, as on a round one [m]; else None."""
+        """Clearance of the deepest chord between two nodes, if it lies in a shape, as on a round one [m]; or None."""
         return self.clearance if self.clearance < min(0.0, self.promised) - 1e-9 else None
 
 
@@ -519,12 +523,14 @@ class RunMetrics:
 
     def _lower(self, time: float, margins: Margins) -> None:
         """Lower the minimum of each barrier to that of a frame."""
-        for row in margins.minima:
-            clearance, place = float(row.clearance[0]), (int(row.node[0]), int(row.obstacle[0]), time)
-            found = MinimumMargin(row.barrier, clearance, margins[row.barrier].minimum, *place)
-            held = self._minimum.get(row.barrier, found)
-            lower = found if clearance < held.clearance else held
-            self._minimum[row.barrier] = replace(lower, value=min(found.value, held.value))
+        for rows in filter(len, margins.barriers):
+            at = int(rows.value.argmin()) if rows.barrier in SOLID else rows.closest
+            place = (int(rows.node[at]), int(rows.obstacle[at]), time)
+            found = MinimumMargin(rows.barrier, rows.minimum_clearance, rows.minimum, *place)
+            held = self._minimum.get(rows.barrier, found)
+            lower = found if found.promised < held.promised else held
+            value, clearance = min(found.value, held.value), min(found.clearance, held.clearance)
+            self._minimum[rows.barrier] = replace(lower, value=value, clearance=clearance)
 
     def _take_disturbances(self, time: float, frame: FrameResult) -> None:
         """Add the strongest disturbance of a frame to the event that it belongs to, or as a new one."""

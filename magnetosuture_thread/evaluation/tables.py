@@ -269,7 +269,7 @@ def summary_table(summary: ReplaySummary) -> Table:
         where = f"node {margin.node}" + (f", obstacle {margin.obstacle}" if margin.obstacle >= 0 else "")
         margins.append((f"  {margin.kind}", micrometres(margin.promised), f"{where}, at {margin.time:.2f} s"))
         if margin.chord is not None:
-            margins.append(("    a chord there", micrometres(margin.chord), "between two nodes; no barrier keeps it"))
+            margins.append(("    deepest chord", micrometres(margin.chord), "between two nodes; no barrier keeps it"))
     margins += [
         ("frames in contact", str(summary.contact_frames), _share(summary.contact_frames, summary.predicted)),
         ("maximum stretch", f"{100.0 * summary.stretch:.1e} %", "of a segment"),

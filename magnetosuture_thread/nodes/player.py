@@ -108,6 +108,7 @@ class LiveReplay:
     Args:
         domain: the graph's ROS domain.
         timeline: the simulated time.
+        bag_start: time of the bag's first message [ns].
         played: topics to play.
         nodes: how many nodes there are to be; all follow /clock.
         receive: called with topic, simulated time [ns] and CDR bytes of every output.
@@ -125,13 +126,14 @@ class LiveReplay:
         domain: int,
         timeline: Timeline,
         *,
+        bag_start: int,
         played: Collection[topics.Topic],
         nodes: int,
         receive: Callable[[str, int, bytes], None],
         watch: Callable[[], None],
         log: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._time = timeline
+        self._time, self._bag_start = timeline, bag_start
         self._nodes = nodes
         self._receive = receive
         self._watch = watch
@@ -203,19 +205,20 @@ class LiveReplay:
             progress: called with the time played since the start [s].
         """
         self._time.begin()
-        clock = self._time.start
+        clock = last = reached = self._time.start
         for record in records:
             publisher = self._inputs.get(record.topic)
             if publisher is None:
                 continue
-            if record.time - clock > 1e9 * MAX_SILENCE:
-                clock = self._drain(clock)  # what is under way belongs before the silence
-                begin, end = ((at - self._time.start) * 1e-9 for at in (clock, record.time))
-                self._log(silence_text(begin, end))
-                self._time.skip_to(record.time)
-                clock = record.time
+            if record.time - last > 1e9 * MAX_SILENCE:
+                clock = reached = self._drain(clock)  # what is under way belongs before the silence
+                if clock < record.time:
+                    self._log(silence_text((last - self._bag_start) * 1e-9, (record.time - self._bag_start) * 1e-9))
+                    self._time.skip_to(record.time)
+                    clock = record.time
+            last = record.time
             clock = self._run_clock(clock, record.time)
-            self._publish_clock(record.time)
+            self._publish_clock(max(record.time, reached))
             self._publish(publisher, record)
             progress((record.time - self._time.start) * 1e-9)
         self._drain(clock)

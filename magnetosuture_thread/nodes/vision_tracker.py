@@ -104,7 +104,8 @@ class VisionTrackerNode(ManagedNode[VisionTrackerSettings]):
             self.refuse(error)
         else:
             if self._session is not None:
-                self._session.point_at_tip(place)
+                now, stamp = self.get_clock().now().nanoseconds, reading.nanoseconds(message.header.stamp)
+                self._session.point_at_tip(place, 1e-9 * (min(stamp, now) or now))
 
     def on_watch(self) -> None:
         """Report when no frame has come for too long."""

@@ -59,6 +59,7 @@ class Calibration:
         values: dict[str, Any] = {
             "dish_centre_px": [round(float(value), 3) for value in self.view.centre_px],
             "metres_per_pixel": float(f"{self.view.metres_per_pixel:.7g}"),
+            "scale_error": round(float(self.scale_error), 4),
             "camera_rotation": round(float(self.view.rotation), 6),
         }
         if self.homography is not None:
@@ -139,6 +140,8 @@ def calibrate_by_dish(
     nearest = dishes[int(np.where(kept, np.abs(circles[:, 2] - radius), np.inf).argmin())]
     view = DishView((float(u) + left, float(v) + top), 0.5 * dish_diameter / radius).shrunk(1.0 / factor)
     straight = nearest.straightening()
+    moved = int((~still[kept].any(axis=0)).sum())
+    elsewhere = f"{moved} of {len(dishes)} frames show the dish elsewhere, and are left out" if moved else ""
     return Calibration(
         view,
         int(kept.sum()),
@@ -147,7 +150,7 @@ def calibrate_by_dish(
         dish_diameter,
         None if straight is None else scaled_homography(scaled_homography(straight, 1.0, -left, -top), 1.0 / factor),
         scale_error=nearest.scale_error,
-        remark=nearest.warning,
+        remark="; ".join(filter(None, (nearest.warning, elsewhere))),
     )
 
 

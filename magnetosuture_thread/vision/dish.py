@@ -566,7 +566,8 @@ def see_dish(
         # Only a dark frame whose negative shows the dish has a dark floor: others are just dark.
         dark = middle(gray[::8, ::8]) < DARK_FLOOR and not _fits(find_dish(gray, diameter), fixed)
         dark = dark and _fits(find_dish(255 - gray, diameter), fixed)
-        return FoundDish(fixed, dark, homography=settings.homography())
+        error = settings.scale_error
+        return FoundDish(fixed, dark, None, error, remark=_scale_remark(error), homography=settings.homography())
     for dark_field in (False, True):
         if dark_field:
             gray = 255 - gray
@@ -576,7 +577,7 @@ def see_dish(
         radius = 0.5 * diameter / view.metres_per_pixel
         circle = Ellipse(view.centre_px, radius, radius, 0.0)
         rings = find_rings(image, circle)
-        edge = circle if not settings.rim else inner_ring(rings, outer=settings.rim == "outer")
+        edge = inner_ring(rings, outer=settings.rim == "outer") if settings.rim and rings else circle
         if edge is circle:
             found = _by_dark_rim(gray, view, rings, settings, diameter)
         else:
@@ -635,25 +636,27 @@ def _is_confirmed(tilt: Tilt, radius: float, rings: list[Ring]) -> bool:
     return False
 
 
+def _scale_remark(error: float) -> str:
+    """Return what a user should know of a scale of a standard deviation, given as a share; empty if nothing."""
+    remedy = "name the wall's edge by rim, or measure metres_per_pixel"
+    return f"the scale is known to {100.0 * error:.0f} % only: {remedy}" if error > RING_ERROR else ""
+
+
 def _with_given(found: FoundDish, settings: VisionTrackerSettings) -> FoundDish | None:
     """Return a dish with what is given of its view, as by a calibration; None if it is another one."""
     centre, scale = settings.dish_centre_px, settings.metres_per_pixel
     view = replace(found.view, rotation=settings.camera_rotation)
     remark = ""
     if not (centre or scale):
-        if found.scale_error > RING_ERROR:
-            percent = f"{100.0 * found.scale_error:.0f} %"
-            remark = f"the scale is known to {percent} only: name the wall's edge by rim, or give metres_per_pixel"
-        return replace(found, view=view, remark=remark)
+        return replace(found, view=view, remark=_scale_remark(found.scale_error))
     error = found.scale_error
     if scale:
         apart = abs(view.metres_per_pixel / scale - 1.0)
         if apart > 1.0 - INNER_RADIUS:
             return None
         if apart > max(error, GIVEN_ERROR):
-            by_dish = f"{1e3 * view.metres_per_pixel:.4g} mm by the dish's diameter"
-            remark = f"metres_per_pixel is {1e3 * scale:.4g} mm, which is used, but {by_dish}: one of them is wrong"
-        error = apart if remark else 0.0
+            remark = f"metres_per_pixel, which is used, is {apart:.0%} off the dish's diameter: one of them is wrong"
+        error = apart if remark else settings.scale_error
         view = replace(view, metres_per_pixel=scale)
     if centre:
         view = replace(view, centre_px=(centre[0], centre[1]))
@@ -724,7 +727,8 @@ class DishWatch:
         if self._fixed is not None or self.found is None:
             self.found = self._search(image)
             if self.found is None:
-                return NO_DISH, image
+                given = "; or correct metres_per_pixel, by which the dish has another size"
+                return NO_DISH + (given if self._settings.metres_per_pixel else ""), image
             return "", self.found.prepared(image)
         prepared = self.found.prepared(image)
         gray, view = measured_channel(prepared), self.found.view

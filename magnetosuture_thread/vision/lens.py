@@ -76,8 +76,8 @@ class Lens:
 
     @property
     def is_straight(self) -> bool:
-        """Whether it has no distortion."""
-        return not any(self.coefficients)
+        """Whether it has no distortion; an equidistant lens without coefficients bends straight lines too."""
+        return not any(self.coefficients) and self.model in ("", *COEFFICIENTS) and self.model != "equidistant"
 
     def problem_with(self, shape: tuple[int, ...]) -> InvalidInputError | None:
         """Return why frames of a shape (rows, columns) are not of this camera; None if they are."""

@@ -62,6 +62,12 @@ class VisionTrackerSettings(Configuration):
     metres_per_pixel: float = quantity(
         0.0, "the image's scale; 0: from the dish's diameter", unit="m", minimum=0.0, maximum=0.01
     )
+    scale_error: float = quantity(
+        0.0,
+        "standard deviation of metres_per_pixel as a share of it, as calibrate-camera measures it",
+        minimum=0.0,
+        maximum=0.5,
+    )
     rim: str = quantity(
         "",
         "edge of the dish's wall that the scene's diameter is of; not given: the inner one, in doubt by the others",

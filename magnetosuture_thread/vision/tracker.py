@@ -147,7 +147,7 @@ class VisionTracker:
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
         self._given = settings
         self._scene = scene
-        self._tip: Points | None = None
+        self._tip: tuple[Points, float] | None = None  # place, and the last time that it is of
         self._lens: Lens | None = None
         self._mask: tuple[Any, SceneMask | None] = ((), None)  # what it was made for, and the mask
         self._shape: tuple[int, ...] = ()
@@ -191,14 +191,18 @@ class VisionTracker:
         self._anew: list[_Pose] = []
         self._thread: Points = np.empty((0, 2))  # in pixels, with the needle's ends
 
-    def point_at_tip(self, place: Points) -> None:
-        """Take a point near the needle's tip, shape (2,) [m], as a person gives it.
+    def point_at_tip(self, place: Points, until: float = math.inf) -> None:
+        """Take a point near the needle's tip, as a person gives it.
 
         It is used in the next frame in which a needle is found, where nothing else tells its direction, and if an end
         of it is nearer to the point than a third of its length. From then on the direction is carried from frame to
         frame as long as the needle cannot have turned round unseen.
+
+        Args:
+            place: shape (2,) [m].
+            until: time of the last frame that it is of [s], by the clock of the frames.
         """
-        self._tip = np.array(place, dtype=float)
+        self._tip = np.array(place, dtype=float), until
         self._last, self._anew = None, []
 
     def look(self, image: np.ndarray) -> Track:
@@ -334,9 +338,11 @@ class VisionTracker:
             picture = self._picture(image, None if whole else self._region(image, view, time))
             toward = self._toward(view, time)
             needles, refused = find_needles(picture, size, toward)
-            if toward is None and (pointed := self._pointed_at(needles, picture)) is not None:
+            if toward is None and (pointed := self._pointed_at(needles, picture, time)) is not None:
                 needles, _ = find_needles(picture, size, pointed.direction_px)
                 needles = [each for each in needles if math.dist(each.tip_px, pointed.tip_px) < 0.5 * each.length_px]
+            elif toward is not None and whole and not self._near_before(needles, picture, time):
+                needles, refused = find_needles(picture, size, None)  # it is elsewhere, and may have turned round
             needles = [self._as_before(needle, picture, time) for needle in needles]
             within = [needle for needle in needles if self._fits(_pose(needle, picture, time), last)]
             if len(within) == 1 and not (whole and not within[0].heading_known):
@@ -371,19 +377,31 @@ class VisionTracker:
             return None, None, True, "a needle farther from the last one than it can move"
         return None, None, True, f"a needle seen in {len(self._anew)} of {settings.confirm_frames} frames"
 
+    @property
+    def _before(self) -> _Pose | None:
+        """The last pose, or that which the next frames have to agree with; None without any."""
+        return self._last or (self._anew[-1] if self._anew else None)
+
+    def _near_before(self, needles: list[MeasuredNeedle], picture: Picture, time: float) -> bool:
+        """Say whether any needle lies where the one before can be."""
+        return any(self._fits(_pose(needle, picture, time), self._before) for needle in needles)
+
     def _toward(self, view: DishView, time: float) -> Points | None:
         """Return where the needle must point, u right and v down; None where it may have turned round unseen."""
-        before = self._last or (self._anew[-1] if self._anew else None)
+        before = self._before
         if before is None or self._most_turned(time - before.time) > 0.5 * math.pi:
             return None
         _, angle = before.at(time)
         return view.directions_to_pixels(np.array([math.cos(angle), math.sin(angle)]))
 
-    def _pointed_at(self, needles: list[MeasuredNeedle], picture: Picture) -> MeasuredNeedle | None:
+    def _pointed_at(self, needles: list[MeasuredNeedle], picture: Picture, time: float) -> MeasuredNeedle | None:
         """Return the needle that a person points at, with its tip there; see `point_at_tip`."""
         if self._tip is None or not needles:
             return None
-        tip, self._tip = picture.view.to_pixels(self._tip), None
+        (place, until), self._tip = self._tip, None
+        if time > until:
+            return None
+        tip = picture.view.to_pixels(place)
         ways = [way for needle in needles if not needle.heading_known for way in (needle, needle.reversed())]
         near = [way for way in ways if math.dist(way.tip_px, tip) < TIP_REACH * way.length_px]
         return min(near, key=lambda way: math.dist(way.tip_px, tip), default=None)
@@ -590,7 +608,7 @@ class TrackerSession:
     """
 
     def __init__(self, settings: VisionTrackerSettings, scene: Scene) -> None:
-        self._tracker = VisionTracker(settings, scene)
+        self._tracker, self._tip_age = VisionTracker(settings, scene), settings.forget_after
         self._repetition = RepetitionDetector()
         self.frames = self.tracked = 0
 
@@ -603,9 +621,9 @@ class TrackerSession:
         """Take another scene; see `VisionTracker.set_scene`."""
         self._tracker.set_scene(scene)
 
-    def point_at_tip(self, place: Points) -> None:
-        """Take a point near the needle's tip; see `VisionTracker.point_at_tip`."""
-        self._tracker.point_at_tip(place)
+    def point_at_tip(self, place: Points, taken: float) -> None:
+        """Take a point near the needle's tip as of a time [s]; see `VisionTracker.point_at_tip`."""
+        self._tracker.point_at_tip(place, taken + self._tip_age)
 
     def set_lens(self, lens: Lens | None) -> None:
         """Take the camera's lens; see `VisionTracker.set_lens`."""

@@ -31,7 +31,7 @@ class Video:
     """
 
     def __init__(self, path: Path, rate: float | None = None) -> None:
-        self._path = path
+        self._path, self._is_timed = path, rate is None
         video = cv2.VideoCapture(str(path))
         if not video.isOpened():
             raise BagError(path, "cannot be read as a video; expected one that is whole, and that OpenCV can decode")
@@ -43,9 +43,15 @@ class Video:
             raise BagError(path, f"has frames of {width} x {height} pixels; expected at most {MAX_PIXELS} pixels")
         self.count = max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
 
-    def frames(self) -> Iterator[np.ndarray]:
-        """Go through the frames that can be decoded, their pixels as the sensor has them, as those of pictures."""
+    def frames(self) -> Iterator[tuple[float, np.ndarray]]:
+        """Go through the frames that can be decoded, their pixels as the sensor has them, as those of pictures.
+
+        Each has the time since the first one [s], that of the file where no rate was given: it may vary.
+        """
         video = cv2.VideoCapture(str(self._path))
         video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        number = 0
         while (taken := video.read())[0]:
-            yield np.asarray(taken[1])
+            told = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
+            yield told if self._is_timed and told > 0.0 else number / self.rate, np.asarray(taken[1])
+            number += 1

@@ -26,6 +26,8 @@ from magnetosuture_thread.interface import (
     MEASURED_THREAD,
     NEEDLE_COMMAND,
     NEEDLE_POSE,
+    SCENE,
+    is_rectified,
 )
 from test.bags.bags import make, stamped
 
@@ -163,7 +165,15 @@ def test_the_lens_of_frames_that_are_rectified_is_left_out(topic: str, tmp_path:
         bag_of(tmp_path / "raw", ("/correct/image", image(IMAGE)), lens, remap={"/correct/image": "/camera/image_raw"})
     )
     assert raw.rectified == ""
+    assert not is_rectified("/rig_rect/camera/image_raw")
     assert len(list(raw.records([CAMERA_INFO]))) == 1
+
+
+def test_a_scene_of_a_rig_with_a_prefix_is_read_in_our_frame(tmp_path: Path):
+    scene = make("magnetosuture_msgs/msg/Scene", stamped(1, "left/dish"))
+    recording = Recording(bag_of(tmp_path, (SCENE.recorded, scene)), dish_frame="left/dish")
+    assert only(recording, SCENE).header.frame_id == "dish"
+    assert only(Recording(Bag(tmp_path / "bag")), SCENE).header.frame_id == "left/dish"
 
 
 def test_poses_of_another_frame_are_transformed(tmp_path: Path):

@@ -27,12 +27,15 @@ from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.messages.packing import packed_compressed_image
 from magnetosuture_thread.messages.reading import stamp_of
 from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.scene import Scene, SceneShape
 from magnetosuture_thread.setups import read_setup
 from magnetosuture_thread.vision.images import decode_image
-from test.bags.bags import changed, make
+from test.bags.bags import changed, make, stamped
+from test.vision.scenes import rod
 
 SETUP = read_setup("petri_35mm_polyamide")
 SCENE, POSE, FRAME = interface.SCENE, interface.NEEDLE_POSE.recorded, interface.COMPRESSED_IMAGE.recorded
@@ -203,6 +206,23 @@ def test_stamps_that_go_back_are_refused_and_a_time_that_goes_back_by_more_begin
     assert summary.predicted == 30
     assert summary.error_seen is not None
     assert summary.error_seen["maximum"] < 1.0
+
+
+def test_a_recorded_point_at_the_tip_gives_a_needle_without_a_thread_its_direction(tmp_path: Path):
+    ends, random = np.array([[-0.004, 0.002], [0.003, 0.002]]), np.random.default_rng(0)
+    tip = make("geometry_msgs/msg/PointStamped", stamped(1), make("geometry_msgs/msg/Point", *ends[1]))
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(FRAME, interface.COMPRESSED_IMAGE.type_name)
+        bag.add_topic(interface.NEEDLE_TIP.recorded, interface.NEEDLE_TIP.type_name)
+        for index in range(12):
+            at = 10**9 + index * 10**9 // 30
+            noisy = np.clip(rod(ends) + random.normal(0.0, 2.0, (480, 640, 3)), 0, 255).astype(np.uint8)
+            bag.write(FRAME, at, packed_compressed_image(at, encode_jpeg(noisy, 95)))
+            if index == 4:
+                bag.write_message(interface.NEEDLE_TIP.recorded, at, tip)
+    found = list(observed(tmp_path / "bag"))
+    assert [bool(len(each.tail)) for each in found] == [False] * 7 + [True] * 5
+    assert found[-1].tail == pytest.approx(ends[0], abs=2e-4)
 
 
 def test_a_silence_is_in_every_table(pose_bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

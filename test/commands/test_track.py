@@ -101,7 +101,7 @@ def test_a_part_of_a_frame_is_looked_at_and_a_bright_needle_is_found(tmp_path: P
     file = tmp_path / "seen.json"
     given = ["--region", "640", "0", "1280", "480", "--tip", *map(str, ends[1]), "--json", str(file)]
     for options, status in ((["--needle-brightness", "0.9"], "tracked"), ([], "lost")):
-        assert cli.main(["track", str(tmp_path / "pair.png"), *given, *options]) == 0
+        assert cli.main(["track", str(tmp_path / "pair.png"), *given, *options]) == (status != "tracked")
         (row,) = json.loads(file.read_text())
         assert row["dish_centre_px"] == pytest.approx([962.0, 238.0], abs=0.5)
         assert row["status"] == status
@@ -109,7 +109,7 @@ def test_a_part_of_a_frame_is_looked_at_and_a_bright_needle_is_found(tmp_path: P
     calibrated = ["calibrate-camera", str(tmp_path / "pair.png"), *given[:5], "--dish-diameter", "0.035"]
     assert cli.main([*calibrated, "--output", str(camera)]) == 0
     again = ["--setup", str(camera), "--scene", "dish_35mm", "--json", str(file)]
-    assert cli.main(["track", str(tmp_path / "pair.png"), *again]) == 0
+    assert cli.main(["track", str(tmp_path / "pair.png"), *again]) == 1  # the needle is bright
     assert json.loads(file.read_text())[0]["dish_centre_px"] == pytest.approx([962.0, 238.0], abs=0.5)
 
 
@@ -156,6 +156,17 @@ def test_a_folder_is_followed_over_time_in_the_order_of_its_numbers(
     assert "is read as a video of 15 frames/s" in " ".join(capsys.readouterr().out.split())
     assert cli.main(["track", str(tmp_path / "frames" / "frame_1.png"), "--rate", "15"]) == 1
     assert "--rate has no meaning" in error_of(capsys)
+
+
+def test_pictures_of_different_sizes_in_a_folder_are_searched_one_by_one(tmp_path: Path):
+    (tmp_path / "photos").mkdir()
+    for name, size in (("a.png", (640, 480)), ("b.png", (960, 720))):
+        image = cv2.imread(str(next(SAMPLES.glob("*.png"))))
+        assert image is not None
+        cv2.imwrite(str(tmp_path / "photos" / name), cv2.resize(image, size))
+    file = tmp_path / "seen.json"
+    assert cli.main(["track", str(tmp_path / "photos"), "--json", str(file)]) == 0
+    assert [(row["status"], row["stamp_s"]) for row in json.loads(file.read_text())] == [("tracked", None)] * 2
 
 
 def test_a_video_is_followed_over_time_and_one_that_is_cut_off_is_reported(

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, ViewportSize, expect
+from playwright.sync_api import Browser, Page, Position, ViewportSize, expect
 
 from test.console.conftest import ServedConsole
 from test.console.scene import TAIL, estimated_state, forecast_state, picture, state
@@ -112,7 +112,7 @@ def test_a_click_tells_which_end_of_the_needle_is_its_tip(operator: Operator):
     scale, ratio = float(dish.get_attribute("data-scale") or 0), operator.page.evaluate("devicePixelRatio")
     u, v = (float(entry) / ratio for entry in (dish.get_attribute("data-centre") or "").split(","))
     tip = (TAIL[0] + 0.007, TAIL[1])
-    place = {"x": u + tip[0] * scale / ratio, "y": v - tip[1] * scale / ratio}
+    place: Position = {"x": u + tip[0] * scale / ratio, "y": v - tip[1] * scale / ratio}
     dish.click(position=place)  # without control
     assert operator.served.graph.tips == []
     operator.take_control()

@@ -14,7 +14,7 @@ from magnetosuture_thread.evaluation.metrics import (
     target_points,
 )
 from magnetosuture_thread.evaluation.page import thinned
-from magnetosuture_thread.thread.margins import Margins
+from magnetosuture_thread.thread.margins import BarrierMargins, Margins
 from magnetosuture_thread.thread.prediction import Prediction
 from test.evaluation.runs import both, margins
 
@@ -31,6 +31,16 @@ def test_a_barrier_of_a_user_has_a_column_and_a_minimum_like_the_others():
     assert run.series.column("margin_tip_keep_in") == pytest.approx([np.nan, -0.1, 0.2], nan_ok=True)
     assert list(run.minimum_margins) == ["obstacle", "tip_keep_in"]
     assert run.minimum_margins["tip_keep_in"].clearance == -0.1
+
+
+def test_a_minimum_margin_is_of_one_row_and_the_deepest_chord_of_all():
+    """The chord at node 7 is deep at first; later node 3 itself is in the shape."""
+    run = RunMetrics(1.0)
+    for k, (node, value, clearance) in enumerate(((7, 2.0, -15.0), (3, -3.0, -5.0)), 1):
+        row = np.array([node], np.uint32), np.zeros(1, np.int32), np.array([value]), np.array([clearance])
+        run.add(FrameResult(k * 10**9, vertices=STRAIGHT, margins=Margins((BarrierMargins("obstacle", *row),))))
+    least = run.minimum_margins["obstacle"]
+    assert (least.promised, least.node, least.time, least.chord) == (-3.0, 3, 2.0, -15.0)
 
 
 def test_of_a_run_numbers_are_kept_and_the_worst_in_full():
@@ -94,6 +104,7 @@ def test_the_error_is_of_the_nodes_that_are_known_and_none_of_less_than_half():
         ),
         (np.arange(100.0, 200.0, 0.1), SensorSilence(2, 260.1, 160.1, 199.9)),
         (np.arange(0.0, 100.0, 0.1) + 1e9, SensorSilence()),  # of another clock
+        (np.concatenate([np.arange(0.0, 360.0, 0.1), [-1.7e9]]), SensorSilence()),  # a frame stamped 0
         (np.array([3.0]), SensorSilence(1, 360.0, 360.0, 0.0)),
     ],
 )

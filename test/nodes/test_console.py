@@ -8,6 +8,7 @@ import re
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import cv2
 import numpy as np
@@ -117,11 +118,16 @@ def report(names: list[str], text: str = "") -> DiagnosticArray:
     )
 
 
+def known_part(console: ConsoleGraph, name: str) -> object:
+    """Return a part of what the page knows."""
+    return console.state()[name]
+
+
 def test_the_axis_of_a_needle_is_told_and_a_point_at_its_tip_is_published(graph, console):
     tips, tail = graph.listen(topics.NEEDLE_TIP), np.array([0.002, -0.001])
     for deviation, known, unknown in ((10.0, "axis", "needle"), (0.1, "needle", "axis"), (np.inf, "axis", "needle")):
         pose = wire.pose_message(graph.now(), tail, np.array([1.0, 0.0]), np.diag([1e-9, 1e-9, deviation**2]))
-        tell(graph, topics.NEEDLE_POSE, pose, lambda known=known: console.state()[known], known)
+        tell(graph, topics.NEEDLE_POSE, pose, partial(known_part, console, known), known)
         assert console.state()[known]["tail"] == pytest.approx(tail)
         assert console.state()[unknown] is None
 

@@ -10,6 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Path
 from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import RecordedMessage
 from magnetosuture_thread.errors import GraphError
@@ -71,22 +72,33 @@ def test_losses_are_counted_by_the_way_on_which():
 
 
 def test_a_silence_of_54_years_is_left_out_and_named(graph, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(player, "QUIET", 0.1)
+    monkeypatch.setattr(player, "QUIET", 1.5)
+    clocks = list[int]()
+    graph.probe.create_subscription(Clock, "/clock", lambda at: clocks.append(at.clock.sec), 1000)
     played, logged, line = [topics.MEASURED_THREAD], list[str](), Timeline(0, 5.0)
     live = LiveReplay(
-        graph.domain, line, played=played, nodes=1, receive=lambda *_: None, watch=lambda: None, log=logged.append
+        graph.domain,
+        line,
+        bag_start=-(10**9),
+        played=played,
+        nodes=1,
+        receive=lambda *_: None,
+        watch=lambda: None,
+        log=logged.append,
     )
     data = serialize_message(Path())
-    times = [0, 10**8, 1_700_000_000_200_000_000, 1_700_000_000_300_000_000]
+    # The last silence, of 5.2 s, is shorter than what the replay waits for answers at this rate.
+    times = [0, 10**8, 1_700_000_000_200_000_000, 1_700_000_000_300_000_000, 1_700_000_005_500_000_000]
     try:
         live.play([RecordedMessage("/thread/measured", "nav_msgs/msg/Path", at, data) for at in times], lambda at: None)
     finally:
         live.close()
-    assert live.losses.played["thread/measured"] == 4
+    assert live.losses.played["thread/measured"] == 5
     assert line.now() >= times[-1]
-    assert [text.rpartition(": ")[2] for text in logged] == [
-        "a live replay leaves this out, --start 1700000000.200 begins after it"
-    ]
+    (first, *_) = logged
+    assert first.startswith("no message for 1700000000.1 s from 1.100 s on")
+    assert first.endswith("--start 1700000001.200 begins after it")
+    assert clocks == sorted(clocks)
 
 
 def test_a_graph_in_which_nobody_hears_an_input_is_not_complete(graph, monkeypatch: pytest.MonkeyPatch):
@@ -100,6 +112,7 @@ def test_a_graph_in_which_nobody_hears_an_input_is_not_complete(graph, monkeypat
     live = LiveReplay(
         graph.domain,
         Timeline(10**9, 5.0),
+        bag_start=10**9,
         played=[topics.NEEDLE_POSE, topics.MEASURED_THREAD],
         nodes=1,
         receive=lambda topic, time, data: None,

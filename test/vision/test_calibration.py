@@ -22,6 +22,7 @@ from magnetosuture_thread.vision.calibration import (
     calibrate_by_markers,
     measure_needle_length,
 )
+from magnetosuture_thread.vision.dish import see_dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import SCENE, VIEW, Pose, render
@@ -68,6 +69,19 @@ def test_the_tracker_and_the_calibration_find_the_same_dishes(name: str):
             assert found.view.centre_px == pytest.approx(seen.centre_px, abs=0.01)
             assert found.view.metres_per_pixel == pytest.approx(seen.metres_per_pixel, rel=1e-4)
             assert found.scale_error == track.scale_error > 0.0
+
+
+def test_what_is_not_sure_of_a_calibration_is_said(tmp_path: Path):
+    frames = [render(Pose(np.array([0.001 * index, 0.0]), 0.3)) for index in range(10)]
+    moved = [np.roll(frame, 10, axis=1) if index > 5 else frame for index, frame in enumerate(frames)]
+    found = calibrate_by_dish(moved, 0.035)
+    assert "4 of 10 frames show the dish elsewhere" in found.remark
+    assert found.view.centre_px[0] == pytest.approx(322.0, abs=0.3)
+    (tmp_path / "camera.yaml").write_text(replace(found, scale_error=0.07).to_yaml())
+    settings = load_setup(tmp_path / "camera.yaml", (VisionTrackerSettings,))["vision_tracker"]
+    assert settings.scale_error == 0.07
+    strip = np.random.default_rng(0).integers(0, 255, (100, 1000), dtype=np.uint8)
+    assert see_dish(strip, VisionTrackerSettings(rim="outer"), 0.035) is None
 
 
 def test_dishes_that_differ_or_are_missing_are_refused():

@@ -75,6 +75,7 @@ def test_in_large_frames_the_lens_is_shrunk_with_them():
         (SIZE, "plumb_bob", (-0.2, 0, 0, 0, 0), (0.0,) * 9, "above 0"),
         (SIZE, "plumb_bob", (-0.2, 0, 0, 0, 0), (*MATRIX[:2], np.inf, *MATRIX[3:]), "nine finite numbers"),
         (SIZE, "plumb_bob", (-0.2, 0, 0), MATRIX, "3 coefficients, expected 4 or 5 of plumb_bob"),
+        (SIZE, "omni", (0.0,) * 4, MATRIX, "plumb_bob, rational_polynomial, equidistant"),
         (SIZE, "division", (-0.2,), MATRIX, "plumb_bob, rational_polynomial, equidistant"),
         (SIZE, "plumb_bob", (1e6, 0, 0, 0, 0), MATRIX, "that can be undone"),
         (SIZE, "plumb_bob", (-3.0, 0, 0, 0, 0), MATRIX, "that can be undone"),
@@ -105,7 +106,23 @@ def test_a_scale_that_does_not_fit_the_dish_is_warned_of_without_a_needle_too():
     settings = VisionTrackerSettings(metres_per_pixel=1.06 * VIEW.metres_per_pixel)
     found = VisionTracker(settings, SCENE).look(render(Pose(np.array([0.5, 0.5]), 0.3)))
     assert found.reason.startswith("no needle")
-    assert found.warning.startswith("metres_per_pixel is 6 % off")
+    assert found.warning.startswith("metres_per_pixel, which is used, is 6% off the dish's diameter")
+
+
+def test_the_doubt_of_a_calibrated_scale_is_stated():
+    settings = VisionTrackerSettings(
+        dish_centre_px=VIEW.centre_px, metres_per_pixel=VIEW.metres_per_pixel, scale_error=0.07
+    )
+    found = VisionTracker(settings, SCENE).look(render(Pose(np.array([0.008, 0.0]), 0.3)))
+    assert found.scale_error == 0.07
+    assert found.warning.startswith("the scale is known to 7 % only")
+    assert found.covariance[0, 0] > (0.07 * 0.008) ** 2
+
+
+def test_an_equidistant_lens_without_coefficients_is_not_straight():
+    lens = Lens(SIZE, "equidistant", (0.0,) * 4, MATRIX)
+    assert not lens.is_straight
+    assert Lens(SIZE, "", (), MATRIX).is_straight
 
 
 def test_a_calibration_file_is_read(tmp_path: Path):

@@ -131,3 +131,28 @@ def test_a_point_far_from_both_ends_and_one_that_was_used_tell_nothing():
         tracker.point_at_tip(view.to_dish(place))
         assert tracker.look(image).state is state
         assert tracker.look(image).reason == UNDIRECTED
+
+
+def test_a_rod_elsewhere_may_have_turned_round_unseen_and_has_no_direction():
+    image, ends, told = Rod(4).drawn()
+    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+    view = tracker.look(image).view
+    assert view is not None
+    tracker.point_at_tip(view.to_dish(ends[1]))
+    frames = [tracker.track(Rod(4, turned=1e-6 * index).drawn()[0], index / RATE) for index in range(9)]
+    assert frames[-1].state is State.TRACKED
+    half_turn = cv2.getRotationMatrix2D(view.centre_px, 180.0, 1.0)
+    turned = cv2.warpAffine(image, half_turn, image.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    after = [tracker.track(turned, index / RATE) for index in range(9, 20)]
+    assert all(seen.state is not State.TRACKED for seen in after)
+    assert after[-1].reason == UNDIRECTED
+
+
+def test_a_point_is_of_its_time():
+    image, ends, told = Rod(4).drawn()
+    tracker = VisionTracker(told, Scene(dish=Dish(DIAMETER)))
+    view = tracker.look(image).view
+    assert view is not None
+    for time, until, reason in ((2.0, 1.9, UNDIRECTED), (2.1, 2.2, "a needle seen in 1 of 3 frames")):
+        tracker.point_at_tip(view.to_dish(ends[1]), until)
+        assert tracker.track(image, time).reason == reason
