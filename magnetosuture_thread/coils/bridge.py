@@ -142,7 +142,7 @@ class CoilBridge:
         self.prediction_monitor, self.stamp_ages = PredictionMonitor(settings.prediction_timeout), StampAges()
         self._observer = MotionObserver(kinematics, self._hold, settings.max_speed)
         slack_ratio = needle.drag / needle.slack_drag
-        self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio, 0.5 * kinematics.chord)
+        self._follow = FollowMonitor(settings.pose_uncertainty, slack_ratio)
         self._settings, self._gains, self._allocation = settings, settings.gain_estimator(), settings.allocation()
         self._coils = CertifiedAllocation(self._allocation, settings.max_speed)
         self._filter: NeedleSafetyFilter | None = None

@@ -116,7 +116,10 @@ class MotionObserver:
             return None
         interval, before = stamp - last[0], last[2]
         turn = math.atan2(before[0] * e[1] - before[1] * e[0], float(before @ e))
-        return MotionStep(stamp, interval, interval * applied[2:4], interval * applied[4], middle - last[1], turn)
+        swing = 0.5 * self._needle.chord * (e - before)
+        return MotionStep(
+            stamp, interval, interval * applied[2:4], interval * applied[4], middle - last[1], turn, swing
+        )
 
     def apply(self, now: float, applied: Vector, intended: Vector, turn_rate: float) -> None:
         """Register what currents are set for from a time on.
@@ -178,6 +181,7 @@ class MotionStep(NamedTuple):
         expected_turn: angle by which the field was set to turn the needle [rad].
         measured: displacement of the middle, shape (2,) [m].
         measured_turn: change of the heading [rad].
+        swing: displacement of the middle by that turn, where it is about the tail, shape (2,) [m].
     """
 
     stamp: float
@@ -186,6 +190,7 @@ class MotionStep(NamedTuple):
     expected_turn: float
     measured: Vector
     measured_turn: float
+    swing: Vector
 
 
 class FollowMonitor:
@@ -193,16 +198,17 @@ class FollowMonitor:
 
     With the expected displacement E and the measured one M of the needle's middle, the poses are not the needle's where
 
-        |M - s E| > max(MAX_ERROR d, MAX_ERROR_SHARE |E|) + b    for every s from 0 (held) to the slack ratio,
+        |M - s E - r B| > max(MAX_ERROR d, MAX_ERROR_SHARE |E|)    for every s from 0 (held) to the slack ratio,
+                                                                   and every r from 0 to 1,
 
     with the minimum distance d, or where the heading turns `MAX_TURN` farther than the field; both within
-    `MIN_WINDOW`. A needle that its thread holds turns about its tail: b is half of its chord times the turn that field
-    and heading share. The needle stands still where
+    `MIN_WINDOW`. A needle that its thread holds turns about its tail: B is the displacement of its middle by the turn
+    that field and heading share. The needle stands still where
 
         M . E < MIN_SHARE |E|^2
 
-    in the shortest window of at least `MIN_WINDOW` with |E| >= d, and is not the needle where |M| > STILL_SHARE |E|
-    within twice that time. A taut thread may hold it: the field then probes it
+    in the shortest window of at least `MIN_WINDOW` with |E| >= d, and is not the needle where
+    |M| > STILL_SHARE |E| + |B| within twice that time. A taut thread may hold it: the field then probes it
     by a small turn, which a held needle follows and a pose that is not the needle's does not. A turn of the field as
     commanded in that window serves as well. Pure: times come in, in seconds of the stamps' clock.
 
@@ -211,11 +217,10 @@ class FollowMonitor:
     Args:
         min_distance: shorter displacements are not judged [m].
         slack_ratio: how many times as fast as expected the needle moves when the thread is slack.
-        lever: half of the needle's chord [m].
     """
 
-    def __init__(self, min_distance: float, slack_ratio: float = 1.0, lever: float = 0.0) -> None:
-        self._min_distance, self._slack_ratio, self._lever = max(min_distance, MIN_DISTANCE), slack_ratio, lever
+    def __init__(self, min_distance: float, slack_ratio: float = 1.0) -> None:
+        self._min_distance, self._slack_ratio = max(min_distance, MIN_DISTANCE), slack_ratio
         self._steps: deque[MotionStep] = deque()
         self._probed: float | None = None  # stamp of the pose that began the probe
         self._turned = 0.0  # by which the field was turned since
@@ -259,13 +264,16 @@ class FollowMonitor:
             self._steps.popleft()
         if self._probed is not None:
             return self._judge_probe(step.stamp, self._probed)
-        expected, measured, error, span = np.zeros(2), np.zeros(2), 0.0, 0.0
-        field_turn = turn = 0.0
+        expected, measured, swing, about_tail = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
+        field_turn = turn = error = span = 0.0
         for entry in reversed(self._steps):
             expected, measured = expected + entry.expected, measured + entry.measured
             if span < MIN_WINDOW:
                 field_turn, turn = field_turn + entry.expected_turn, turn + entry.measured_turn
-                error = self._error(expected, measured)
+                swing = swing + entry.swing
+                shared = min(1.0, max(0.0, field_turn / turn)) if turn else 0.0
+                about_tail = shared * swing
+                error = self._error(expected, measured, about_tail)
             span, distance = span + entry.interval, math.hypot(*expected)
             if span >= MIN_WINDOW and distance >= min_distance:
                 break
@@ -277,23 +285,31 @@ class FollowMonitor:
             f"needle does not follow: {1e3 * distance:.2g} mm expected, {1e3 * moved:.2g} mm measured in {span:.2g} s"
         )
         is_straight = abs(field_turn) < 0.5 * MAX_TURN  # else the direction of E depends on when the needle turned
-        about_tail = self._lever * max(0.0, min(field_turn * math.copysign(1.0, turn), abs(turn)))
-        if is_straight and error > max(MAX_ERROR * min_distance, MAX_ERROR_SHARE * distance) + about_tail:
+        if is_straight and error > max(MAX_ERROR * self._min_distance, MAX_ERROR_SHARE * distance):
             return f"{text}, elsewhere"
         enough = span >= MIN_WINDOW and distance >= min_distance and bool(step.expected.any())
         if not enough or measured @ expected >= MIN_SHARE * distance**2:
             return ""
-        if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance + about_tail:
+        if is_straight and span <= 2.0 * MIN_WINDOW and moved > STILL_SHARE * distance + math.hypot(*about_tail):
             return f"{text}, elsewhere"
         self._suspicion, self._probed, self._turned = text, step.stamp, 0.0
         self._direction = math.copysign(1.0, field_turn)
         return self._judge_turn(step.stamp, field_turn, turn)
 
-    def _error(self, expected: Vector, measured: Vector) -> float:
-        """Return how far a displacement is from those between none, and the expected one with a slack thread [m]."""
-        size = max(math.hypot(*expected), 1e-12)
-        share = min(self._slack_ratio, max(0.0, float(measured @ expected) / size**2))
-        return math.hypot(*(measured - share * expected))
+    def _error(self, expected: Vector, measured: Vector, about_tail: Vector) -> float:
+        """Return how far a displacement is from those of a needle that is held, slack, or turns about its tail [m].
+
+        These are a parallelogram from 0, its sides the expected displacement with a slack thread, and that about the
+        tail.
+        """
+        slack = self._slack_ratio * expected
+        area = slack[0] * about_tail[1] - slack[1] * about_tail[0]
+        along = measured[0] * about_tail[1] - measured[1] * about_tail[0]
+        across = slack[0] * measured[1] - slack[1] * measured[0]
+        if area and 0.0 < along / area < 1.0 and 0.0 < across / area < 1.0:
+            return 0.0
+        sides = ((np.zeros(2), slack), (np.zeros(2), about_tail), (slack, about_tail), (about_tail, slack))
+        return min(_distance(measured - start, side) for start, side in sides)
 
     def _judge_probe(self, stamp: float, since: float) -> str:
         steps = [entry for entry in self._steps if entry.stamp > since]
@@ -311,3 +327,9 @@ class FollowMonitor:
         self.clear()
         self._trusted_until = stamp + TRUST_TIME
         return ""
+
+
+def _distance(point: Vector, side: Vector) -> float:
+    """Return how far a point, shape (2,), is from the line from 0 to another one [m]."""
+    share = min(1.0, max(0.0, float(point @ side) / max(float(side @ side), 1e-24)))
+    return math.hypot(*(point - share * side))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from magnetosuture_thread.coils.allocation import (
@@ -60,11 +60,12 @@ def test_the_coil_ahead_pulls_and_the_field_lies_along_the_needle():
     way=st.floats(-1.0, 1.0),
     speed=st.floats(0.001, 0.006),
 )
-def test_everywhere_in_the_dish_the_velocity_is_reached_by_the_physics(
+def test_away_from_the_wall_the_velocity_is_reached_by_the_physics(
     x: float, y: float, angle: float, way: float, speed: float
 ):
     """The forces and the torque of the poles in the field, divided by the drag, give the velocity again."""
     tail, heading = np.array([x, y]), turned(EAST, angle)
+    assume(np.linalg.norm([tail, tail + NEEDLE.length * heading], axis=1).max() < 0.012)
     velocity = speed * turned(heading, way)
     found = allocation(limit=1000.0).allocate(velocity, tail, heading)
     across = turned(heading, np.pi / 2)

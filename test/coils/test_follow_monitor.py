@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionStep
 
 INTERVAL, SPEED = 0.05, 2e-3  # s and m/s
-EAST = np.array([SPEED * INTERVAL, 0.0])
+EAST, STILL = np.array([SPEED * INTERVAL, 0.0]), np.zeros(2)
 
 
 def watch(monitor: FollowMonitor, moved: NDArray[np.float64], *, follows_turns: bool = False, count: int = 40) -> str:
@@ -19,7 +19,7 @@ def watch(monitor: FollowMonitor, moved: NDArray[np.float64], *, follows_turns: 
     for k in range(count):
         turn = monitor.probe_rate * INTERVAL
         monitor.register_turn(turn)
-        step = MotionStep(1.0 + k * INTERVAL, INTERVAL, EAST, turn, moved, turn if follows_turns else 0.0)
+        step = MotionStep(1.0 + k * INTERVAL, INTERVAL, EAST, turn, moved, turn if follows_turns else 0.0, STILL)
         if fault := monitor.update(step):
             return fault
     return ""
@@ -47,25 +47,27 @@ def test_poses_that_move_elsewhere_are_not_the_needles(moved: NDArray[np.float64
 
 
 @pytest.mark.parametrize(
-    ("share", "turned", "is_fault"), [(1.0, 1.0, False), (2.5, 1.0, True), (1.0, 0.0, True), (1.0, -1.0, True)]
+    ("share", "turned", "is_fault"),
+    [(1.0, 1.0, False), (0.5, 1.0, False), (2.5, 1.0, True), (-1.0, 1.0, True), (1.0, 0.0, True), (1.0, -1.0, True)],
 )
 def test_a_needle_may_turn_about_its_tail_and_not_move_farther(share: float, turned: float, is_fault: bool):
     """Half of its chord is 6 mm, and in 0.2 s its middle moves by 2.4 mm across what is expected."""
-    monitor, turn = FollowMonitor(5e-4, lever=6e-3), 0.1
-    aside = np.array([0.0, share * 6e-3 * turn])
-    steps = [MotionStep(0.05 * k, 0.05, EAST, turn, EAST + aside, turn * turned) for k in range(4)]
+    monitor, turn, swing = FollowMonitor(5e-4), 0.1, np.array([0.0, 6e-4])
+    steps = [
+        MotionStep(0.05 * k, 0.05, EAST, turn, EAST + share * swing, turn * turned, turned * swing) for k in range(4)
+    ]
     assert any(monitor.update(step).endswith("elsewhere") for step in steps) is is_fault
 
 
 def test_a_heading_that_turns_farther_than_the_field_is_not_the_needles():
     monitor = FollowMonitor(5e-4)
-    faults = [monitor.update(MotionStep(1.0 + 0.05 * k, 0.05, EAST, -0.1, EAST, 0.4)) for k in range(4)]
+    faults = [monitor.update(MotionStep(1.0 + 0.05 * k, 0.05, EAST, -0.1, EAST, 0.4, STILL)) for k in range(4)]
     assert "it turned 1.2 rad away from the field" in faults[-1]
 
 
 def test_a_motion_that_cannot_be_seen_is_not_judged():
     monitor = FollowMonitor(5e-4)
-    step = MotionStep(0.0, 0.05, 0.05 * EAST, 0.0, np.zeros(2), 0.0)
+    step = MotionStep(0.0, 0.05, 0.05 * EAST, 0.0, STILL, 0.0, STILL)
     assert not any(monitor.update(step._replace(stamp=0.05 * k)) for k in range(200))
 
 
@@ -74,11 +76,11 @@ def test_a_needle_that_turns_about_itself_moves_in_no_wrong_direction():
     monitor = FollowMonitor(5e-4)
     for k in range(20):
         expected, measured = (8e-4 * np.array([math.cos(a), math.sin(a)]) for a in (0.5 * k, 0.5 * k - 1.2))
-        assert monitor.update(MotionStep(0.05 * k, 0.05, expected, 0.5, measured, 0.5)) == ""
+        assert monitor.update(MotionStep(0.05 * k, 0.05, expected, 0.5, measured, 0.5, STILL)) == ""
 
 
 def test_a_command_that_ends_ends_the_probe_without_a_fault():
-    monitor, still = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, np.zeros(2), 0.0, np.zeros(2), 0.0)
+    monitor, still = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, STILL, 0.0, STILL, 0.0, STILL)
     while not monitor.probe_rate:
         watch(monitor, np.zeros(2), count=1)
     monitor.end_probe()
@@ -86,7 +88,7 @@ def test_a_command_that_ends_ends_the_probe_without_a_fault():
 
 
 def test_what_a_needle_lies_at_may_hold_it_for_a_while_and_not_for_good():
-    monitor, step = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, EAST, 0.0, np.zeros(2), 0.0)
+    monitor, step = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, EAST, 0.0, STILL, 0.0, STILL)
     faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=True) for k in range(40)]
     assert not any(faults[:15])
     assert "needle does not follow: 2 mm expected" in faults[-1]
