@@ -61,8 +61,6 @@ from magnetosuture_thread.untrusted import (
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an mcap file
 RECORD_HEADER = struct.Struct("<BQ")  # opcode and length of the content
 MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the data
-UNCHECKED = "has no checksums: damage to it cannot be noticed"
-PARTLY_UNCHECKED = "has messages without a checksum: damage to them cannot be noticed"
 
 _MIN_PRIVATE_OPCODE = 0x80
 _PARSED = frozenset(Opcode) - {Opcode.MESSAGE, Opcode.ATTACHMENT}
@@ -670,7 +668,9 @@ class McapFile:
         self.counts = {channel: counts[channel] for channel in self.connections if counts[channel]}
         self.unchecked = ""
         if not scan.data_verified and not all(block.has_checksum for block in blocks):
-            self.unchecked = PARTLY_UNCHECKED if any(block.has_checksum for block in blocks) else UNCHECKED
+            some = any(block.has_checksum for block in blocks)
+            what = "has messages without a checksum: damage to them" if some else "has no checksums: damage to it"
+            self.unchecked = f"{what} cannot be noticed"
         self.notes = _notes(scan)
         others = sum(record.name not in (NOTES, "rosbag2") for record in scan.metadata)
         private = scan.private_records

@@ -38,10 +38,7 @@ from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.files import HEAD_BYTES, is_url, substitute_problem
 from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
-SQLITE_UNCHECKED = "has no checksums (sqlite3): damage to it cannot be noticed"
 _SQLITE_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a name
-_SQLITE_MAGIC = b"SQLite format 3\0"
-_LIMIT_LENGTH = 0  # SQLITE_LIMIT_LENGTH
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget
 _MIN_STEPS, _STEPS_A_BYTE = 20_000_000, 10  # a row takes about 20 steps, and 10 bytes or more
 _COLUMNS = {
@@ -83,12 +80,12 @@ class SqliteFile:
                 magic = stream.read(HEAD_BYTES)
         except OSError as error:
             raise BagError(path, f"cannot be read: {error.strerror or error}") from error
-        if not magic.startswith(_SQLITE_MAGIC):
+        if not magic.startswith(b"SQLite format 3\0"):
             problem = substitute_problem(magic) or "is no sqlite3 file"
             raise BagError(path, problem if magic else "is empty, expected a sqlite3 file")
         self._max_steps = _MIN_STEPS + _STEPS_A_BYTE * size
         self.notes: dict[str, str] = {}
-        self.unchecked = SQLITE_UNCHECKED
+        self.unchecked = "has no checksums (sqlite3): damage to it cannot be noticed"
         self.others: Counter[str] = Counter()
         self.counts: dict[int, int] = {}
         self.damage: DamageReport | None = None
@@ -170,7 +167,7 @@ class SqliteFile:
         database = sqlite3.connect(f"file:{quote(os.fsencode(self.path.absolute()))}?{mode}", uri=True)
         database.text_factory = _decode_text
         if set_limit := getattr(database, "setlimit", None):  # from Python 3.11 on
-            set_limit(_LIMIT_LENGTH, 2 * MAX_BLOCK_BYTES)
+            set_limit(0, 2 * MAX_BLOCK_BYTES)  # SQLITE_LIMIT_LENGTH
         left = self._max_steps
 
         def step() -> int:

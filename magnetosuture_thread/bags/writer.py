@@ -49,7 +49,6 @@ from magnetosuture_thread.errors import BagError
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed
-MAX_SEQUENCE = (1 << 32) - 1
 MAX_TIME = (1 << 64) - 1  # ns, the range of mcap
 DISK_FULL_TEXTS = {errno.ENOSPC: "is full", errno.EDQUOT: "is full (quota)", errno.EFBIG: "takes no larger file"}
 
@@ -249,7 +248,7 @@ class BagWriter:
         sequence = self._sequences[number] if sequence is None else sequence
         publish_time = time if publish_time is None else publish_time
         self._state.pending.add(mcap_records.Message(number, time, data, publish_time, sequence))
-        self._sequences[number] = (sequence + 1) & MAX_SEQUENCE
+        self._sequences[number] = (sequence + 1) & 0xFFFFFFFF
         if self._state.pending.is_full:
             try:
                 self._flush()

@@ -36,7 +36,6 @@ from magnetosuture_thread.vision.settings import MIN_SIDE_PX
 BLUR_PX = 2.0  # beyond the tolerance, up to which an edge still looks like a dark line
 OUTSIDE_DEPTH_PX = 1e4  # depth of a pixel in an image without any outline
 
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"  # markers
 CELL_PX = 8  # side of a cell of the grid on which the floor's brightness is known
 RIM_PX = 1.0  # by which the rim's blurred edge reaches into the dish
 FLOOR_DEPTH_PX = 40.0  # inside of the wall, where the floor's brightness is not mixed with the rim's
@@ -60,12 +59,16 @@ class Encoding(NamedTuple):
     block: int = 1
 
 
-_UYVY, _YUYV = (Encoding(8, 2, code, block=2) for code in (cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2BGR_YUYV))
 # By the names of sensor_msgs/image_encodings, and nv12 as drivers name it.
-ENCODINGS = {"yuv422": _UYVY, "uyvy": _UYVY, "yuv422_yuy2": _YUYV, "yuyv": _YUYV}
-ENCODINGS |= {
-    name: Encoding(8, 1, code, block=2)
-    for name, code in (("nv12", cv2.COLOR_YUV2BGR_NV12), ("nv21", cv2.COLOR_YUV2BGR_NV21))
+ENCODINGS = {
+    name: Encoding(8, values, code, block=2)
+    for names, values, code in (
+        (("yuv422", "uyvy"), 2, cv2.COLOR_YUV2BGR_UYVY),
+        (("yuv422_yuy2", "yuyv"), 2, cv2.COLOR_YUV2BGR_YUYV),
+        (("nv12",), 1, cv2.COLOR_YUV2BGR_NV12),
+        (("nv21",), 1, cv2.COLOR_YUV2BGR_NV21),
+    )
+    for name in names
 }
 for _bits in (8, 16):
     for _names, _values, _conversion in (
@@ -351,8 +354,8 @@ def decode_image(data: bytes | bytearray | memoryview | np.ndarray) -> np.ndarra
         raise InvalidInputError("image.size", f"{width} x {height} pixels", f"at most {MAX_PIXELS} pixels")
     image = None
     with suppress(cv2.error, ValueError):  # some headers promise more than can be made
-        if width and buffer[:2].tobytes() == JPEG_START:  # OpenCV's decoder only prints that bytes are missing
-            image = simplejpeg.decode_jpeg(buffer.tobytes() + JPEG_END, "BGR")
+        if width and buffer[:2].tobytes() == b"\xff\xd8":  # a JPEG, of which OpenCV only prints that bytes are missing
+            image = simplejpeg.decode_jpeg(buffer.tobytes() + b"\xff\xd9", "BGR")  # an end marker more does no harm
         elif width:
             flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
             image = cv2.imdecode(buffer, flags)

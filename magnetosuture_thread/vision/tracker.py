@@ -42,7 +42,6 @@ MAX_LENGTH_RATIO = 1.05  # of the thread's length, after which the walk ends
 SMOOTHING = 0.5  # weight of the newest velocity
 VIEW_STEP_PX = 0.5  # to which the view is rounded for a mask, much less than the tolerance of outlines
 UNDIRECTED = "the needle's axis is found, but not which end is the tip: click it on the page, or by --tip or needle/tip"
-REMEDY = "check light, needle_length, needle_width, max_needle_brightness"
 TIP_REACH = 1.0 / 3.0  # of the length, from a point that a person gives: the other end is then twice as far or more
 CENTRELINE_POINTS = 64  # of the published centreline; each is a whole pose in the message
 REPEATED = "camera repeats frames"
@@ -350,8 +349,9 @@ class VisionTracker:
                 return within[0], picture, whole, ""
         if not needles:
             self._anew = []
+            remedy = "check light, needle_length, needle_width, max_needle_brightness"
             others = f"; dark things: {', '.join(refused)}" if refused else ""
-            return None, None, True, f"no needle in the dish; {REMEDY}{others}"
+            return None, None, True, f"no needle in the dish; {remedy}{others}"
         chosen = within[0] if len(within) == 1 else self._with_thread(picture, needles)
         if chosen is None or not chosen.heading_known:
             self._anew = []
