@@ -21,6 +21,7 @@ COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidi
 ALIASES = {
     **dict.fromkeys(("pinhole", "radtan", "radial_tangential", "brown_conrady"), "plumb_bob"),
     **dict.fromkeys(("fisheye", "equi", "kannala_brandt", "kannala_brandt4", "kb4"), "equidistant"),
+    "none": "",
 }
 MAX_SIDE_PX = 65536
 GRID = 33  # points along each side at which a lens is checked

@@ -140,6 +140,7 @@ def test_a_calibration_file_is_read(tmp_path: Path):
         (None, "pinhole", 5, "plumb_bob"),
         ("radtan", "pinhole", 4, "plumb_bob"),
         ("plumb_bob", None, 8, "rational_polynomial"),
+        ("none", None, 5, "distortion_model: got '', expected plumb_bob"),
         (None, None, 5, "distortion_model: got '', expected plumb_bob"),
         (None, "omni", 4, "distortion_model: got 'omni', expected plumb_bob"),
         ("radtan", "omni", 4, "camera_model: got omni, expected that of distortion_model, which is radtan"),
