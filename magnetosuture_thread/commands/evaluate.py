@@ -108,6 +108,8 @@ def run_evaluate(options: argparse.Namespace, terminal: command.Terminal) -> int
         terminal.print(tables.evaluation_table(evaluation))
         command.write_json(options.json, evaluation.to_mapping())
         return command.DONE
+    if missing := [path for path in options.paths if not is_url(path) and not path.exists()]:
+        raise BagError(missing[0], "does not exist; expected bags, folders of them, or reference trajectories")
     if options.output is None:
         raise ConfigurationError("--output", None, "a folder to make, as PATH is a bag")
     given = command.given(options, "paths", "output", "against", "formulation", "workers", "scheduler")
