@@ -1,7 +1,7 @@
-"""Makes `docs/pictures/console.png`: the operator's page while the needle draws its thread around the hernia.
+"""Makes `docs/pictures/console.png`: the operator's page with the hernia repair planned, before it runs.
 
-The whole graph runs around the simulated rig, at half speed, and a program presses the buttons of a procedure in a
-browser without a window (Chromium, which has to be installed). Run it from the top: python examples/console_picture.py
+The whole graph runs around the simulated rig, and a program presses the buttons in a browser without a window
+(Chromium, which has to be installed). Run it from the top: python examples/console_picture.py
 """
 
 from __future__ import annotations
@@ -15,32 +15,27 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from playwright.sync_api import ViewportSize, sync_playwright
 
 from benchmarks.page import BROWSERS
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "console.png"
-SETUP = Path(__file__).parents[1] / "config" / "hernia_ring.yaml"
 SCREEN: ViewportSize = {"width": 1366, "height": 768}
 WAIT = 240e3  # ms
 
 
 @contextmanager
 def served() -> Iterator[str]:
-    """Run the command with the setup at half speed, and yield the page's address."""
-    with TemporaryDirectory() as folder:
-        setup = Path(folder) / SETUP.name
-        setup.write_text(SETUP.read_text().replace("    frame_rate:", "    rate: 0.5\n    frame_rate:"))
-        command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", str(setup), "--port", "0"]
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-            assert process.stdout is not None
-            try:
-                yield next(found[1] for line in process.stdout if (found := re.search(r"open (http://\S+)", line)))
-            finally:
-                process.send_signal(signal.SIGINT)
+    """Run the command, and yield the page's address."""
+    command = [sys.executable, "-m", "magnetosuture_thread.cli", "console", "hernia_ring", "--port", "0"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None
+        try:
+            yield next(found[1] for line in process.stdout if (found := re.search(r"open (http://\S+)", line)))
+        finally:
+            process.send_signal(signal.SIGINT)
 
 
 def main() -> None:
@@ -51,11 +46,10 @@ def main() -> None:
         page = browser.new_page(viewport=SCREEN, color_scheme="light")
         page.set_default_timeout(WAIT)
         page.goto(address)
-        for button in ("control", "plan-procedure", "arm", "run-procedure"):
+        for button in ("control", "plan-procedure", "arm"):
             page.click(f"#{button}")
-        # Through the channel, and on around the ring.
-        page.wait_for_function("document.getElementById('goals').textContent.startsWith('✓')")
-        page.wait_for_timeout(20e3)
+        page.wait_for_selector("#run-procedure:enabled")
+        page.wait_for_timeout(3e3)  # for the plots
         page.screenshot(path=PICTURE)
         browser.close()
 

@@ -79,13 +79,13 @@ function speeds({ since, graph: { bridge, filter } }) {
 }
 
 function resting(view) {
-  const { since, graph, lease, client, canCommand, jogging, stale } = view;
+  const { since, graph, host, lease, client, canCommand, jogging, stale } = view;
   const { bridge } = graph;
   const filter = graph.filter && graph.filter.age + since < SILENCE_TIMEOUT ? graph.filter : null;
   const { commanded, filtered } = speeds(view);
   if (commanded > MIN_SPEED) {
     const why = filter?.reason || bridge.reasons[0] || restingAt(filter, bridge, filtered);
-    return result("warn", `At rest: ${why}`, others(bridge, [why]));
+    return result(host?.mode === "replay" ? "rest" : "warn", `At rest: ${why}`, others(bridge, [why]));
   }
   if (stale || (jogging && lease?.release_first)) return result("warn", "At rest: release the key and press it again", ["It was held while the needle was stopped.", ...others(bridge, [])]);
   if (jogging) return result("warn", "Jogging, but no command has arrived", others(bridge, []));
