@@ -40,6 +40,7 @@ def graph_environment(domain: int) -> dict[str, str]:
     environment["ROS_DOMAIN_ID"] = str(domain)
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     environment.setdefault("FASTDDS_BUILTIN_TRANSPORTS", LARGE_DATA)
+    environment["PYTHONSAFEPATH"] = "1"  # not the package of a clone that a person is in; from 3.11 on
     return environment
 
 
