@@ -160,7 +160,7 @@ def test_the_frames_of_a_rig_have_its_prefix(
     assert transform.remappings == remapped
 
 
-def test_the_systemd_unit_launches_with_its_arguments_and_ends_all_that_it_launched(description, tmp_path: Path):
+def test_the_systemd_unit_launches_with_its_arguments_and_signals_its_whole_group(description, tmp_path: Path):
     unit = configparser.ConfigParser(interpolation=None, strict=False)
     unit.optionxform = str  # type: ignore[assignment,method-assign]
     unit.read(ROOT / "config" / "systemd" / "magnetosuture.service")

@@ -40,7 +40,7 @@ OPTIONAL = (
 INTERRUPTED = "interrupted"
 SUMMARY_FILE = "summary.json"  # of a procedure's run, in the bag's folder
 EXTRA_TIME = 20.0  # s of simulated time
-MIN_RATE = 0.5
+MIN_RATE = 0.5  # of real time; the least that the rig's setting `rate` takes
 MAX_SKIPPED = 0.1  # of the frames; beyond, the needle is steered by another camera than the setup's
 TOO_SLOW = "machine too slow"
 

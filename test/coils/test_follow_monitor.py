@@ -87,6 +87,14 @@ def test_a_command_that_ends_ends_the_probe_without_a_fault():
     assert not any(monitor.update(still._replace(stamp=1.0 + INTERVAL * k)) for k in range(1, 40))
 
 
+@pytest.mark.parametrize("at_shape", [False, True])
+def test_what_a_needle_lies_at_moves_it_to_no_other_place(at_shape: bool):
+    """In 0.15 s 1.5 mm are expected to the east, and measured to the west."""
+    monitor, step = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, 5.0 * EAST, 0.0, -5.0 * EAST, 0.0, STILL)
+    faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=at_shape) for k in range(3)]
+    assert faults[-1].endswith("elsewhere")
+
+
 def test_what_a_needle_lies_at_may_hold_it_for_a_while_and_not_for_good():
     monitor, step = FollowMonitor(5e-4), MotionStep(0.0, INTERVAL, EAST, 0.0, STILL, 0.0, STILL)
     faults = [monitor.update(step._replace(stamp=INTERVAL * k), at_shape=True) for k in range(40)]
