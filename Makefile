@@ -48,7 +48,7 @@ kernels: $(READY)
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
 coverage: $(READY)
 	@mkdir -p output
-	$(RUN)/python -m coverage run -m pytest -q $(addprefix test/,coils console estimator geometry planning safety scene thread thread_model vision)
+	$(RUN)/python -m coverage run -m pytest -q $(addprefix test/,coils console estimator geometry planning thread vision)
 	$(RUN)/python -m coverage report --skip-covered --show-missing
 
 lint: $(READY)

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from magnetosuture_thread.commands.compile import kernel_steps
-from magnetosuture_thread.compiled import PACKAGE
+from magnetosuture_thread.geometry.compiled import PACKAGE
 
 ROOT = Path(__file__).resolve().parent.parent
 # Tests with kernels that no setup has: in space, which share hardly any with the setups, ...

@@ -17,11 +17,11 @@ from rich.table import Table
 
 from benchmarks.report import figures_table
 from magnetosuture_thread import NeedlePose
-from magnetosuture_thread.campaign.loop import START, ClosedLoop
+from magnetosuture_thread.estimator.thread_session import PredictionResult, ThreadSession
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.rig.closed_loop import START, ClosedLoop
 from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.thread_model.session import PredictionResult, ThreadSession
+from magnetosuture_thread.rig.setups import Setup, read_setup
 
 CASES = (
     ("petri_35mm_polyamide", 25),

@@ -25,17 +25,17 @@ from benchmarks.self_contact import measure_self_contact, self_contact_table
 from magnetosuture_thread import NeedlePose, ThreadPredictor, Workspace
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.commands.command import make_log
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.reproduce.hernia import (
+from magnetosuture_thread.commands.reproduce_hernia import (
     paper_model,
     point_filter,
     read_steering,
     replay_steering,
     start_centreline,
 )
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.thread.rod import RodFormulation
 
 STEERING = Path("examples/hernia_steering")

@@ -26,21 +26,21 @@ from rich.console import Console
 from benchmarks.closed_loop import PathControl
 from benchmarks.report import figures_table
 from magnetosuture_thread import Disc, NeedlePose, NeedleSafetyFilter, Scene, Thread, ThreadEstimate, ThreadForecaster
-from magnetosuture_thread.campaign.loop import LATENCY, START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.run import vary
 from magnetosuture_thread.coils.bridge import BridgeOutput
 from magnetosuture_thread.commands.command import make_log
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.estimator.thread_session import PredictionResult
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.executor import ENDED, ThreadCondition
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
 from magnetosuture_thread.planning.session import ProcedureSession
+from magnetosuture_thread.rig.campaign import vary
+from magnetosuture_thread.rig.closed_loop import LATENCY, START, ClosedLoop, Measurement
 from magnetosuture_thread.rig.rig import Rig, RigFrame
-from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
-from magnetosuture_thread.thread_model.session import PredictionResult
 
 LOOPS = ("hernia", "slalom", "figure_eight", "dead_end", "wrap_and_tighten", "petri_35mm_polyamide_post")
 LENGTH, NEEDLE = 0.019, 0.007  # of thread and needle that are timed [m]

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from magnetosuture_thread.geometry.polyline import lay_behind_needle
 from magnetosuture_thread.rig.camera import encode_jpeg
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 FRAMES = 20  # before the one that is counted, 33 ms apart
 PACKAGE = str(Path(__file__).parents[1] / "magnetosuture_thread")

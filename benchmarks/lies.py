@@ -22,10 +22,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.keep_out import World
-from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
-from magnetosuture_thread.campaign.run import vary
+from magnetosuture_thread.rig.campaign import vary
+from magnetosuture_thread.rig.closed_loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.rig.rig import Rig, RigFrame
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 Vector = NDArray[np.float64]
 SETUPS = ("hernia_ring", "dish_50mm", "petri_35mm_polyamide", "petri_35mm_polyamide_post", "petri_150mm_silk")

@@ -29,10 +29,10 @@ from rich.console import Console
 from rich.table import Table
 
 from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
-from magnetosuture_thread.configuration import read_yaml
-from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.configuration import read_yaml
+from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
+from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, NEEDLE_SETPOINT, OPERATOR_COMMAND
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -221,7 +221,7 @@ def _sent(domain: int) -> Iterator[dict[str, list[float]]]:
     By the senders' stamps: when we hear of it does not matter to the coils. A command that got lost on its way to us
     is known by the needle command that followed from it, which keeps its stamp.
     """
-    from magnetosuture_thread.messages.cdr import header_stamp
+    from magnetosuture_thread.bags.cdr import header_stamp
     from magnetosuture_thread.nodes import topics
     from magnetosuture_thread.nodes.clients import Recorder
     from magnetosuture_thread.nodes.processes import environment_of, graph_environment

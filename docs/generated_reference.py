@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import magnetosuture_thread
-from magnetosuture_thread import MATERIALS, interface
+from magnetosuture_thread import MATERIALS
 from magnetosuture_thread.cli import make_parser
-from magnetosuture_thread.configuration import Configuration, ConfigurationField, configuration_fields
-from magnetosuture_thread.setups import SETTINGS_CLASSES
-from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.rig.setups import SETTINGS_CLASSES
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import Configuration, ConfigurationField, configuration_fields
+from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 ROOT = Path(__file__).parents[1]
 NODES = ROOT / "magnetosuture_thread" / "nodes"

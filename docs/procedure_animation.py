@@ -11,7 +11,7 @@ from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 EVERY, SPEED = 0.6, 6.0  # s of the run between two pictures, and how much faster they are shown
 SIDE, MARGIN = 440, 12  # pixels of a picture, and of the frame around the dish

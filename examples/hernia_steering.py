@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from magnetosuture_thread.bags.packing import packed_twist
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.interface import OPERATOR_COMMAND
-from magnetosuture_thread.messages.packing import packed_twist
-from magnetosuture_thread.reproduce.hernia import RATE, SteeredThread, point_filter, start_centreline
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.commands.reproduce_hernia import RATE, SteeredThread, point_filter, start_centreline
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.interface import OPERATOR_COMMAND
 
 BAG = Path(__file__).parent / "hernia_steering"
 SETUP = "hernia_ring"

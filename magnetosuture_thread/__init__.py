@@ -9,15 +9,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from magnetosuture_thread.barrier import Barrier, Gradient, check_gradient
+    from magnetosuture_thread.coils.filter import FilteredCommand, NeedleSafetyFilter
     from magnetosuture_thread.commands.calibrate import calibrate_bags
     from magnetosuture_thread.commands.replay import replay_offline
-    from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError, SolverError
     from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
     from magnetosuture_thread.forecast import Forecast, ForecastStart, ThreadForecaster
+    from magnetosuture_thread.geometry.barrier import Barrier, Gradient, check_gradient
     from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
-    from magnetosuture_thread.safety import FilteredCommand, NeedleSafetyFilter
-    from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+    from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+    from magnetosuture_thread.geometry.scene_files import read_scene
+    from magnetosuture_thread.settings.errors import (
+        ConfigurationError,
+        InvalidInputError,
+        MagnetosutureError,
+        SolverError,
+    )
     from magnetosuture_thread.thread.margins import BarrierMargins, Margins
     from magnetosuture_thread.thread.material import MATERIALS, Attachment, Material, Medium, Thread
     from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
@@ -26,8 +32,8 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"  # as in pyproject.toml, both files package.xml, CITATION.cff and CHANGELOG.md
 
 _HOME = {
-    "barrier": ("Barrier", "Gradient", "check_gradient"),
-    "errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
+    "geometry.barrier": ("Barrier", "Gradient", "check_gradient"),
+    "settings.errors": ("ConfigurationError", "InvalidInputError", "MagnetosutureError", "SolverError"),
     "forecast": ("Forecast", "ForecastStart", "ThreadForecaster"),
     "geometry.obstacles": ("Disc", "Polygon", "Workspace"),
     "commands.calibrate": ("calibrate_bags",),
@@ -37,8 +43,9 @@ _HOME = {
     "thread.prediction": ("NeedlePose", "Prediction"),
     "thread.predictor": ("ThreadPredictor",),
     "thread.material": ("MATERIALS", "Attachment", "Material", "Medium", "Thread"),
-    "safety": ("FilteredCommand", "NeedleSafetyFilter"),
-    "scene": ("Dish", "Scene", "SceneShape", "read_scene"),
+    "coils.filter": ("FilteredCommand", "NeedleSafetyFilter"),
+    "geometry.scene": ("Dish", "Scene", "SceneShape"),
+    "geometry.scene_files": ("read_scene",),
 }
 _MODULES = {name: module for module, names in _HOME.items() for name in names}
 

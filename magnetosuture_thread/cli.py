@@ -11,15 +11,14 @@ from importlib import import_module
 
 from magnetosuture_thread import ConfigurationError, MagnetosutureError, __version__
 from magnetosuture_thread.commands.command import FAILED, WRONG_USE, Terminal, check_outputs, describe, make_console
-from magnetosuture_thread.errors import missing_module
+from magnetosuture_thread.settings.errors import missing_module
 
 DESCRIPTION = """\
 Predicts where a suture thread goes behind a magnetically steered needle.
 
 Research software, no medical device. Lengths are in metres and times in seconds throughout.
 """
-# Name and summary of each command. `commands/NAME.py` is imported when the command is given, so that --help is quick;
-# in place of it that of `MODULES`.
+# Name and summary of each command. `commands/NAME.py` is imported when the command is given, so that --help is quick.
 COMMANDS = {
     "replay": "play a recorded bag through the live graph, or offline",
     "render": "write a bag of simulated camera frames, or poses",
@@ -37,7 +36,6 @@ COMMANDS = {
     "bag": "check a recorded bag, or repair it",
     "compile": "compile the functions that every node runs, so that nodes start at once",
 }
-MODULES = {"reproduce": "reproduce.command"}  # which builds on the other commands
 
 
 def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentParser:
@@ -56,8 +54,7 @@ def make_parser(names: Collection[str] = tuple(COMMANDS)) -> argparse.ArgumentPa
     for name, summary in COMMANDS.items():
         own = subparsers.add_parser(name, help=summary)
         if name in names:
-            module = MODULES.get(name, f"commands.{name.replace('-', '_')}")
-            import_module(f"magnetosuture_thread.{module}").add(own)
+            import_module(f"magnetosuture_thread.commands.{name.replace('-', '_')}").add(own)
     return parser
 
 

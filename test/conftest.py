@@ -18,7 +18,7 @@ from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 # What a shell runs in the background ignores SIGINT, and hands that on to its children: no Ctrl-C would reach them.

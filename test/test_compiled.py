@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from magnetosuture_thread.compiled import compiled, delete_stale_cache
+from magnetosuture_thread.geometry.compiled import compiled, delete_stale_cache
 
 
 def test_a_compiled_function_is_the_same_function():
@@ -25,11 +25,11 @@ def test_kernels_are_deleted_when_a_file_that_they_depend_on_changes(tmp_path: P
     cache = tmp_path / "room" / "__pycache__"
     cache.mkdir(parents=True)
     (tmp_path / "room/caller.py").write_text(
-        "from magnetosuture_thread.compiled import compiled\nfrom magnetosuture_thread.callee import f\n"
+        "from magnetosuture_thread.geometry.compiled import compiled\nfrom magnetosuture_thread.callee import f\n"
     )
     (tmp_path / "callee.py").write_text("from magnetosuture_thread.constants import X\n")
     (tmp_path / "constants.py").write_text("X = 1\n")
-    (tmp_path / "other.py").write_text("from magnetosuture_thread.compiled import compiled\n")
+    (tmp_path / "other.py").write_text("from magnetosuture_thread.geometry.compiled import compiled\n")
     kernels = [cache / "caller.f-1.py311.nbi", cache / "caller.f-1.py311.1.nbc"]
 
     def is_kept(*, changed: str = "") -> bool:
@@ -55,7 +55,7 @@ def test_a_second_start_compiles_nothing():
     """
     code = """
 from numba.core import event
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 
 with event.install_recorder("numba:compile") as compilations:
     {start}
@@ -75,6 +75,6 @@ print(len(compilations.buffer))
 
 
 def test_a_package_that_cannot_be_written_is_left_alone(tmp_path: Path):
-    (tmp_path / "kernel.py").write_text("from magnetosuture_thread.compiled import compiled\n")
+    (tmp_path / "kernel.py").write_text("from magnetosuture_thread.geometry.compiled import compiled\n")
     (tmp_path / "__pycache__").write_text("a file where a folder should be, as nothing can be written into it")
     assert delete_stale_cache(tmp_path)

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import pytest
 
-from magnetosuture_thread.configuration import Configuration, from_mapping, quantity, read_yaml
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.parameter_files import key_matches, load_setup
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity, read_yaml
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.parameter_files import key_matches, load_setup
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)

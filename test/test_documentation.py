@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 import yaml
 
-from magnetosuture_thread import interface
 from magnetosuture_thread.cli import make_parser
-from magnetosuture_thread.configuration import ROS_PARAMETERS, configuration_fields
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.planning.procedure import parse_procedure
-from magnetosuture_thread.scene import read_scene
-from magnetosuture_thread.setups import SETTINGS_CLASSES
+from magnetosuture_thread.rig.setups import SETTINGS_CLASSES
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import ROS_PARAMETERS, configuration_fields
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.files import read_regular
+from magnetosuture_thread.settings.files import read_regular
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])

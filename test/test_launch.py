@@ -18,8 +18,15 @@ from typing import Any, ClassVar
 import pytest
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.configuration import configuration_fields
-from magnetosuture_thread.interface import ALL_NODES, FRAME_PREFIX_VARIABLE, NODES, PROCESSES, RIG_NODES, STANDBY_NODES
+from magnetosuture_thread.settings.configuration import configuration_fields
+from magnetosuture_thread.settings.interface import (
+    ALL_NODES,
+    FRAME_PREFIX_VARIABLE,
+    NODES,
+    PROCESSES,
+    RIG_NODES,
+    STANDBY_NODES,
+)
 
 ROOT = Path(__file__).parent.parent
 INSTALLED: dict[str, str] = {}  # packages of the ROS installation

@@ -12,11 +12,12 @@ from rosbags.rosbag2 import StoragePlugin
 from magnetosuture_thread import ConfigurationError, cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.commands.output import whole_file
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.page import _template
 from magnetosuture_thread.evaluation.tables import failed_row, flat, table_csv
-from magnetosuture_thread.outputs import input_problem, output_problem
-from magnetosuture_thread.scene import Scene, write_scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_files import write_scene
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.outputs import input_problem, output_problem
 from test.bags.bags import STRING, read, texts, write_mcap, write_rosbag
 
 NASTY = "a\x1b[31m\u202eb\x9b1m"

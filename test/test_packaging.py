@@ -15,8 +15,8 @@ import yaml
 from catkin_pkg.packages import find_packages
 
 import magnetosuture_thread
-from magnetosuture_thread.errors import missing_module
-from magnetosuture_thread.resources import share_directory
+from magnetosuture_thread.settings.errors import missing_module
+from magnetosuture_thread.settings.resources import share_directory
 from test.test_imports import MODULES, imported
 
 ROOT = Path(__file__).parent.parent
@@ -98,7 +98,7 @@ def test_every_message_package_that_the_nodes_import_is_declared():
     used = set()
     for path in (ROOT / "magnetosuture_thread" / "nodes").rglob("*.py"):
         used |= set(re.findall(r"^from (\w+)\.(?:msg|srv|action) import", path.read_text(), re.MULTILINE))
-    interface = (ROOT / "magnetosuture_thread" / "interface.py").read_text()
+    interface = (ROOT / "magnetosuture_thread" / "settings" / "interface.py").read_text()
     used |= set(re.findall(r'"(\w+)/msg/\w+"', interface))
     assert used <= declared
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.planning.session import NeedlePlannerSettings
-from magnetosuture_thread.resources import find_setup_file, share_directory
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
-from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.resources import find_setup_file, share_directory
+from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 SHIPPED = sorted(path.stem for path in (share_directory("magnetosuture_thread") / "config").glob("*.yaml"))
 

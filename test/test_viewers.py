@@ -13,8 +13,8 @@ import yaml
 from magnetosuture_msgs.msg import BarrierMargin
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from magnetosuture_thread.interface import DISH_FRAME
 from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.settings.interface import DISH_FRAME
 
 ROOT = Path(__file__).parent.parent
 VIEWERS = ROOT / "config" / "viewers"

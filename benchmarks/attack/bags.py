@@ -20,14 +20,14 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagWriter
 
+from magnetosuture_thread.bags.cdr import pack
 from magnetosuture_thread.bags.check import write_repaired_bag
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import packed_path, packed_pose
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import METADATA_FILE
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import MagnetosutureError
-from magnetosuture_thread.messages.cdr import pack
-from magnetosuture_thread.messages.packing import packed_path, packed_pose
+from magnetosuture_thread.settings.errors import MagnetosutureError
 
 MAX_SECONDS, MAX_MEGABYTES = 5.0, 300.0
 GRACE = 10.0  # s after `MAX_SECONDS`, after which a reader is ended

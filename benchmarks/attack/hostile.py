@@ -29,9 +29,9 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from magnetosuture_thread import InvalidInputError
-from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import Topic
+from magnetosuture_thread.settings.interface import Service
 
 TOPICS = (*topics.INPUTS, *topics.OUTPUTS, *topics.SETTINGS, *topics.SIMULATED, topics.RIG_CURRENTS)
 # Whatever their content, these requests are orders, not attacks: only who may give them could be asked.

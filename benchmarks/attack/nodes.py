@@ -17,9 +17,9 @@ from rclpy.executors import SingleThreadedExecutor
 
 from benchmarks.attack.hostile import READY, STOP, UNARMED, Attacker
 from magnetosuture_thread.commands.live import START_TIMEOUT, OwnGraph, own_graph
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import NODES, RIG_NODES, SCENE_SERVER
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.interface import NODES, RIG_NODES, SCENE_SERVER
 
 SETUP = "petri_35mm_polyamide"
 TARGETS = (SCENE_SERVER, *RIG_NODES, *NODES)

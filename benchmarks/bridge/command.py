@@ -25,9 +25,9 @@ from rich.table import Table
 
 from magnetosuture_thread.coils.inputs import SILENCE_TIMEOUT
 from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.rig.power import PowerStage
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import GraphError
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.clients import CoilClient

@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TwistStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from magnetosuture_thread.messages.packing import packed_pose, packed_twist
+from magnetosuture_thread.bags.packing import packed_pose, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.run import run
 

@@ -20,17 +20,17 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.estimator.truth import LENGTH, RATE, WALL_RADIUS, CameraModel, Run, simulate
+from magnetosuture_thread.bags.reading import pose_deviation
 from magnetosuture_thread.commands.command import make_log, progress
 from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.geometry.polyline import Points, points_at
-from magnetosuture_thread.messages.reading import pose_deviation
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
-from magnetosuture_thread.scene import Scene
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread_observation import ThreadObservation
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import TrackerSession
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.obstacles import Disc
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, lay_behind_needle, points_at
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 LENGTH = 0.019  # m; of the thread
 RATE = 30.0  # 1/s; of the frames

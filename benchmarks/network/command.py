@@ -24,8 +24,8 @@ from rich.table import Table
 
 from benchmarks.network.hosts import TwoHosts
 from magnetosuture_thread.commands.command import make_log, make_table, progress, whole_number
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import GraphError
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.processes import NodeProcesses

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 
-from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.settings.errors import GraphError
 
 _CLONE_NEWNET, _TUNSETIFF, _TUNSETCARRIER, _IFF_TAP_NO_PI = 0x40000000, 0x400454CA, 0x400454E2, 0x1002
 # Nodes of one machine exchange messages by shared memory, which two hosts do not have in common.

@@ -18,7 +18,7 @@ from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.measurements import frame_of, measure_vision
 from benchmarks.vision.photographs import PHOTOGRAPHS, RIGHT, measure_photographs
 from magnetosuture_thread.commands.command import count_argument, make_log, progress, whole_number
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 FAMILIES = ", ".join(dict.fromkeys(name.partition("_")[0] for name in CLASSES))
 TOTALS = ("frames", "found", "unknown", "wrong", "reversed", "misplaced", "incomplete", "not_free")

@@ -17,9 +17,8 @@ from scipy.spatial import KDTree
 from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS, Case, Image, dense, render
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import Track, VisionTracker, published_centreline, warm_up
 

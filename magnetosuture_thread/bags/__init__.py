@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 
 def parse_remap(text: str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from magnetosuture_thread.bags.cdr import stamp_and_frame
 from magnetosuture_thread.bags.message_types import own_definition
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
 from magnetosuture_thread.bags.recording import Recording, UnfitError
@@ -24,9 +25,8 @@ from magnetosuture_thread.bags.storage import (
     jazzy_qos_profiles,
 )
 from magnetosuture_thread.bags.writer import MAX_TIME, BagWriter
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.interface import Channel
-from magnetosuture_thread.messages.cdr import stamp_and_frame
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.interface import Channel
 
 
 @dataclass

@@ -47,9 +47,9 @@ from magnetosuture_thread.bags.storage import (
     pluralize,
     verified_notes,
 )
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.files import HEAD_BYTES, is_url, open_ranges, substitute_problem
-from magnetosuture_thread.untrusted import (
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, open_ranges, substitute_problem
+from magnetosuture_thread.settings.untrusted import (
     LONE_RECORD,
     MAX_BLOCK_BYTES,
     MAX_BLOCK_RECORDS,

@@ -17,9 +17,9 @@ from rosbags.typesys.peg import Failure, Parser
 from rosbags.typesys.store import Typestore
 
 from magnetosuture_thread.bags.storage import MessageDefinition
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.resources import share_directory
-from magnetosuture_thread.untrusted import (
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.resources import share_directory
+from magnetosuture_thread.settings.untrusted import (
     MAX_DECODED,
     MAX_DEFINITION_CHARS,
     MAX_ELEMENTS,

@@ -34,9 +34,9 @@ from magnetosuture_thread.bags.storage import (
     merge_by_time,
     merge_reports,
 )
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.files import HEAD_BYTES, is_url, substitute_problem
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES, UnpackBudget
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import HEAD_BYTES, is_url, substitute_problem
+from magnetosuture_thread.settings.untrusted import MAX_BLOCK_BYTES, UnpackBudget
 
 _SQLITE_ERRORS = (sqlite3.Error, OverflowError, UnicodeDecodeError)  # the last: in the words of an error about a name
 _STEP_INTERVAL = 10_000  # steps of sqlite's machine between two looks at the budget

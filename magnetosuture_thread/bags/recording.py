@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread import interface
+from magnetosuture_thread.bags.cdr import is_in_dish_frame, pack, stamp_and_frame
+from magnetosuture_thread.bags.markers import ADD, LINE_STRIP
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, DISH_FRAME, Channel, is_rectified
-from magnetosuture_thread.messages.cdr import is_in_dish_frame, pack, stamp_and_frame
-from magnetosuture_thread.messages.markers import ADD, LINE_STRIP
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, DISH_FRAME, Channel, is_rectified
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

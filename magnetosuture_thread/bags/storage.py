@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import yaml
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.interface import STORAGE_SUFFIXES
-from magnetosuture_thread.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.interface import STORAGE_SUFFIXES
+from magnetosuture_thread.settings.untrusted import MAX_METADATA_BYTES, MAX_TEXT_BYTES, BudgetError, check_yaml
 
 CDR = "cdr"  # how ROS 2 writes messages
 METADATA_FILE = "metadata.yaml"

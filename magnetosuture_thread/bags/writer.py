@@ -45,7 +45,7 @@ from magnetosuture_thread.bags.storage import (
     parse_qos_profiles,
     pluralize,
 )
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 
 MAX_CHUNK_BYTES = 256 * 1024  # of messages, uncompressed
 MAX_CHUNK_SPAN = 2_000_000_000  # ns, from first to last message; lost if the recorder is killed

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any
 
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 ATTACHMENT = "attachment"
 OFFSET = "attachment_offset"

@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import BagError, GraphError, InvalidInputError
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.thread_session import InitialObservation, ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import MIN_KNOWN_SHARE, node_errors, target_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.errors import BagError, GraphError, InvalidInputError
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread_model.session import InitialObservation, ThreadSession
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
 SETTLING = 1.0  # s after the start that are not compared: the noise of the first centreline straightens out in it

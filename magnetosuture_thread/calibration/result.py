@@ -15,9 +15,9 @@ from rich.table import Table
 from magnetosuture_thread.bags.storage import MAX_SILENCE
 from magnetosuture_thread.calibration.parameters import ATTACHMENT, OFFSET, stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, mean_across, mean_error
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 IDENTIFIED, FIXED, STAND_IN, UNFINISHED = "identified", "fixed", "stand-in", "unfinished"
 STIFFNESS = (

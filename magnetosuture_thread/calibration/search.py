@@ -41,11 +41,11 @@ from magnetosuture_thread.calibration.result import (
     CalibrationResult,
     Estimate,
 )
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import Attachment
-from magnetosuture_thread.thread_model.session import ThreadSession
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from magnetosuture_thread.workers import Log, Progress
 
 Array = NDArray[np.float64]

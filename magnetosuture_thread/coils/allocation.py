@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import LoopCoils
+from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter
 from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
-from magnetosuture_thread.safety import NeedleKinematics, NeedleSafetyFilter
-from magnetosuture_thread.safety.filter import SPEED
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 
 Vector = NDArray[np.float64]
 

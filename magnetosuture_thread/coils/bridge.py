@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.allocation import Allocation, CertifiedAllocation
 from magnetosuture_thread.coils.drivers import DriverState
+from magnetosuture_thread.coils.filter import SPEED, NeedleSafetyFilter, rest_reason
 from magnetosuture_thread.coils.inputs import (
     CONSISTENT_POSES,
     TOPIC,
@@ -22,12 +23,11 @@ from magnetosuture_thread.coils.inputs import (
 )
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.motion_observer import FollowMonitor, MotionDisturbance, MotionObserver
+from magnetosuture_thread.coils.needle_motion import STUCK
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.safety.filter import SPEED, NeedleSafetyFilter, rest_reason
-from magnetosuture_thread.safety.motion import STUCK
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.texts import shortened
 
 Vector = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ import yaml
 from numpy.typing import NDArray
 
 from magnetosuture_thread.coils.field import CoilProperties, loop_fields
-from magnetosuture_thread.configuration import from_mapping, read_yaml, to_mapping
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.untrusted import MAX_TABLE_BYTES
+from magnetosuture_thread.settings.configuration import from_mapping, read_yaml, to_mapping
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.untrusted import MAX_TABLE_BYTES
 
 MODEL = "loops"  # of the field of a coil
 MIN_COILS = 3  # needed to pull in every direction

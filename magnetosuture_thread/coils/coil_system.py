@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from magnetosuture_thread.barrier import import_barriers
 from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import CoilDriver, DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch, RecordedState, StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.barrier import import_barriers
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 UNCONFIGURED, FINALIZED = "unconfigured", "finalized"
 UNCLEAN_END = "the bridge ended while armed or in fault, and not in order"

@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.configuration import Configuration, quantity
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.compiled import compiled
+from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.safety import NeedleKinematics
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.texts import shortened
 
 Vector = NDArray[np.float64]
 

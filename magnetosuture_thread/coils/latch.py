@@ -7,9 +7,9 @@ from contextlib import suppress
 from enum import Enum
 from pathlib import Path
 
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.outputs import output_problem
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.outputs import output_problem
 
 
 class ArmingState(Enum):

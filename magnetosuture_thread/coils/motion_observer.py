@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.safety import NeedleKinematics
-from magnetosuture_thread.safety.motion import limit_pair
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics, limit_pair
 
 Vector = NDArray[np.float64]
 

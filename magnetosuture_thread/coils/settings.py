@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
-from magnetosuture_thread.barrier import load_barriers
 from magnetosuture_thread.coils.allocation import (
     MIN_ALIGNING_SHARE,
     CoilAllocation,
@@ -18,12 +17,13 @@ from magnetosuture_thread.coils.allocation import (
 )
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
-from magnetosuture_thread.configuration import Configuration, quantity
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.coils.filter import NeedleSafetyFilter
+from magnetosuture_thread.geometry.barrier import load_barriers
 from magnetosuture_thread.geometry.needle_arc import check_needle
-from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 # Of the loop: two of the first four are the lookahead of the bridge; drivers would switch off between two steps.
 MIN_TIMEOUT_PERIODS = {"command_timeout": 4.0, "pose_timeout": 4.0, "driver_timeout": 2.0 * (1.0 - 1e-9)}

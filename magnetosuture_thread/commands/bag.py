@@ -15,7 +15,7 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import pluralize, silence_text
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.texts import one_line
+from magnetosuture_thread.settings.texts import one_line
 
 DESCRIPTION = """\
 Check a recorded bag, or repair it.

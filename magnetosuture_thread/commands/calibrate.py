@@ -24,9 +24,9 @@ from magnetosuture_thread.calibration.search import calibrate, unfinished_result
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_file
 from magnetosuture_thread.commands.recorded import BagInput, BagSelection, open_bag, setup_of_notes
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.setups import Setup
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.rig.setups import Setup
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.workers import Log, Progress
 
 if TYPE_CHECKING:

@@ -20,16 +20,16 @@ import numpy as np
 
 from magnetosuture_thread import ConfigurationError, Disc, Polygon, Scene
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.campaign import run
-from magnetosuture_thread.campaign.loop import RunBag
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import SETUP_NOTE
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.page import page_style, read_source, read_template
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.procedure import Procedure, read_procedure
-from magnetosuture_thread.setups import Setup, read_procedure_setup
+from magnetosuture_thread.rig import campaign as run
+from magnetosuture_thread.rig.closed_loop import RunBag
+from magnetosuture_thread.rig.setups import Setup, read_procedure_setup
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.workers import Log, Progress, WorkerDiedError, make_runner
 
 REASONS = {

@@ -21,9 +21,9 @@ from rich.text import Text
 
 from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags import parse_remap
-from magnetosuture_thread.files import parse_location
-from magnetosuture_thread.outputs import input_problem, output_problem
-from magnetosuture_thread.texts import printable
+from magnetosuture_thread.settings.files import parse_location
+from magnetosuture_thread.settings.outputs import input_problem, output_problem
+from magnetosuture_thread.settings.texts import printable
 
 DONE, FAILED, WRONG_USE = 0, 1, 2
 STANDARD_OUTPUT = Path("-")  # as the file of --json, of benchmarks

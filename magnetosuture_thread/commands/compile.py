@@ -7,15 +7,15 @@ import time
 from collections.abc import Callable
 
 from magnetosuture_thread.coils.coil_system import CoilSystem
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.commands.command import DONE, Terminal, runs
-from magnetosuture_thread.compiled import compilations
+from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
+from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.planning.session import compile_planning
 from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.thread_model.session import ThreadSession
+from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.vision.tracker import warm_up
 
 

@@ -22,18 +22,18 @@ from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import DEFAULT_SETUP, SETUP_NOTE, open_bag
-from magnetosuture_thread.configuration import from_mapping, to_mapping
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, joined
 from magnetosuture_thread.nodes.console import RECORDED_TOPICS, RIG, ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.processes import NodeProcesses
 from magnetosuture_thread.nodes.program import STOPS
-from magnetosuture_thread.resources import share_directory
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_setup
+from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.interface import NODES, PLANNER, PROCESSES, SCENE_SERVER
+from magnetosuture_thread.settings.resources import share_directory
 from magnetosuture_thread.workers import Log
 
 TOKEN = "MAGNETOSUTURE_TOKEN"

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from magnetosuture_thread.bags.writer import RecordingEndedError
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.outputs import output_problem
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.outputs import output_problem
 
 
 @contextmanager

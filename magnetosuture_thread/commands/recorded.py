@@ -18,18 +18,9 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, NeedlePose, Scene, interface
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, NeedlePose, Scene
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
-from magnetosuture_thread.bags.recording import Recording
-from magnetosuture_thread.bags.storage import UNVERIFIED_NOTE
-from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.evaluation.frames import FrameResult, Observation
-from magnetosuture_thread.evaluation.metrics import RunMetrics
-from magnetosuture_thread.geometry.orientation import round_trip_heading
-from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import Channel
-from magnetosuture_thread.messages.reading import (
+from magnetosuture_thread.bags.reading import (
     plane_point,
     pose_deviation,
     read_force,
@@ -38,11 +29,21 @@ from magnetosuture_thread.messages.reading import (
     read_pose,
     stamp_of,
 )
-from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.setups import Setup, read_setup
-from magnetosuture_thread.thread_model.session import MAX_WAITING_POSES, PredictionResult, ThreadSession
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings, parse_material
-from magnetosuture_thread.thread_observation import ThreadObservation
+from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.bags.storage import UNVERIFIED_NOTE
+from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
+from magnetosuture_thread.estimator.thread_session import MAX_WAITING_POSES, PredictionResult, ThreadSession
+from magnetosuture_thread.evaluation.frames import FrameResult, Observation
+from magnetosuture_thread.evaluation.metrics import RunMetrics
+from magnetosuture_thread.geometry.orientation import round_trip_heading
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation
+from magnetosuture_thread.rig.setups import Setup, read_setup
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.interface import Channel
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import lens_of
 from magnetosuture_thread.vision.tracker import FrameMeasurement, TrackerSession, warm_up

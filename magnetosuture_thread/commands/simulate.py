@@ -14,22 +14,23 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread import ConfigurationError, interface
+from magnetosuture_thread import ConfigurationError
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands import command, live
 from magnetosuture_thread.commands.output import whole_folder
 from magnetosuture_thread.commands.recorded import SETUP_NOTE
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import LoopCollector, LoopSummary
 from magnetosuture_thread.evaluation.metrics import finite_or_none
 from magnetosuture_thread.evaluation.tables import loop_table, outcome_line
 from magnetosuture_thread.geometry.polyline import arc_lengths
 from magnetosuture_thread.nodes import clients, topics
 from magnetosuture_thread.planning.procedure import read_procedure
-from magnetosuture_thread.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.rig.power import board_addresses
-from magnetosuture_thread.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_procedure_setup, read_setup
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.resources import find_procedure_file, find_scene_file
 from magnetosuture_thread.workers import Log, Progress
 
 # Topics on which nothing may come before the run begins.

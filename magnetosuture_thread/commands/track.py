@@ -20,18 +20,18 @@ from rich.table import Table
 
 from magnetosuture_thread import InvalidInputError, read_scene
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import COMPRESSED_SUFFIXES, pluralize
 from magnetosuture_thread.commands import command
 from magnetosuture_thread.commands.recorded import read_image
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.metrics import SensorSilence, finite_or_none
-from magnetosuture_thread.files import read_regular
-from magnetosuture_thread.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
-from magnetosuture_thread.messages.reading import stamp_of
-from magnetosuture_thread.setups import read_setup
-from magnetosuture_thread.thread_observation import ThreadPiece
-from magnetosuture_thread.untrusted import MAX_FILE_BYTES
+from magnetosuture_thread.geometry.thread_observation import ThreadPiece
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import read_regular
+from magnetosuture_thread.settings.interface import CAMERA, CAMERA_INFO, STORAGE_SUFFIXES
+from magnetosuture_thread.settings.untrusted import MAX_FILE_BYTES
 from magnetosuture_thread.vision.images import decode_image
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_dish, draw_overlay, draw_region

@@ -14,11 +14,11 @@ from typing import Any, NoReturn, Protocol
 
 from aiohttp import WSMsgType, web
 
-from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.console.access import RateCounter, same_token
 from magnetosuture_thread.console.jog_controller import DelayEstimator, JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 
 MAX_MESSAGE_CHARS = 4096
 HELLO_TIMEOUT = 5.0  # after the connection [s]

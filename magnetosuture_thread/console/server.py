@@ -19,7 +19,7 @@ from magnetosuture_thread.console import access
 from magnetosuture_thread.console.client import Client, Graph, Host, RequestHandler, encode_frame, encode_state
 from magnetosuture_thread.console.jog_controller import JogController
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_CLIENTS = 16  # with the token
 MAX_WATCHERS = 8  # without it, from one address, and twice as many in all; they take no place of the others

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from magnetosuture_thread.configuration import Configuration, quantity
 from magnetosuture_thread.console.access import is_loopback, is_origin
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.needle_arc import check_needle
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 Obstacles = tuple[Workspace, float]

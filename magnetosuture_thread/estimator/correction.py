@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline
 from magnetosuture_thread.estimator.association import MeasuredPoints
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
 from magnetosuture_thread.geometry.obstacles import WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import banded, mechanics

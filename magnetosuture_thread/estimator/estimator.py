@@ -12,9 +12,6 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.barrier import BUILT_IN, BarrierRows
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.estimator import association, noise
 from magnetosuture_thread.estimator.correction import Corrector, Prior, normals_of
 from magnetosuture_thread.estimator.disturbance import Disturbance, DisturbanceTest
@@ -26,14 +23,17 @@ from magnetosuture_thread.estimator.stiffness import (
     SlowParameter,
     StiffnessLearner,
 )
+from magnetosuture_thread.geometry.barrier import BUILT_IN, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import SOLID, Margins
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.step import ThreadState, WarmStart
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 Vector = NDArray[np.float64]
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magnetosuture_thread.arguments import checked_arguments
-from magnetosuture_thread.errors import InvalidInputError, SolverError
 from magnetosuture_thread.estimator.association import LENGTH_ERROR
 from magnetosuture_thread.estimator.estimator import Snapshot, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.settings.arguments import checked_arguments
+from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
 from magnetosuture_thread.thread.prediction import MAX_COORDINATE, NeedlePose
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 MAX_POSES = 400  # that are kept, however many come in the time for which history is kept
 

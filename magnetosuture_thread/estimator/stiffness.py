@@ -37,9 +37,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magnetosuture_thread.errors import ConfigurationError, SolverError
 from magnetosuture_thread.estimator.correction import Corrector
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError, SolverError
 from magnetosuture_thread.thread.prediction import NeedlePose, Prediction
 from magnetosuture_thread.thread.predictor import ThreadPredictor
 from magnetosuture_thread.thread.rod import RodFormulation

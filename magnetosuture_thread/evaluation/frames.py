@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from magnetosuture_thread.estimator import Disturbance, SlowParameter, ThreadEstimate
 from magnetosuture_thread.geometry.obstacles import Obstacle
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.thread.margins import Margins, node_clearance
 from magnetosuture_thread.thread.prediction import Prediction
-from magnetosuture_thread.thread_observation import ThreadObservation
 
 Array = NDArray[np.float64]
 

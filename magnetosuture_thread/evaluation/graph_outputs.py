@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from magnetosuture_thread import interface
-from magnetosuture_thread.errors import GraphError, InvalidInputError
+from magnetosuture_thread.bags.reading import margins_of, nanoseconds, planar_pose, thread_observation
 from magnetosuture_thread.estimator import Disturbance
 from magnetosuture_thread.evaluation.frames import Array, EstimatedThread, FrameResult
 from magnetosuture_thread.evaluation.metrics import (
@@ -23,8 +22,9 @@ from magnetosuture_thread.evaluation.metrics import (
 )
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.messages.reading import margins_of, nanoseconds, planar_pose, thread_observation
-from magnetosuture_thread.thread_observation import ThreadObservation
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import GraphError, InvalidInputError
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.estimator import SlowParameter
 from magnetosuture_thread.estimator.stiffness import STIFFNESS_OVER_DRAG
 from magnetosuture_thread.evaluation.frames import (
@@ -26,8 +25,9 @@ from magnetosuture_thread.evaluation.frames import (
     WorstFrame,
     WorstFrames,
 )
+from magnetosuture_thread.geometry.barrier import BUILT_IN
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
+from magnetosuture_thread.settings.interface import CAMERA, CURRENTS, NEEDLE_COMMAND, NEEDLE_POSE, PREDICTED_THREAD
 from magnetosuture_thread.thread.margins import SOLID, Margins
 
 TARGETS = ("truth", "seen")  # what a prediction is compared with, the better one first

@@ -13,7 +13,6 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from magnetosuture_thread.barrier import BUILT_IN
 from magnetosuture_thread.evaluation.figures import (
     AGAINST,
     STAGES,
@@ -34,7 +33,8 @@ from magnetosuture_thread.evaluation.metrics import (
     finite_or_none,
 )
 from magnetosuture_thread.evaluation.reference import Evaluation
-from magnetosuture_thread.texts import printable
+from magnetosuture_thread.geometry.barrier import BUILT_IN
+from magnetosuture_thread.settings.texts import printable
 
 Value: TypeAlias = "str | int | float | None"
 Row: TypeAlias = "dict[str, Value | dict[str, Any]]"

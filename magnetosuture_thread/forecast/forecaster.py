@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.coils.filter import NeedleSafetyFilter
 from magnetosuture_thread.estimator import ThreadEstimate
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.rollout import (
     KINDS,
     NEEDLE_MARGIN,
@@ -30,8 +30,10 @@ from magnetosuture_thread.forecast.rollout import (
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace
 from magnetosuture_thread.geometry.polyline import Points, chain_inside, lay_behind_needle
-from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.scene import WALL_NAME, Scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread.margins import FrictionLaw
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose, check_pose
@@ -40,7 +42,6 @@ from magnetosuture_thread.thread.program import CONTACTS_PER_NODE
 from magnetosuture_thread.thread.rod import ENDED, NO_ROOM, RodFormulation
 from magnetosuture_thread.thread.solvers import BandedSolver
 from magnetosuture_thread.thread.step import WarmStart
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 Vector = NDArray[np.float64]
 Controller = Callable[[float, Vector, Vector], Vector]

@@ -7,17 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_uncounted_without_gil, compiled_within
-from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
-from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
-from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
-from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.safety.certificate import FilterData, pose_needle
-from magnetosuture_thread.safety.motion import (
+from magnetosuture_thread.coils.certificate import FilterData, pose_needle
+from magnetosuture_thread.coils.needle_motion import (
     filter_velocity,
     moved_needle,
     needle_margin,
 )
+from magnetosuture_thread.geometry.compiled import compiled, compiled_uncounted_without_gil, compiled_within
+from magnetosuture_thread.geometry.obstacles import WALL, Contacts, WorkspaceData, find_contacts
+from magnetosuture_thread.geometry.obstacles.chords import MAX_ELONGATION
+from magnetosuture_thread.geometry.obstacles.contacts import half_segment_distance
+from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.banded import SolverBuffers
 from magnetosuture_thread.thread.forces import write_forces

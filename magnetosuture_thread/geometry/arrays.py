@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.configuration import Quantity
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.texts import shortened
 
 
 def as_numbers(name: str, value: Any) -> NDArray[np.float64]:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_NEEDLE_TURN = 1.02 * np.pi  # of a needle, tail to tip [rad]; a little more than what suture needles have
 

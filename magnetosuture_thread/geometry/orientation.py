@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 
 def yaw_quaternion(angle: float) -> tuple[float, float]:

@@ -18,16 +18,16 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from magnetosuture_thread import InvalidInputError, MagnetosutureError, Scene
+from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.coils.bridge import INPUTS, NEEDLE, OPERATOR, BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.coil_system import FINALIZED, UNCONFIGURED, CoilSystem
 from magnetosuture_thread.coils.drivers import DriverState, make_driver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.interface import Service
-from magnetosuture_thread.messages import packing, reading
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import JITTER_KEYS, SCHEDULING, ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import raise_priority
+from magnetosuture_thread.settings.interface import Service
 
 INPUT_ERRORS = (InvalidInputError, ArithmeticError, ValueError)  # the last two in case a check is missing
 

@@ -21,13 +21,11 @@ from rclpy.time import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread import InvalidInputError, MagnetosutureError, interface, read_scene
+from magnetosuture_thread import InvalidInputError, MagnetosutureError, read_scene
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.packing import packed_header, packed_point, packed_twist
 from magnetosuture_thread.console.server import ConsoleServer, serve_until
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import Service
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_header, packed_point, packed_twist
 from magnetosuture_thread.nodes import console_state as page
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, Latest, Services, answer_requests
@@ -35,9 +33,12 @@ from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, PERIOD, GuardedNod
 from magnetosuture_thread.nodes.parameters import declare, given_parameters, init
 from magnetosuture_thread.nodes.run import end_signals
 from magnetosuture_thread.planning.procedure import read_procedure
-from magnetosuture_thread.resources import shipped_procedures
 from magnetosuture_thread.rig.camera import encode_jpeg
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.interface import Service
+from magnetosuture_thread.settings.resources import shipped_procedures
+from magnetosuture_thread.settings.texts import shortened
 from magnetosuture_thread.vision.images import image_of
 
 NAME = "console"

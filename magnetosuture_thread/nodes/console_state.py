@@ -11,12 +11,12 @@ from magnetosuture_msgs import msg
 from nav_msgs.msg import Path
 
 from magnetosuture_thread import Disc, InvalidInputError, Scene, SceneShape
+from magnetosuture_thread.bags.markers import forecast_events
+from magnetosuture_thread.bags.reading import constant_name, heading_known, margins_of, needle_pose
+from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.estimator.disturbance import disturbance_text
 from magnetosuture_thread.geometry.orientation import heading_angle
-from magnetosuture_thread.messages.markers import forecast_events
-from magnetosuture_thread.messages.reading import constant_name, heading_known, margins_of, needle_pose
-from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.settings.texts import shortened
 from magnetosuture_thread.thread.margins import node_clearance
 
 MAX_THREAD_NODES = 2001  # with the most segments that thread_model accepts

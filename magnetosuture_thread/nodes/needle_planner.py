@@ -19,13 +19,13 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.clock import Clock, ClockType
 from std_msgs.msg import Header
 
-from magnetosuture_thread import InvalidInputError, Scene, interface
+from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.estimator.disturbance import disturbance_text
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.interface import Service
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_path, packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import MAX_REASON_CHARS, GuardedNode, ManagedNode, SceneFollower, reason_of
 from magnetosuture_thread.nodes.parameters import settings_of
@@ -38,8 +38,9 @@ from magnetosuture_thread.planning.session import (
     ProcedureStatus,
     compile_planning,
 )
-from magnetosuture_thread.texts import shortened
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.interface import Service
+from magnetosuture_thread.settings.texts import shortened
 
 PERIOD = 0.1  # s between two messages of the state where only progress or clearance have changed
 

@@ -29,15 +29,16 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
-from magnetosuture_thread.compiled import compilations
-from magnetosuture_thread.configuration import Configuration, configuration_fields, from_mapping, to_mapping
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.parameters import as_declared, declare, given_parameters, plain_value
-from magnetosuture_thread.texts import shortened
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.texts import shortened
 
 C = TypeVar("C", bound=Configuration)
 E = TypeVar("E")  # a publisher, subscription, service or timer, or another part of a node with a method `destroy`

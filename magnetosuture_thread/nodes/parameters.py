@@ -24,7 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_default_context
 
 from magnetosuture_thread import ConfigurationError
-from magnetosuture_thread.configuration import (
+from magnetosuture_thread.settings.configuration import (
     ROS_PARAMETERS,
     Configuration,
     ConfigurationField,
@@ -33,7 +33,7 @@ from magnetosuture_thread.configuration import (
     parse_parameter_value,
     to_mapping,
 )
-from magnetosuture_thread.parameter_files import (
+from magnetosuture_thread.settings.parameter_files import (
     EVERY_NODE,
     check_list_value,
     format_key,
@@ -41,7 +41,7 @@ from magnetosuture_thread.parameter_files import (
     node_of_key,
     read_sections,
 )
-from magnetosuture_thread.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 C = TypeVar("C", bound=Configuration)
 

@@ -9,8 +9,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.duration import Duration
 
 from magnetosuture_thread import ConfigurationError, InvalidInputError, Scene
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import packed_pose_stamped, packed_twist
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.packing import packed_pose_stamped, packed_twist
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
 from magnetosuture_thread.nodes.run import DELIVERY_TIMEOUT

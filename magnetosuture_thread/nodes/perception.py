@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from magnetosuture_thread.settings.errors import GraphError
 
 
 def perception(**options: Any) -> tuple[VisionTrackerNode, ThreadModelNode]:

@@ -12,14 +12,15 @@ import rclpy.time
 from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rosgraph_msgs.msg import Clock
 
-from magnetosuture_thread import InvalidInputError, interface
+from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread.bags.cdr import header_stamp
+from magnetosuture_thread.bags.reading import nanoseconds
 from magnetosuture_thread.bags.storage import MAX_SILENCE, silence_text
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.messages.cdr import header_stamp
-from magnetosuture_thread.messages.reading import nanoseconds
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import Inbox, answer_requests, joined
 from magnetosuture_thread.nodes.timeline import Timeline
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import GraphError
 
 CLOCK_PERIOD = 10_000_000  # ns of simulated time between two messages on /clock
 START_TIMEOUT = 180.0  # s for all nodes to be there

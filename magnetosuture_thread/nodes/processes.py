@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes.run import raise_priority
+from magnetosuture_thread.settings.errors import GraphError
 
 # Camera frames over shared memory and TCP: Fast DDS's defaults lose most large best-effort messages.
 LARGE_DATA = "LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true"

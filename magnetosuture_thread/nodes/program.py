@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from types import FrameType
 
-from magnetosuture_thread.errors import missing_module
+from magnetosuture_thread.settings.errors import missing_module
 
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -15,16 +15,17 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import String
 
-from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, interface, read_scene
-from magnetosuture_thread.messages.packing import camera_outputs, ground_truth_outputs, packed_image
+from magnetosuture_thread import ConfigurationError, InvalidInputError, MagnetosutureError, Scene, read_scene
+from magnetosuture_thread.bags.packing import camera_outputs, packed_image
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
 from magnetosuture_thread.nodes.parameters import declare, given_parameters
 from magnetosuture_thread.nodes.timeline import Timeline
 from magnetosuture_thread.rig.camera import encode_jpeg
 from magnetosuture_thread.rig.faults import Fault
-from magnetosuture_thread.rig.rig import Rig, RigFrame
+from magnetosuture_thread.rig.rig import Rig, RigFrame, ground_truth_outputs
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.settings import interface
 
 PERIOD = 0.005  # s between two looks at the boards, which keep real time; simulated, between two messages on /clock
 EPOCH = 1_000_000_000  # ns; simulated time begins here, as time 0 means "not set" in ROS

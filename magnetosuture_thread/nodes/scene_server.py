@@ -7,12 +7,12 @@ from functools import partial
 from typing import Any
 
 from magnetosuture_thread import MagnetosutureError, Scene, read_scene
-from magnetosuture_thread.interface import SCENE_SERVER, Service
-from magnetosuture_thread.messages.markers import packed_scene_markers
-from magnetosuture_thread.messages.scene import packed_scene, parse_shape_message
+from magnetosuture_thread.bags.markers import packed_scene_markers
+from magnetosuture_thread.bags.scene_message import packed_scene, parse_shape_message
+from magnetosuture_thread.geometry.scene_files import SceneEditor, SceneServerSettings
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode
-from magnetosuture_thread.scene.files import SceneEditor, SceneServerSettings
+from magnetosuture_thread.settings.interface import SCENE_SERVER, Service
 
 
 class SceneServerNode(ManagedNode[SceneServerSettings]):

@@ -23,23 +23,23 @@ from magnetosuture_thread import (
     Scene,
     ThreadEstimate,
     ThreadForecaster,
-    interface,
 )
-from magnetosuture_thread.configuration import to_mapping
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.cdr import header_stamp
+from magnetosuture_thread.bags.markers import packed_forecast_markers, packed_thread_markers
+from magnetosuture_thread.bags.packing import estimate_outputs, packed_forecast, prediction_outputs
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
+from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings, parse_material
+from magnetosuture_thread.estimator.thread_session import WAITING, PredictionResult, ThreadSession
 from magnetosuture_thread.forecast import make_forecaster
 from magnetosuture_thread.forecast.published import PublishedForecasts
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.cdr import header_stamp
-from magnetosuture_thread.messages.markers import packed_forecast_markers, packed_thread_markers
-from magnetosuture_thread.messages.packing import estimate_outputs, packed_forecast, prediction_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health, ManagedNode, SceneFollower
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, prepare_paths
-from magnetosuture_thread.safety.motion import NeedleKinematics
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.configuration import to_mapping
 from magnetosuture_thread.thread.prediction import STARTED
 from magnetosuture_thread.thread.program import SOLVED
-from magnetosuture_thread.thread_model.session import WAITING, PredictionResult, ThreadSession
-from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings, parse_material
 
 if TYPE_CHECKING:
     from magnetosuture_thread.vision.tracker import Track

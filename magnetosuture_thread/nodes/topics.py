@@ -20,9 +20,10 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from magnetosuture_thread import InvalidInputError, interface
-from magnetosuture_thread.interface import Channel, Quality
-from magnetosuture_thread.untrusted import MAX_BLOCK_BYTES
+from magnetosuture_thread import InvalidInputError
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.interface import Channel, Quality
+from magnetosuture_thread.settings.untrusted import MAX_BLOCK_BYTES
 
 if TYPE_CHECKING:
     from magnetosuture_thread.nodes.node import GuardedNode

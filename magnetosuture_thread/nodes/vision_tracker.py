@@ -11,11 +11,12 @@ from geometry_msgs.msg import PointStamped
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from magnetosuture_thread import InvalidInputError, Scene, interface
-from magnetosuture_thread.messages import reading
-from magnetosuture_thread.messages.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
+from magnetosuture_thread import InvalidInputError, Scene
+from magnetosuture_thread.bags import reading
+from magnetosuture_thread.bags.packing import Outputs, packed_tracker_state, pose_outputs, thread_outputs
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import ManagedNode, SceneFollower
+from magnetosuture_thread.settings import interface
 from magnetosuture_thread.vision.images import image_of
 from magnetosuture_thread.vision.lens import Lens, lens_of
 from magnetosuture_thread.vision.settings import VisionTrackerSettings

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import MagnetosutureError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import WELL_MET, NeedlePlanner, PlanningError, place_of
@@ -29,6 +28,7 @@ from magnetosuture_thread.planning.procedure import (
 )
 from magnetosuture_thread.planning.tracking import PathTracker, RestDetector
 from magnetosuture_thread.planning.verdict import GoalJudge, centre_of, left_to_wind, winding
+from magnetosuture_thread.settings.errors import MagnetosutureError
 
 Vector = NDArray[np.float64]
 

@@ -9,12 +9,13 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_chord
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.scene import WALL_NAME, Scene, find_collision
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import WALL_NAME, find_collision
+from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 Vector = NDArray[np.float64]
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from magnetosuture_thread.compiled import compiled, compiled_without_gil
+from magnetosuture_thread.geometry.compiled import compiled, compiled_without_gil
 from magnetosuture_thread.geometry.obstacles.distances import measure, pack_obstacles
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.scene import Scene
 
 CELLS = 400  # of the clearance map across the dish
 STRIDE = 2  # of the clearance map's grid between two points of the lattice

@@ -13,10 +13,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, MagnetosutureError
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.forecaster import make_forecaster
 from magnetosuture_thread.geometry.needle_arc import needle_points
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import WALL_NAME
 from magnetosuture_thread.planning.path import (
     CELLS,
     DIRECTIONS,
@@ -62,9 +65,7 @@ from magnetosuture_thread.planning.verdict import (
     solid_of,
     winding,
 )
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import WALL_NAME, Scene
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, MagnetosutureError
 
 Vector = NDArray[np.float64]
 

@@ -19,7 +19,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
-from magnetosuture_thread.configuration import (
+from magnetosuture_thread.geometry.scene_checks import WALL_NAME
+from magnetosuture_thread.settings.configuration import (
     Configuration,
     from_mapping,
     quantity,
@@ -27,9 +28,8 @@ from magnetosuture_thread.configuration import (
     read_yaml_text,
     suggest_names,
 )
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.resources import find_procedure_file
-from magnetosuture_thread.scene import WALL_NAME
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.resources import find_procedure_file
 
 MAX_GOALS = 100
 HEADING_TOLERANCE = 0.3  # rad; of `GoTo.heading`

@@ -10,11 +10,12 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.geometry.needle_arc import check_needle
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.planning.executor import (
     ENDED,
     MAX_WAIT,
@@ -28,10 +29,9 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath, body_clearance
 from magnetosuture_thread.planning.planner import NeedlePlanner, chains, planned_duration
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import Dish, Scene
-from magnetosuture_thread.shared_parameters import shared_parameter
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 NO_POSE = "no needle pose yet"
 

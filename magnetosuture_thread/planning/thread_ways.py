@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.forecast.forecaster import ForecastStart, ThreadForecaster
 from magnetosuture_thread.forecast.published import follow_plan
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside, points_at
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.procedure import BringEnd, Lay, TakeOff, ThreadGoal, Unwind
 from magnetosuture_thread.planning.verdict import part_along, resampled
-from magnetosuture_thread.safety.motion import NeedleKinematics
 from magnetosuture_thread.thread.prediction import NeedlePose
 
 Vector = NDArray[np.float64]

@@ -9,6 +9,8 @@ import shapely
 from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import WALL_NAME
 from magnetosuture_thread.planning.procedure import (
     BringEnd,
     Lay,
@@ -19,7 +21,6 @@ from magnetosuture_thread.planning.procedure import (
     WindingGoal,
     Wrap,
 )
-from magnetosuture_thread.scene import WALL_NAME, Scene
 
 Vector = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.rig.camera import Cover
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 GLARE, HAND, TOOL = "glare", "hand", "tool"
 DIM, OVEREXPOSED = "dim", "overexposed"

@@ -27,7 +27,7 @@ from typing import BinaryIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import ConfigurationError, GraphError
+from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
 ACKNOWLEDGED = b"\xff"
 ADDRESSES = range(0x80, 0x88)

@@ -9,11 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import InvalidInputError, SolverError
+from magnetosuture_thread.bags.cdr import Stamp
+from magnetosuture_thread.bags.packing import Outputs, packed_path, packed_pose_stamped, packed_wrench
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import find_collision
 from magnetosuture_thread.rig.camera import Cover, DishCamera, Image
 from magnetosuture_thread.rig.faults import COIL_STUCK
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.scene import Scene, find_collision
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import InvalidInputError, SolverError
 
 Vector = NDArray[np.float64]
 
@@ -269,3 +273,10 @@ class Rig:
             return frame
         image = self.camera.render(frame.tail, frame.heading, frame.thread, frame.covers, frame.gain)
         return replace(frame, image=image)
+
+
+def ground_truth_outputs(stamp: Stamp, frame: RigFrame) -> Outputs:
+    """Give where needle and thread of a simulation are, and how the thread pulls."""
+    yield interface.GROUND_TRUTH_NEEDLE, packed_pose_stamped(stamp, frame.tail, frame.heading)
+    yield interface.GROUND_TRUTH_THREAD, packed_path(stamp, frame.thread)
+    yield interface.GROUND_TRUTH_PULL, packed_wrench(stamp, frame.pull, frame.moment)

@@ -9,12 +9,12 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.configuration import Configuration, quantity
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import check_needle, needle_axis
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import find_collision
 from magnetosuture_thread.rig.camera import LOOK_OF_KIND, LOOKS, CameraScene, DishCamera, Lighting, Look
 from magnetosuture_thread.rig.faults import Fault, FaultSchedule
 from magnetosuture_thread.rig.mechanics.contact import Surface
@@ -22,8 +22,9 @@ from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.mechanics.needle import CoilField, NeedleBody
 from magnetosuture_thread.rig.mechanics.rod import NeedleJoint, ThreadProperties
 from magnetosuture_thread.rig.power import StageProcess
-from magnetosuture_thread.scene import Scene, find_collision
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.settings.configuration import Configuration, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)

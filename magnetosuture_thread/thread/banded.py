@@ -36,7 +36,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import (
+    compiled,
+    compiled_inline,
+    compiled_inner,
+    compiled_uncounted,
+    compiled_within,
+)
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.program import (
     SPAN,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import (
+from magnetosuture_thread.geometry.barrier import (
     COMPRESSION,
     CONNECTIVITY,
     ENHANCED_CONNECTIVITY,
@@ -18,7 +18,7 @@ from magnetosuture_thread.barrier import (
     BarrierRows,
     RowBarrier,
 )
-from magnetosuture_thread.compiled import compiled_uncounted
+from magnetosuture_thread.geometry.compiled import compiled_uncounted
 from magnetosuture_thread.geometry.obstacles import WALL as DISH_WALL
 from magnetosuture_thread.geometry.obstacles import Contacts, Workspace, wall_contact
 from magnetosuture_thread.geometry.polyline import Points

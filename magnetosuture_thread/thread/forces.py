@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled, compiled_within
+from magnetosuture_thread.geometry.compiled import compiled, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread import mechanics
 from magnetosuture_thread.thread.margins import FrictionState

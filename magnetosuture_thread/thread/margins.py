@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import OBSTACLE, WALL, BarrierRows
+from magnetosuture_thread.geometry.barrier import OBSTACLE, WALL, BarrierRows
 from magnetosuture_thread.geometry.polyline import Points
 
 SOLID = (OBSTACLE, WALL)

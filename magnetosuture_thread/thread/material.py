@@ -11,10 +11,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 LENGTH = bounded("m", 1e-4, 2.0)
 SEGMENTS = bounded("", 3, 2000)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.polyline import Points
 
 END_CORRECTION = 1.0 / 12.0  # of a quadrature at its end

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.geometry.barrier import Barrier
 from magnetosuture_thread.geometry.obstacles import WALL, Workspace
 from magnetosuture_thread.geometry.polyline import Points
 from magnetosuture_thread.thread.barriers import (

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.configuration import Quantity
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.arrays import as_numbers, finite_array
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import Margins
 

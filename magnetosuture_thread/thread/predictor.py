@@ -10,14 +10,15 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.barrier import Barrier, check_barriers
-from magnetosuture_thread.configuration import Quantity
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.arrays import finite_array
+from magnetosuture_thread.geometry.barrier import Barrier, check_barriers
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, chain_inside
-from magnetosuture_thread.scene import Scene, find_collision
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_checks import find_collision
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.configuration import Quantity
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import Margins
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread, check_scene

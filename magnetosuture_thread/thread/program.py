@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_inner
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_inner
 from magnetosuture_thread.geometry.obstacles import Contacts
 from magnetosuture_thread.geometry.polyline import Points
 

@@ -34,11 +34,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.barrier import Barrier
-from magnetosuture_thread.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.geometry.barrier import Barrier
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_inner, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles import Workspace, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.thread import banded, mechanics
 from magnetosuture_thread.thread.barriers import Compression, Connectivity, move_inside
 from magnetosuture_thread.thread.contact_rows import (

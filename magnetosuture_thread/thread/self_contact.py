@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import NO_OBSTACLE, BarrierRows, RowBarrier
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import ConfigurationError, SolverError
+from magnetosuture_thread.geometry.barrier import NO_OBSTACLE, BarrierRows, RowBarrier
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.errors import ConfigurationError, SolverError
 from magnetosuture_thread.thread.material import Thread
 
 REACH = 0.5  # segments; what is farther from touching than this has no row

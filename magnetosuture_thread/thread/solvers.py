@@ -13,8 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from magnetosuture_thread.configuration import Quantity
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.configuration import Quantity
 from magnetosuture_thread.thread.banded import BandedSolver
 from magnetosuture_thread.thread.program import SOLVED, SPAN, ChainProgram, Solution, Solver, Vector, residuals_of
 

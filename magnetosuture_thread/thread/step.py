@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.barrier import Barrier, BarrierRows
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.barrier import Barrier, BarrierRows
 from magnetosuture_thread.geometry.obstacles import Workspace, half_segment_distances
 from magnetosuture_thread.geometry.polyline import Points, chain_along
+from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.barriers import ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.material import Thread

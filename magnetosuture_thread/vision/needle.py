@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle, NeedleSize, fit_arc
 from magnetosuture_thread.vision.images import RIM_PX, Layer, Picture, SceneMask, middle
 from magnetosuture_thread.vision.template import (

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.appearance import (
     FAINTEST,
     GAP_PX,

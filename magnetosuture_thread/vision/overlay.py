@@ -9,11 +9,11 @@ from types import TracebackType
 import cv2
 import numpy as np
 
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
-from magnetosuture_thread.outputs import output_problem
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.outputs import output_problem
 from magnetosuture_thread.vision.tracker import State, Track
 
 VIDEOS = {".mp4": "mp4v", ".avi": "MJPG"}

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from magnetosuture_thread.configuration import Configuration, autostart_parameter, quantity
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.shared_parameters import shared_parameter
+from magnetosuture_thread.settings.configuration import Configuration, autostart_parameter, quantity
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 MIN_SCALE = 1e-7  # m; of a pixel: finer than light resolves
 MIN_SIDE_PX = 64  # of a frame that is looked at

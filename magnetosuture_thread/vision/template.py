@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.vision.arc import Arc
 from magnetosuture_thread.vision.images import Layer, Picture
 

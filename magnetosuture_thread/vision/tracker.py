@@ -14,11 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
-from magnetosuture_thread.scene.scene import Scene
-from magnetosuture_thread.thread_observation import ThreadObservation, ThreadPiece
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation, ThreadPiece
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.arc import LengthEstimator, MeasuredNeedle
 from magnetosuture_thread.vision.centreline import find_centreline, without_needle
 from magnetosuture_thread.vision.dish import DishWatch, FoundDish

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from magnetosuture_thread.errors import BagError
-from magnetosuture_thread.untrusted import MAX_PIXELS
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.untrusted import MAX_PIXELS
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")  # endings
 

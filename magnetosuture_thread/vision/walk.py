@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.vision.images import middle, sample
 
 STEP_PX = 2.0  # of the walk

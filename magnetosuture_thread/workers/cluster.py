@@ -14,7 +14,7 @@ from typing import Any
 import dask
 from distributed import Client, KilledWorker, as_completed, get_worker
 
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.workers import Log, Progress, Work, WorkerDiedError
 
 CONNECT_TIMEOUT = 20.0  # s to reach the scheduler

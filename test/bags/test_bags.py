@@ -16,7 +16,7 @@ from magnetosuture_thread.bags.message_types import DecoderCache, typestore
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import HEADER, STRING, cdr, read, stamped, texts, write_mcap, write_rosbag
 
 COUNT = 300

@@ -23,7 +23,7 @@ from magnetosuture_thread.bags.message_types import DecoderCache
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import STRING, cdr, read, texts, write_mcap, write_rosbag
 
 PATH = "nav_msgs/msg/Path"

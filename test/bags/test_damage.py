@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import SECOND, STRING, Message, cdr, chunks_of, read, texts, write_many_chunks, write_mcap
 
 Untouched = Callable[[int, int], bool]

@@ -16,8 +16,8 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.recording import Recording
 from magnetosuture_thread.bags.storage import MessageDefinition
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError, ConfigurationError
-from magnetosuture_thread.interface import (
+from magnetosuture_thread.settings.errors import BagError, ConfigurationError
+from magnetosuture_thread.settings.interface import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     GROUND_TRUTH_NEEDLE,

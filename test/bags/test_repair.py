@@ -20,7 +20,7 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from test.bags.bags import STRING, cdr, read, texts, write_mcap, write_rosbag
 
 PATH = "nav_msgs/msg/Path"

@@ -19,9 +19,9 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.tables import TIMES
-from magnetosuture_thread.files import RANGE_BYTES, open_ranges, parse_location
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.files import RANGE_BYTES, open_ranges, parse_location
 from test.bags.bags import (
     IMAGE,
     SECOND,

@@ -19,7 +19,7 @@ RECORDER = """
 import os, resource, signal, sys
 from pathlib import Path
 from magnetosuture_thread.bags.writer import BagWriter
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 folder, limit = Path(sys.argv[1]), int(sys.argv[2])
 bag = BagWriter(folder, {"setup": "example"})
 bag.add_topic("/noise", "std_msgs/msg/UInt8MultiArray")

@@ -12,7 +12,7 @@ import pytest
 from benchmarks import keep_out
 from benchmarks.__main__ import main
 from benchmarks.bridge import command as bridge
-from magnetosuture_thread.errors import GraphError
+from magnetosuture_thread.settings.errors import GraphError
 
 WRONG = ["", "dance", "solver --json .", "solver --peers all", "bridge --kills -1", "attack moon", "vision --count 0"]
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from magnetosuture_thread.calibration.parameters import with_stiffness_over_drag
 from magnetosuture_thread.calibration.recorded_run import RecordedRun, read_run
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.thread_session import ThreadSession
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.geometry.polyline import Points, points_at
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread_model.session import ThreadSession
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12, max_step=0.07)  # one step a pose
 SILK = ThreadModelSettings(material="silk_6_0", thread_length=0.15, segments=30, max_step=0.07)

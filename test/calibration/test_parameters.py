@@ -22,8 +22,8 @@ from magnetosuture_thread.calibration.result import (
     parameter_table,
     to_yaml,
 )
-from magnetosuture_thread.parameter_files import load_setup
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.settings.parameter_files import load_setup
 
 SETTINGS = ThreadModelSettings(thread_length=0.019, segments=12)
 ALL = [(formulation, parameter) for formulation, many in OF_FORMULATION.items() for parameter in many]

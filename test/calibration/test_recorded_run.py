@@ -18,9 +18,9 @@ from magnetosuture_thread.calibration.recorded_run import (
     replay_with_parameters,
 )
 from magnetosuture_thread.calibration.result import BagFit
-from magnetosuture_thread.errors import BagError, InvalidInputError
 from magnetosuture_thread.evaluation.frames import Observation
 from magnetosuture_thread.evaluation.metrics import prediction_error_percent
+from magnetosuture_thread.settings.errors import BagError, InvalidInputError
 from test.calibration.runs import LENGTH, SETTINGS, path, rig_run, stiff
 
 TRUE = 1.3e-9

@@ -18,7 +18,7 @@ from magnetosuture_thread.coils.allocation import (
 from magnetosuture_thread.coils.field import LoopCoils, coils_around
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 NEEDLE = CoilBridgeSettings().needle()
 COILS = LoopCoils(coils_around((0.0, np.pi / 2, np.pi, -np.pi / 2), 0.05, 0.025, 1.2e-3))

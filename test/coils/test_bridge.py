@@ -18,9 +18,9 @@ from magnetosuture_thread.coils.bridge import BridgeOutput, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 PERIOD = 0.005
 READY = DriverState(True)

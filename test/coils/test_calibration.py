@@ -9,7 +9,7 @@ import pytest
 from magnetosuture_thread.coils.calibration import CoilCalibration, read_calibration
 from magnetosuture_thread.coils.field import CoilProperties
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 COILS = (
     CoilProperties("east", 0.01, 0.052, 0.024, 1.1e-3, 2.5, 3.0e-5),

@@ -12,9 +12,9 @@ import pytest
 from magnetosuture_thread.coils.calibration import ProbeMeasurements, fit_calibration
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.rig.mechanics.needle import CoilField
 from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 UNLIKE = (
     CoilProperties("coil_0", 0.05, 0.052, 0.024, 1.1e-3),

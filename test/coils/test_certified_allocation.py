@@ -13,7 +13,7 @@ from magnetosuture_thread.coils.inputs import Pose
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
 from magnetosuture_thread.geometry.obstacles import Polygon
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True, needle_length=0.0025, keep_out=2.5e-4)
 ZERO = SETTINGS.allocation().zero()

@@ -11,8 +11,8 @@ from magnetosuture_thread.coils.coil_system import CoilSystem
 from magnetosuture_thread.coils.drivers import RecordingDriver
 from magnetosuture_thread.coils.latch import StopRecord
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 
 
 @pytest.fixture
@@ -68,7 +68,11 @@ def test_any_switch_or_fault_before_cancels_that_it_arms_when_ready(system, swit
 
 
 def test_only_barriers_that_were_named_at_the_start_or_imported_by_others_are_taken(system):
-    named, imported, neither = "not_installed_yet:Bound", "magnetosuture_thread.barrier:Barrier", "antigravity:Bound"
+    named, imported, neither = (
+        "not_installed_yet:Bound",
+        "magnetosuture_thread.geometry.barrier:Barrier",
+        "antigravity:Bound",
+    )
     system.import_barriers([named])
     system.check_barriers([named, imported])
     for name in (neither, "not_installed_yet:Another"):

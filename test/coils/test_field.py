@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.field import CoilProperties, LoopCoils, coils_around
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 DISTANCE, RADIUS, FIELD = 0.05, 0.025, 1.2e-3
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from magnetosuture_thread.campaign.loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.coils.allocation import MAX_CHANGE, CoilGainEstimator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.rig.closed_loop import START, ClosedLoop, Measurement
 from magnetosuture_thread.rig.rig import Rig, RigFrame
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
 
 SETTINGS = CoilBridgeSettings(motion_compensation=True, thread_drag=0.0093)
 COILS, NEEDLE = SETTINGS.coil_field(), SETTINGS.needle()

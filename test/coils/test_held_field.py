@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.motion_observer import MotionDisturbance
-from magnetosuture_thread.scene import Dish, Scene
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.rig.setups import read_setup
 
 
 @pytest.mark.parametrize("name", ["hernia_ring", "petri_35mm_polyamide", "petri_150mm_silk"])

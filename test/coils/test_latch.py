@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from magnetosuture_thread.coils.latch import ArmingLatch, ArmingState
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 
 def armed() -> ArmingLatch:

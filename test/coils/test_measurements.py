@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.coils.calibration import read_measurements
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 HEADER = "coil,current,x,y,bx,by\n"
 

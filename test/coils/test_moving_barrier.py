@@ -10,10 +10,10 @@ import pytest
 from magnetosuture_thread.coils.bridge import NEEDLE, CoilBridge
 from magnetosuture_thread.coils.drivers import DriverState
 from magnetosuture_thread.coils.latch import ArmingLatch
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.estimator.thread_session import ThreadSession
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.rig.setups import read_setup
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread_model.session import ThreadSession
 from test.examples import FOLDER, load_example
 
 MovingDisc = load_example("barriers/moving_disc").MovingDisc

@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.coils.inputs import PoseExtrapolator
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 NEEDLE = CoilBridgeSettings().needle().kinematics
 EAST = np.array([1.0, 0.0])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 
 @pytest.mark.parametrize(("keep_out", "pose_margin"), [(0.001, 0.0), (0.0007, 0.0003)])

@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.coils.coil_system import UNCLEAN_END, CoilSystem
 from magnetosuture_thread.coils.latch import RecordedState, StopRecord
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 
 @pytest.fixture

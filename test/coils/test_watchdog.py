@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.coils.inputs import AGE_WINDOW, CommandWatchdog, StampAges
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 TIMEOUT = 0.1
 EAST = np.array([0.01, 0.0])

@@ -17,9 +17,9 @@ from magnetosuture_thread import cli
 from magnetosuture_thread.calibration.parameters import stiffness_over_drag
 from magnetosuture_thread.commands.calibrate import calibrate_bags, material_named, thread_settings
 from magnetosuture_thread.commands.render import render_bag
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
 from test.bags.bags import copy_with_notes
 from test.calibration.runs import LENGTH, rig_run
 

@@ -18,8 +18,8 @@ import pytest
 
 from magnetosuture_thread import cli
 from magnetosuture_thread.commands.evaluate import evaluate_bags
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.evaluation.tables import TIMES
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.workers import Work, WorkerDiedError, cluster, make_runner
 
 SOURCE = """

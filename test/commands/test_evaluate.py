@@ -15,8 +15,8 @@ from magnetosuture_thread.bags.reader import Bag
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.evaluate import evaluate_bags, find_bags
 from magnetosuture_thread.commands.replay import replay_offline
-from magnetosuture_thread.errors import BagError, ConfigurationError
-from magnetosuture_thread.interface import NEEDLE_POSE, PREDICTED_THREAD
+from magnetosuture_thread.settings.errors import BagError, ConfigurationError
+from magnetosuture_thread.settings.interface import NEEDLE_POSE, PREDICTED_THREAD
 from test.bags.bags import copy_with_notes
 
 

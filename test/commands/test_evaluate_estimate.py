@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import packed_path
 from magnetosuture_thread.bags.reader import RecordedMessage
+from magnetosuture_thread.bags.reading import path_points, stamp_of
 from magnetosuture_thread.commands.evaluate import evaluate_bags
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import MEASURED_THREAD
-from magnetosuture_thread.messages.packing import packed_path
-from magnetosuture_thread.messages.reading import path_points, stamp_of
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.interface import MEASURED_THREAD
 from test.bags.bags import changed
 from test.conftest import arc
 

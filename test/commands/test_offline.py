@@ -16,23 +16,24 @@ import numpy as np
 import pytest
 
 from benchmarks.vision.frames import distorted, lens_with
-from magnetosuture_thread import cli, interface
+from magnetosuture_thread import cli
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import packed_compressed_image
 from magnetosuture_thread.bags.reader import Bag, RecordedMessage
+from magnetosuture_thread.bags.reading import stamp_of
 from magnetosuture_thread.bags.recording import Recording
+from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.recorded import BagInput, ObservationReader, chosen_source, predictions
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.commands.replay import replay_offline
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages.packing import packed_compressed_image
-from magnetosuture_thread.messages.reading import stamp_of
-from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.geometry.scene import Scene, SceneShape
 from magnetosuture_thread.rig.camera import encode_jpeg
-from magnetosuture_thread.scene import Scene, SceneShape
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.vision.images import decode_image
 from test.bags.bags import changed, make, stamped
 from test.vision.scenes import rod

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from magnetosuture_thread.commands.output import whole_folder
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 
 
 def test_the_later_of_two_runs_to_one_output_is_refused(tmp_path: Path):

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.commands.render import render_bag
-from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.setups import read_setup
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import BagError, ConfigurationError
 from magnetosuture_thread.vision.images import decode_image
 
 SETUP = read_setup("petri_35mm_polyamide")

@@ -17,12 +17,15 @@ from std_srvs.srv import SetBool
 
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.reading import nanoseconds
 from magnetosuture_thread.commands.live import replay_live
 from magnetosuture_thread.commands.render import render_bag
 from magnetosuture_thread.commands.replay import replay_offline
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.reference import ReferenceTrajectory
-from magnetosuture_thread.interface import (
+from magnetosuture_thread.nodes import topics
+from magnetosuture_thread.rig.setups import read_setup
+from magnetosuture_thread.settings.errors import BagError
+from magnetosuture_thread.settings.interface import (
     ESTIMATED_THREAD,
     MARGINS,
     MEASURED_THREAD,
@@ -31,9 +34,6 @@ from magnetosuture_thread.interface import (
     THREAD_OBSERVATION,
     Channel,
 )
-from magnetosuture_thread.messages.reading import nanoseconds
-from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.setups import read_setup
 from test.nodes.conftest import Graph, own_context
 
 pytestmark = pytest.mark.whole_graph

@@ -11,14 +11,15 @@ import pytest
 
 from magnetosuture_thread.bags.message_types import typestore
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.scene_message import packed_scene, parse_scene_message
 from magnetosuture_thread.bags.writer import BagWriter
 from magnetosuture_thread.commands.live import GraphInput
 from magnetosuture_thread.commands.recorded import SETUP_NOTE, BagInput, open_bag
-from magnetosuture_thread.errors import BagError, ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.interface import COMPRESSED_IMAGE, IMAGE, SCENE
-from magnetosuture_thread.messages.scene import packed_scene, parse_scene_message
-from magnetosuture_thread.scene import Dish, Scene, SceneShape, read_scene
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene_files import read_scene
+from magnetosuture_thread.settings.errors import BagError, ConfigurationError
+from magnetosuture_thread.settings.interface import COMPRESSED_IMAGE, IMAGE, SCENE
 from magnetosuture_thread.vision.images import decode_image
 from test.bags.bags import make
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.commands.evaluate import score_rig
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 
 MATERIAL = {
     "L_m": 0.02,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread.cli import main
-from magnetosuture_thread.scene import read_scene, write_scene
-from test.scene.scenes import every_shape
+from magnetosuture_thread.geometry.scene_files import read_scene, write_scene
+from test.geometry.scene.scenes import every_shape
 
 HOSTILE = """\
 dish: {diameter: 0.035, depth: 0.003}

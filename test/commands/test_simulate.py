@@ -17,15 +17,15 @@ import cv2
 import pytest
 
 from magnetosuture_thread.bags.reader import Bag
+from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.cli import main
+from magnetosuture_thread.commands import reproduce_thread_behavior as thread_behavior_module
 from magnetosuture_thread.commands import simulate as simulate_module
 from magnetosuture_thread.commands.replay import replay_offline
 from magnetosuture_thread.commands.simulate import SUMMARY_FILE, simulate, too_slow
-from magnetosuture_thread.errors import ConfigurationError, GraphError
-from magnetosuture_thread.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
-from magnetosuture_thread.messages.scene import parse_scene_message
-from magnetosuture_thread.reproduce import thread_behavior as thread_behavior_module
-from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.geometry.scene_files import read_scene
+from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
+from magnetosuture_thread.settings.interface import NEEDLE_COMMAND, PROCEDURE_PLAN, PROCEDURE_STATE, SCENE, TIP_SETPOINT
 
 pytestmark = pytest.mark.whole_graph
 

@@ -16,10 +16,17 @@ import pytest
 from magnetosuture_msgs.msg import Disc, SceneShape
 from magnetosuture_msgs.srv import EditShape
 
-from magnetosuture_thread.interface import ALL_NODES, OPERATOR_COMMAND, PLANNER, PROCESSES, SCENE_SERVER, Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.processes import NodeProcesses, environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.settings.interface import (
+    ALL_NODES,
+    OPERATOR_COMMAND,
+    PLANNER,
+    PROCESSES,
+    SCENE_SERVER,
+    Service,
+)
 from test.commands.test_console import tail, wait
 from test.console.visitor import Page, opened
 from test.nodes.conftest import Graph, own_context

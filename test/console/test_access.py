@@ -15,7 +15,7 @@ from magnetosuture_thread.console.access import (
 )
 from magnetosuture_thread.console.client import MAX_UNACKNOWLEDGED, Outbox
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 TOKEN = "a-token-of-the-tests"
 

@@ -13,7 +13,7 @@ import pytest
 from magnetosuture_thread.console.client import ClientMessage, parse_client_message
 from magnetosuture_thread.console.server import HEADERS, ConsoleServer
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 from test.console.visitor import NORTH, REST, TOKEN, WAIT_TIMEOUT, Console, Page, run, until
 
 

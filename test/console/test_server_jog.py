@@ -9,7 +9,7 @@ import pytest
 
 from magnetosuture_thread.console.client import ClientMessage, RequestHandler
 from magnetosuture_thread.console.jog_controller import JogController
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 from test.console.scene import RecordingGraph, RecordingHost
 from test.console.visitor import EAST, NORTH, REST, Console, run, until
 

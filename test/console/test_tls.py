@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from magnetosuture_thread.console.server import server_context
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import ConfigurationError
 from test.console.visitor import TOKEN, Console, run
 
 

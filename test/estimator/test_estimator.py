@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 from magnetosuture_thread import Disc
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.estimator.estimator import clearance_bound
 from magnetosuture_thread.estimator.session import observation_of
 from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG, STIFFNESS_RANGE
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import points_at
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.material import Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.estimator.threads import (
     DEVIATION,
     LENGTH,

@@ -18,11 +18,11 @@ from magnetosuture_thread.estimator.noise import (
     learn_intensity,
 )
 from magnetosuture_thread.geometry.obstacles import Workspace
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.program import StepBuffers, program_of
 from magnetosuture_thread.thread.rod import RodFormulation
 from magnetosuture_thread.thread.solvers import as_quadratic_program
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from test.estimator.threads import LENGTH, RATE, estimator_of, piece_of, poses, predictor_of, thread_of
 
 NODES = 13

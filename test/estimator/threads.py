@@ -10,10 +10,10 @@ from magnetosuture_thread import Disc
 from magnetosuture_thread.estimator import EstimatorOptions, ThreadEstimator
 from magnetosuture_thread.geometry.obstacles import Workspace
 from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 LENGTH = 0.019
 RATE = 30.0

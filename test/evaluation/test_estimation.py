@@ -19,7 +19,7 @@ from magnetosuture_thread.evaluation.metrics import (
     hidden_part,
     mean_band,
 )
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 NODES = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])  # a thread 1 m long
 LINE = np.column_stack([-np.linspace(0.0, 1.0, 21), np.zeros(21)])

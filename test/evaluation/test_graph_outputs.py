@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.evaluation.graph_outputs import CurrentSeries, GraphCollector, LoopCollector, ReplaySummary
 from magnetosuture_thread.evaluation.metrics import Percentiles, compare_errors, stage_latencies
 from magnetosuture_thread.evaluation.tables import loop_table, summary_table
+from magnetosuture_thread.settings.errors import GraphError
 from test.evaluation.runs import replay_summary
 
 STRAIGHT = np.column_stack([-0.25 * np.arange(5), np.zeros(5)])

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import BagError
 from magnetosuture_thread.evaluation.plots import draw_case
 from magnetosuture_thread.evaluation.reference import (
     CaseResult,
@@ -21,6 +20,7 @@ from magnetosuture_thread.evaluation.reference import (
     write_reference,
 )
 from magnetosuture_thread.evaluation.tables import evaluation_table
+from magnetosuture_thread.settings.errors import BagError
 
 MATERIAL = {
     "kind": "polyamide USP 7-0 monofilament",

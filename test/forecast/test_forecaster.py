@@ -24,7 +24,7 @@ from magnetosuture_thread import (
     ThreadPredictor,
 )
 from magnetosuture_thread.forecast import NeedleDrag
-from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.thread.margins import FrictionLaw, Margins, NodeMotion
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
 

@@ -19,15 +19,15 @@ from magnetosuture_thread import (
     ThreadForecaster,
 )
 from magnetosuture_thread.bags.message_types import typestore
+from magnetosuture_thread.bags.packing import packed_path
+from magnetosuture_thread.bags.reading import path_poses
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.estimator import ThreadEstimate, ThreadEstimator
 from magnetosuture_thread.forecast.published import NeedlePlan, PublishedForecasts
-from magnetosuture_thread.interface import PROCEDURE_PLAN
-from magnetosuture_thread.messages.packing import packed_path
-from magnetosuture_thread.messages.reading import path_poses
-from magnetosuture_thread.safety.motion import NeedleKinematics
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.settings.interface import PROCEDURE_PLAN
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
 from magnetosuture_thread.thread.predictor import ThreadPredictor
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 
 NEEDLE, SPEED, HORIZON, PERIOD = NeedleKinematics(0.007), 0.002, 2.0, 0.05
 LEVER, RADIUS = 0.5 * NEEDLE.chord, 0.012

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.orientation import (
     heading_angle,
     heading_from_quaternion,
     yaw_quaternion,
 )
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 
 @pytest.mark.parametrize("angle", np.linspace(-3.0, 3.0, 13).tolist())

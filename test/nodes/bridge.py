@@ -10,10 +10,10 @@ from geometry_msgs.msg import TwistStamped
 from magnetosuture_msgs.msg import SafetyMargins
 from std_srvs.srv import SetBool, Trigger
 
-from magnetosuture_thread.interface import Service
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
-from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.settings.interface import Service
 from test.nodes import wire
 
 EAST = np.array([1.0, 0.0])

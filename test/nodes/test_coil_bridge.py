@@ -13,8 +13,9 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.scene import Dish, Scene, read_scene
 from test.nodes import wire
 from test.nodes.bridge import (
     EAST,

@@ -7,9 +7,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from magnetosuture_msgs.msg import CoilBridgeState
 
-from magnetosuture_thread.interface import Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
+from magnetosuture_thread.settings.interface import Service
 from test.nodes.bridge import (
     LONG,
     READY,

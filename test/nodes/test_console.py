@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import console as console_graph
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import joined
@@ -26,7 +27,6 @@ from magnetosuture_thread.nodes.console import ConsoleGraph, GraphHost
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
-from magnetosuture_thread.scene import read_scene
 from test.nodes import wire
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}

@@ -15,8 +15,8 @@ from magnetosuture_msgs.msg import (
     ThreadForecast,
 )
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import console_state as messages
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 STAMP = Time(sec=12)
 

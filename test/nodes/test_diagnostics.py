@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.nodes import node as diagnostics
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import Health
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 
 def test_a_flood_of_refusals_is_counted_and_not_repeated(graph):

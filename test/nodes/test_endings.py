@@ -17,13 +17,13 @@ from magnetosuture_msgs.msg import CoilBridgeState
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.coils.coil_system import UNCLEAN_END
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.interface import Service
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.processes import graph_environment
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
-from magnetosuture_thread.scene import read_scene
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.interface import Service
 from test.nodes.bridge import (
     LONG,
     READY,

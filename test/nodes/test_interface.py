@@ -16,15 +16,15 @@ import yaml
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy
 
-from magnetosuture_thread import interface
 from magnetosuture_thread.console.settings import ConsoleSettings
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import PROCESSES, RIG_NODES, SCENE_SERVER
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.clients import CoilClient
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.console import ConsoleGraph
 from magnetosuture_thread.nodes.node import GuardedNode
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.interface import PROCESSES, RIG_NODES, SCENE_SERVER
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE
 

@@ -20,7 +20,6 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from std_srvs.srv import Trigger
 
-from magnetosuture_thread.interface import SCENE_SERVER, STANDBY_NODES, Service
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
 from magnetosuture_thread.nodes.node import INACTIVE
@@ -28,6 +27,7 @@ from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
 from magnetosuture_thread.nodes.thread_model import ThreadForecasts, ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
+from magnetosuture_thread.settings.interface import SCENE_SERVER, STANDBY_NODES, Service
 from test.nodes import wire
 from test.nodes.conftest import Graph
 from test.nodes.makers import EVERY_NODE

@@ -20,34 +20,34 @@ from magnetosuture_msgs.msg import SafetyMargins, TrackerState
 from rclpy.serialization import serialize_message
 from visualization_msgs.msg import Marker
 
-from magnetosuture_thread import interface
+from magnetosuture_thread.bags import markers, packing, reading
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.barrier import BUILT_IN, WALL
+from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.coils import bridge
+from magnetosuture_thread.coils import filter as safety
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.estimator import Disturbance, ThreadEstimate
 from magnetosuture_thread.forecast import rollout
+from magnetosuture_thread.geometry.barrier import BUILT_IN, WALL
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.messages import markers, packing, reading
-from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.geometry.scene import KINDS
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import topic_of
 from magnetosuture_thread.planning.procedure import GOALS
-from magnetosuture_thread.safety import filter as safety
-from magnetosuture_thread.scene import KINDS
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread import predictor
 from magnetosuture_thread.thread.forces import ThreadForces
 from magnetosuture_thread.thread.margins import BarrierMargins, Friction, FrictionState, Margins
 from magnetosuture_thread.thread.material import Attachment
 from magnetosuture_thread.thread.prediction import Prediction
 from magnetosuture_thread.thread.solvers import SOLVERS
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
 from magnetosuture_thread.vision.tracker import State, no_pose
 from test.estimator.threads import estimator_of, poses, thread_of, true_shapes, whole
+from test.geometry.scene.scenes import every_shape
 from test.nodes import wire
-from test.scene.scenes import every_shape
 
 STAMP = Time(sec=3, nanosec=500_000_000)
 TAIL, HEADING = np.array([1e-3, -2e-3]), np.array([-0.6, 0.8])
@@ -164,9 +164,9 @@ def test_what_is_packed_is_what_rosbags_and_rclpy_make_of_the_same_message(name:
 
 IN_A_RIG_WITH_A_PREFIX = """
 import numpy as np
-from magnetosuture_thread import interface
+from magnetosuture_thread.settings import interface
 from magnetosuture_thread.bags.message_types import typestore
-from magnetosuture_thread.messages import packing, reading
+from magnetosuture_thread.bags import packing, reading
 from magnetosuture_thread.nodes import topics
 
 points, store = np.arange(10.0).reshape(5, 2), typestore()

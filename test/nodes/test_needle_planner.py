@@ -26,12 +26,13 @@ from magnetosuture_msgs.srv import PlanProcedure
 from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.geometry.obstacles import Disc
-from magnetosuture_thread.interface import EXECUTE_PROCEDURE, Service
+from magnetosuture_thread.geometry.scene import Scene, SceneShape
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.needle_planner import NeedlePlannerNode
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import Scene, SceneShape, read_scene
+from magnetosuture_thread.settings.interface import EXECUTE_PROCEDURE, Service
 from test.nodes import wire
 
 NEEDLE = NeedleKinematics(0.0025)

@@ -9,10 +9,10 @@ import pytest
 from rclpy.context import Context
 
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.nodes.parameters import init, settings_of
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
 from magnetosuture_thread.nodes.processes import environment_of, graph_environment, reserved_domain
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 COMMON = "/**: {ros__parameters: {needle_length: 0.006, thread_length: 0.05}}\n"
 OWN = "/**/path_follower: {ros__parameters: {speed: 0.004}}\n"

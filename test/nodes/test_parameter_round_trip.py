@@ -12,7 +12,7 @@ from rclpy.parameter_client import AsyncParameterClient
 
 from magnetosuture_thread.nodes.coil_bridge import CoilBridgeNode
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.resources import find_setup_file
+from magnetosuture_thread.settings.resources import find_setup_file
 
 READ_ONLY = "Trying to set a read-only parameter"  # parameters of rclpy
 

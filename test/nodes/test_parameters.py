@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import pytest
 from rclpy.parameter import Parameter
 
-from magnetosuture_thread.configuration import Configuration, configuration_fields, quantity, to_mapping
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.estimator.settings import FIXED, ThreadModelSettings
 from magnetosuture_thread.nodes.node import ManagedNode
 from magnetosuture_thread.nodes.parameters import plain_value
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.nodes.vision_tracker import VisionTrackerNode
-from magnetosuture_thread.thread_model.settings import FIXED, ThreadModelSettings
+from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, quantity, to_mapping
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 
 def test_every_setting_is_a_described_parameter(graph):

@@ -8,9 +8,9 @@ import numpy as np
 from builtin_interfaces.msg import Time
 
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.path_follower import PathFollowerNode
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
 from test.nodes import wire
 
 EAST = np.array([1.0, 0.0])

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.errors import GraphError
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.processes import NodeProcesses, graph_environment, reserved_domain
 from magnetosuture_thread.nodes.program import MAKERS
+from magnetosuture_thread.settings.errors import GraphError
 from test.nodes.programs import TIMEOUT
 
 ROOT = Path(__file__).parent.parent.parent

@@ -13,11 +13,11 @@ from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 
 from magnetosuture_thread.bags.reader import RecordedMessage
-from magnetosuture_thread.errors import GraphError
-from magnetosuture_thread.interface import NEEDLE_POSE
 from magnetosuture_thread.nodes import player, timeline, topics
 from magnetosuture_thread.nodes.player import LiveReplay, Losses
 from magnetosuture_thread.nodes.timeline import Timeline
+from magnetosuture_thread.settings.errors import GraphError
+from magnetosuture_thread.settings.interface import NEEDLE_POSE
 
 
 def test_time_stands_still_before_it_begins_and_while_it_is_paused(monkeypatch: pytest.MonkeyPatch):

@@ -8,13 +8,13 @@ import pytest
 from magnetosuture_msgs.msg import CoilCurrents
 from std_msgs.msg import String
 
-from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.rig_simulator import RigSimulatorNode
 from magnetosuture_thread.rig.mechanics.dynamics import RigDynamics
 from magnetosuture_thread.rig.rig import Rig
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.settings.errors import SolverError
 from test.nodes import wire
 
 SMALL = {"scene": "dish_35mm", "thread_segments": 12, "needle_start": [0.003, 0.0, 0.0]}

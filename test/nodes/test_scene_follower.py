@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 from rclpy.serialization import serialize_message
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError
-from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.node import GuardedNode, SceneFollower
-from magnetosuture_thread.scene import Scene, read_scene
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError
+from test.geometry.scene.scenes import every_shape
 from test.nodes import wire
-from test.scene.scenes import every_shape
 
 POST, HERNIA = read_scene("dish_35mm_post"), read_scene("hernia_ring")
 

@@ -10,12 +10,13 @@ from geometry_msgs.msg import Point
 from magnetosuture_msgs.msg import Disc, Outline, Polygon, SceneShape
 from magnetosuture_msgs.srv import EditShape, LoadScene, RemoveShape
 
-from magnetosuture_thread.interface import Service
-from magnetosuture_thread.messages.scene import parse_scene_message
+from magnetosuture_thread.bags.scene_message import parse_scene_message
+from magnetosuture_thread.geometry.scene_files import read_scene, write_scene
+from magnetosuture_thread.geometry.scene_shapes import shape_from_mapping
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.scene_server import SceneServerNode
-from magnetosuture_thread.scene import read_scene, shape_from_mapping, write_scene
-from test.scene.scenes import every_shape
+from magnetosuture_thread.settings.interface import Service
+from test.geometry.scene.scenes import every_shape
 
 SERVICES = {
     "load": (Service.LOAD_SCENE, LoadScene),

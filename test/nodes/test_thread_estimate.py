@@ -12,10 +12,10 @@ import pytest
 from builtin_interfaces.msg import Time
 from magnetosuture_msgs.msg import SafetyMargins
 
+from magnetosuture_thread.geometry.thread_observation import ThreadObservation
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
 from magnetosuture_thread.thread.prediction import NeedlePose
-from magnetosuture_thread.thread_observation import ThreadObservation
 from test.estimator.threads import error_percent, piece_of, poses, thread_of, true_shapes, whole
 from test.nodes import wire
 

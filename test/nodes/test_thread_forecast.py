@@ -22,15 +22,15 @@ from magnetosuture_thread import (
     Thread,
     ThreadForecaster,
 )
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.bags.markers import forecast_text, packed_forecast_markers
+from magnetosuture_thread.bags.packing import packed_forecast, packed_path
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
 from magnetosuture_thread.forecast.published import PublishedForecasts
-from magnetosuture_thread.interface import Service
-from magnetosuture_thread.messages.markers import forecast_text, packed_forecast_markers
-from magnetosuture_thread.messages.packing import packed_forecast, packed_path
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import make_path_follower
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.interface import Service
 from magnetosuture_thread.thread.material import MATERIALS, Attachment
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings
 from test.estimator.threads import whole
 from test.nodes import wire
 from test.nodes.test_thread_estimate import NODES, WAY, counting, stamp

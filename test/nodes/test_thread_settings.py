@@ -12,9 +12,10 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_files import read_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.thread_model import ThreadModelNode
-from magnetosuture_thread.scene import Scene, read_scene
 from test.nodes import wire
 from test.thread.worlds import scene_with
 

@@ -8,8 +8,8 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
-from magnetosuture_thread.messages import packing
-from magnetosuture_thread.messages.scene import packed_scene
+from magnetosuture_thread.bags import packing
+from magnetosuture_thread.bags.scene_message import packed_scene
 from magnetosuture_thread.nodes import topics
 from magnetosuture_thread.nodes.topics import Topic
 

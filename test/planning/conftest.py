@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magnetosuture_thread.planning.planner import NeedlePlanner
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_setup
 
 
 @pytest.fixture(scope="session")

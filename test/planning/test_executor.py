@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.executor import (
     PathSubmitter,
     PendingPath,
@@ -23,8 +25,6 @@ from magnetosuture_thread.planning.executor import (
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner
 from magnetosuture_thread.planning.procedure import parse_procedure
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
 
 NEEDLE = NeedleKinematics(0.0025)
 RATE = 20.0

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.planning.follower import PathFollower, PathFollowerSettings, SmoothPath
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 LENGTH = 0.007
 EAST = np.array([1.0, 0.0])

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import shapely
 
-from magnetosuture_thread.errors import ConfigurationError, MagnetosutureError
+from magnetosuture_thread.coils.filter import NeedleSafetyFilter
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure, read_procedure
 from magnetosuture_thread.planning.verdict import winding
-from magnetosuture_thread.safety import NeedleSafetyFilter
-from magnetosuture_thread.safety.motion import NeedleKinematics
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.setups import Setup
+from magnetosuture_thread.rig.setups import Setup
+from magnetosuture_thread.settings.errors import ConfigurationError, MagnetosutureError
 
 KEEP_OUT = 2.5e-4
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.planning.procedure import GoTo, PassThrough, Wrap, parse_procedure, read_procedure
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 
 def test_the_hernia_repair_is_read():

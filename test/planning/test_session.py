@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.planning.executor import ProcedureState
 from magnetosuture_thread.planning.procedure import Procedure, parse_procedure
 from magnetosuture_thread.planning.session import LoopState, NeedlePlannerSettings, ProcedureSession
-from magnetosuture_thread.scene import Dish, Scene
+from magnetosuture_thread.settings.errors import InvalidInputError
 
 SCENE = Scene(Dish(0.035))
 SETTINGS = NeedlePlannerSettings(needle_length=0.0025)

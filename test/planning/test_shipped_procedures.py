@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magnetosuture_thread.campaign.loop import LATENCY
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
 from magnetosuture_thread.planning.procedure import Tighten, parse_procedure, read_procedure
-from magnetosuture_thread.resources import share_directory
-from magnetosuture_thread.setups import read_procedure_setup
+from magnetosuture_thread.rig.closed_loop import LATENCY
+from magnetosuture_thread.rig.setups import read_procedure_setup
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.resources import share_directory
 from magnetosuture_thread.thread.prediction import NeedlePose
 
 FOLDER = share_directory("magnetosuture_thread") / "config" / "procedures"

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import shapely
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.planning.executor import ProcedureExecutor, ProcedureState, ThreadCondition
 from magnetosuture_thread.planning.planner import NeedlePlanner, PlanningError
 from magnetosuture_thread.planning.procedure import Procedure, Wait, parse_procedure
 from magnetosuture_thread.planning.verdict import GoalJudge
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_setup
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.thread.prediction import NeedlePose
 
 POST = Scene(Dish(0.05), (SceneShape("post", "instrument", Disc((0.0, 0.0), 0.002)),))

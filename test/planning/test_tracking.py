@@ -10,9 +10,9 @@ from itertools import cycle, islice
 import numpy as np
 import pytest
 
+from magnetosuture_thread.coils.needle_motion import NeedleKinematics
 from magnetosuture_thread.planning.path import BodyPath
 from magnetosuture_thread.planning.tracking import MAX_AXIS_ANGLE, TACK_SHARE, PathTracker
-from magnetosuture_thread.safety.motion import NeedleKinematics
 
 NEEDLE = NeedleKinematics(0.0025)
 COIL_ANGLES = (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi)

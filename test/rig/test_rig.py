@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError, InvalidInputError, SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 from magnetosuture_thread.rig.rig import Rig
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.settings.errors import ConfigurationError, InvalidInputError, SolverError
 
 EASTWARDS = np.array([4.0, 0.0, -2.0, 0.0])
 

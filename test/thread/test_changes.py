@@ -6,8 +6,8 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
-from magnetosuture_thread.configuration import from_mapping, to_mapping
-from magnetosuture_thread.thread_model.settings import ThreadModelSettings, parse_material
+from magnetosuture_thread.estimator.settings import ThreadModelSettings, parse_material
+from magnetosuture_thread.settings.configuration import from_mapping, to_mapping
 
 
 def changed(values: dict[str, Any], **before: Any) -> ThreadModelSettings:

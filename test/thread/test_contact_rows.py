@@ -11,7 +11,7 @@ from magnetosuture_thread.estimator.association import MeasuredPoints
 from magnetosuture_thread.estimator.correction import Corrector, Prior
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
 from magnetosuture_thread.geometry.polyline import Points
-from magnetosuture_thread.scene import Dish
+from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.thread.contact_rows import (
     DEPTH_TOLERANCE,
     contact_rows,

@@ -10,7 +10,7 @@ import pytest
 
 from magnetosuture_thread import Disc, NeedlePose, NeedleSafetyFilter, Polygon, Scene, ThreadPredictor
 from magnetosuture_thread.geometry.obstacles import Workspace
-from magnetosuture_thread.scene import Dish, SceneShape
+from magnetosuture_thread.geometry.scene import Dish, SceneShape
 
 RATE = 60.0
 DEPTH = 1.01e-7  # m; the tolerance to which a step ends

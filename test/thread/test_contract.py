@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.barrier import Barrier
+from magnetosuture_thread.geometry.barrier import Barrier
 from magnetosuture_thread.geometry.obstacles import Disc, Obstacle, Polygon, Workspace
 from magnetosuture_thread.thread.barriers import (
     Compression,

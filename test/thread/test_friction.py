@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magnetosuture_thread.barrier import BarrierRows
+from magnetosuture_thread.geometry.barrier import BarrierRows
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
 from magnetosuture_thread.thread.barriers import Connectivity, ObstacleAvoidance, WallAvoidance
 from magnetosuture_thread.thread.margins import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.barrier import NO_OBSTACLE, BarrierRows
+from magnetosuture_thread.geometry.barrier import NO_OBSTACLE, BarrierRows
 from magnetosuture_thread.thread.margins import Margins
 
 

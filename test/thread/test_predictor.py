@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon, Workspace
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.thread.material import MATERIALS, Attachment, Thread
 from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
 from magnetosuture_thread.thread.predictor import ThreadPredictor

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import SolverError
 from magnetosuture_thread.geometry.obstacles import Disc, Workspace
+from magnetosuture_thread.settings.errors import SolverError
 from magnetosuture_thread.thread.material import Attachment, Thread
 from magnetosuture_thread.thread.program import ChainProgram, Residuals, Solution, Vector
 from magnetosuture_thread.thread.rod import RodFormulation

@@ -24,7 +24,7 @@ from magnetosuture_thread import (
     ThreadPredictor,
     check_gradient,
 )
-from magnetosuture_thread.barrier import load_barriers
+from magnetosuture_thread.geometry.barrier import load_barriers
 from test.examples import FOLDER, load_example
 
 TipKeepIn = load_example("barriers/tip_keep_in").TipKeepIn

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from magnetosuture_thread.geometry.obstacles import Disc, Polygon
-from magnetosuture_thread.scene import Dish, Scene, SceneShape
+from magnetosuture_thread.geometry.scene import Dish, Scene, SceneShape
 
 
 def scene_with(*geometries: Disc | Polygon, diameter: float = 0.5) -> Scene:

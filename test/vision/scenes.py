@@ -12,8 +12,8 @@ import numpy as np
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
+from magnetosuture_thread.geometry.scene import Scene as TrackedScene
 from magnetosuture_thread.rig.camera import CameraScene, Cover, DishCamera, Lighting
-from magnetosuture_thread.scene import Scene as TrackedScene
 from magnetosuture_thread.vision.tracker import Track
 
 SCENE = TrackedScene()  # a dish of 35 mm with nothing in it

@@ -11,11 +11,10 @@ import pytest
 
 from benchmarks.vision.frames import tilted
 from benchmarks.vision.photographs import DIAMETER, photo_of
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
-from magnetosuture_thread.parameter_files import load_setup
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.settings.parameter_files import load_setup
 from magnetosuture_thread.vision.calibration import (
     CORNERS,
     calibrate_by_dish,

@@ -11,9 +11,8 @@ import pytest
 
 from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import Row, frame_of, measure, row_of
-from magnetosuture_thread.errors import ConfigurationError
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.geometry.scene import Dish, Scene
+from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 

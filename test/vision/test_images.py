@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.images import (
     decode_image,
     glare_mask,

@@ -12,7 +12,7 @@ import yaml
 
 from benchmarks.vision.frames import distorted, lens_with
 from benchmarks.vision.measurements import frame_of, measure
-from magnetosuture_thread.errors import InvalidInputError
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.lens import Lens, lens_of, read_lens
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import InvalidInputError
 from magnetosuture_thread.geometry.camera import DishView
+from magnetosuture_thread.geometry.scene import Dish
+from magnetosuture_thread.geometry.scene import Scene as DishScene
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera, Lighting
-from magnetosuture_thread.scene import Dish
-from magnetosuture_thread.scene import Scene as DishScene
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 from test.vision.scenes import (

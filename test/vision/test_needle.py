@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from benchmarks.vision.cases import SIZES, usual_case
 from benchmarks.vision.frames import DISH_RADIUS, ROWS
 from benchmarks.vision.frames import render as render_case
+from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.rig.camera import CameraScene, DishCamera
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
 from magnetosuture_thread.vision.arc import (
     Arc,
     MeasuredNeedle,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.vision.overlay import OverlayWriter, draw_overlay
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.geometry.scene import Dish, Scene
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import UNDIRECTED, State, Track, VisionTracker
 

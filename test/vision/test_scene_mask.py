@@ -10,9 +10,11 @@ import shapely
 
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_files import read_scene
+from magnetosuture_thread.geometry.scene_shapes import scene_from_mapping
 from magnetosuture_thread.rig import camera as drawn
 from magnetosuture_thread.rig.camera import DishCamera, Look
-from magnetosuture_thread.scene import Scene, read_scene, scene_from_mapping
 from magnetosuture_thread.vision.images import scene_mask
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import Track, VisionTracker

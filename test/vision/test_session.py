@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magnetosuture_thread.errors import InvalidInputError
-from magnetosuture_thread.scene import Scene
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.errors import InvalidInputError
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import REPEATED, RepetitionDetector, State, TrackerSession
 

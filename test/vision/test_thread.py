@@ -12,7 +12,7 @@ import pytest
 from benchmarks.vision.measurements import Row, frame_of, measure, row_of
 from magnetosuture_thread.geometry.camera import DishView
 from magnetosuture_thread.geometry.polyline import arc_lengths, points_at
-from magnetosuture_thread.thread_observation import PieceEnd, ThreadObservation
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation
 from magnetosuture_thread.vision.appearance import Appearance, Hiding, Strand
 from magnetosuture_thread.vision.arc import Arc, MeasuredNeedle
 from magnetosuture_thread.vision.centreline import WALL_PX, find_centreline, without_needle

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.camera import DishCamera
-from magnetosuture_thread.setups import Setup, read_setup
+from magnetosuture_thread.rig.setups import Setup, read_setup
 from magnetosuture_thread.vision.tracker import State, VisionTracker
 
 PLACE = (0.004, -0.012, 2.0)  # tail [m] and heading [rad] beside the tissue

@@ -12,8 +12,8 @@ import magnetosuture_thread.vision as vision
 from benchmarks.vision.cases import CLASSES
 from benchmarks.vision.frames import DISH_RADIUS
 from benchmarks.vision.measurements import frame_of
-from magnetosuture_thread.scene import Scene
-from magnetosuture_thread.scene.scene import Dish
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.vision.settings import VisionTrackerSettings
 from magnetosuture_thread.vision.tracker import VisionTracker
 from magnetosuture_thread.vision.tracker import warm_up

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.workers import ONE_THREAD, WorkerDiedError, WorkerPool
 
 SOURCE = """
 import os
-from magnetosuture_thread.errors import BagError
+from magnetosuture_thread.settings.errors import BagError
 from magnetosuture_thread.workers import ONE_THREAD
 
 def work(task, log, progress):

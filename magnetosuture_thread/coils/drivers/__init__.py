@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.errors import DriverError
+from magnetosuture_thread.settings.errors import DriverError
 
 if TYPE_CHECKING:
     from magnetosuture_thread.coils.settings import CoilBridgeSettings

@@ -30,7 +30,7 @@ from basicmicro.exceptions import BasicmicroError
 
 from magnetosuture_thread.coils.drivers import DriverState, Vector
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import DriverError
+from magnetosuture_thread.settings.errors import DriverError
 
 FULL_DUTY = 32767  # duty of the full supply voltage
 MAX_RETRY_DELAY = 2.0  # s between two attempts to connect

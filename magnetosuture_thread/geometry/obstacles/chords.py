@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled_inline, compiled_uncounted, compiled_within
+from magnetosuture_thread.geometry.compiled import compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles.distances import EDGE_WIDTH, Contacts, WorkspaceData
 from magnetosuture_thread.geometry.polyline import Points
 

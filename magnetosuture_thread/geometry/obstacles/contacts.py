@@ -9,9 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted, compiled_within
 from magnetosuture_thread.geometry.obstacles.distances import (
     EDGE_WIDTH,
     NO_BLOCK,
@@ -26,6 +24,8 @@ from magnetosuture_thread.geometry.obstacles.distances import (
 )
 from magnetosuture_thread.geometry.obstacles.shapes import MIN_EXTENT, Disc, Obstacle
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 WALL = -1
 """Index of the dish wall in place of an obstacle's."""

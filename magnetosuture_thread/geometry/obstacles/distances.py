@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline, compiled_uncounted
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline, compiled_uncounted
 from magnetosuture_thread.geometry.obstacles.shapes import Disc, Obstacle, Polygon
 from magnetosuture_thread.geometry.polyline import Points
 

@@ -12,9 +12,9 @@ import shapely
 from numpy.typing import NDArray
 from shapely.validation import explain_validity
 
-from magnetosuture_thread.arguments import bounded, checked_arguments
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.polyline import Points
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 MAX_COORDINATE = 10.0
 """A coordinate beyond this is taken for one in another unit [m]."""

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from magnetosuture_thread.compiled import compiled, compiled_inline
-from magnetosuture_thread.errors import ConfigurationError
+from magnetosuture_thread.geometry.compiled import compiled, compiled_inline
 from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 Vector = NDArray[np.float64]
 

@@ -12,8 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magnetosuture_thread.compiled import compiled
-from magnetosuture_thread.errors import SolverError
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.polyline import Points, chain_along
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Surface, Vector
 from magnetosuture_thread.rig.mechanics.needle import Needle, NeedleBody, add_clamp, add_needle
@@ -38,6 +37,7 @@ from magnetosuture_thread.rig.mechanics.rod import (
     find_friction,
     find_pairs,
 )
+from magnetosuture_thread.settings.errors import SolverError
 
 __all__ = ["NeedleJoint", "RigDynamics", "Surface", "ThreadProperties"]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magnetosuture_thread.coils.field import fields_per_current
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.geometry.needle_arc import needle_axis
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts
 

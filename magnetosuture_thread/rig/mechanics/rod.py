@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magnetosuture_thread.compiled import compiled
+from magnetosuture_thread.geometry.compiled import compiled
 from magnetosuture_thread.rig.mechanics.contact import Shapes, Vector, clear, point_contacts, segment_contacts
 
 SLIP_SPEED = 2e-6  # m/s; what should stick by friction creeps, at less than this

@@ -10,7 +10,6 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.geometry.obstacles import (
     WALL,
     Disc,
@@ -18,6 +17,7 @@ from magnetosuture_thread.geometry.obstacles import (
     Polygon,
     Workspace,
 )
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 SQUARE = Polygon(((0.0, 0.0), (0.01, 0.0), (0.01, 0.01), (0.0, 0.01)))
 # An L: its only reflex corner is (0.01, 0.01).

@@ -10,11 +10,11 @@ import pytest
 
 from benchmarks.self_contact import move_rig
 from magnetosuture_thread import ConfigurationError, NeedlePose, Scene, ThreadPredictor
+from magnetosuture_thread.geometry.scene import Dish
 from magnetosuture_thread.rig.mechanics.dynamics import NeedleJoint, RigDynamics, Surface, ThreadProperties
 from magnetosuture_thread.rig.mechanics.needle import NeedleBody
 from magnetosuture_thread.rig.mechanics.rod import Rod, add_pairs, couple, factor, find_pairs
 from magnetosuture_thread.rig.settings import RigSettings
-from magnetosuture_thread.scene import Dish
 from magnetosuture_thread.thread.material import Attachment, Medium, Thread
 
 RATE, DIAMETER, EAST = 60.0, 60e-6, np.array([1.0, 0.0])

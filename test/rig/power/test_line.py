@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError
 from magnetosuture_thread.rig.power import Line, RoboClawBoard, checksum
+from magnetosuture_thread.settings.errors import ConfigurationError
 
 QUESTION = bytes((128, 24))
 ANSWER = b"\x00\xf0" + checksum(QUESTION + b"\x00\xf0").to_bytes(2, "big")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from magnetosuture_thread.errors import ConfigurationError, GraphError
 from magnetosuture_thread.rig.power import ACKNOWLEDGED, Command, StageProcess, checksum
+from magnetosuture_thread.settings.errors import ConfigurationError, GraphError
 
 HALF_AND_BACK = bytes(
     (129, Command.SET_DUTIES, 0x40, 0x00, 0xE0, 0x00)

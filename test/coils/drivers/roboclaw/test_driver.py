@@ -20,9 +20,9 @@ from magnetosuture_thread.coils.calibration import CoilCalibration
 from magnetosuture_thread.coils.drivers.roboclaw import RoboClawDriver
 from magnetosuture_thread.coils.field import coils_around
 from magnetosuture_thread.coils.settings import CoilBridgeSettings
-from magnetosuture_thread.errors import DriverError
 from magnetosuture_thread.rig import power as packets
 from magnetosuture_thread.rig.power import RoboClawBoard
+from magnetosuture_thread.settings.errors import DriverError
 
 CURRENTS = (3.0, -6.0, 1.5, 0.0)
 DUTIES = [(4095, -8191), (2047, 0)]

@@ -1,1 +1,0 @@
-"""The closed loop in one process on simulated time: many runs of a procedure, each by its seed."""

@@ -1,0 +1,328 @@
+"""Settings of the thread model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from magnetosuture_thread.estimator import EstimatorOptions, EstimatorSession, ThreadEstimator
+from magnetosuture_thread.estimator.stiffness import AUTOMATIC, STIFFNESS_OVER_DRAG
+from magnetosuture_thread.geometry.barrier import Barrier, load_barriers
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.settings.configuration import (
+    Configuration,
+    autostart_parameter,
+    configuration_fields,
+    quantity,
+)
+from magnetosuture_thread.settings.shared_parameters import shared_parameter
+from magnetosuture_thread.thread.margins import FrictionLaw
+from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
+from magnetosuture_thread.thread.paper import PaperOptions
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
+from magnetosuture_thread.thread.self_contact import SelfContact
+from magnetosuture_thread.thread.solvers import SOLVERS
+
+OF_MEDIUM = {
+    "viscosity": "liquid",
+    "wetted_fraction": "liquid",
+    "drag_anisotropy": "liquid",
+    "mass_per_length": "air",
+    "air_drag": "air",
+    "bending_damping": "air",
+    "gravity": "air",
+}
+FIXED = {  # why a node cannot change it while it is configured
+    "autostart": "read at the start",
+    "formulation": "compiled when the node is configured",
+    "solver": "compiled when the node is configured",
+    "barriers": "imported when the node is configured",
+    "scene": "read when the node is configured; the topic scene changes it",
+    "forecast_horizon": "compiled when the node is configured",
+}
+
+
+@dataclass(frozen=True)
+class ThreadModelSettings(Configuration):
+    """Parameters of the thread model: thread, liquid and numerical settings; the scene is given apart."""
+
+    GROUP: ClassVar[str] = "thread_model"
+
+    autostart: str = autostart_parameter()
+    scene: str = shared_parameter("scene")
+    formulation: str = quantity(
+        "rod", "how a step is written: rod is the accurate one, paper the one as printed", choices=FORMULATIONS
+    )
+    solver: str = quantity("banded", "what solves a step's program", choices=SOLVERS)
+    barriers: tuple[str, ...] = quantity((), "barriers of your own, each as module:class; see Barrier")
+    material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
+    diameter: float = quantity(0.0, "of the thread; 0 takes the material's", "m", 0.0, 0.01)
+    elastic_modulus: float = quantity(
+        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, 1e12
+    )
+    thread_length: float = shared_parameter("thread_length")
+    segments: int = quantity(25, "number of segments, n", "", 3, 2000)
+    attachment: str = quantity(
+        Attachment.PINNED.value,
+        "how the needle holds the thread: pinned turns freely, clamped leaves along its axis; for rod",
+        choices=tuple(kind.value for kind in Attachment),
+    )
+    rest_curvature: float = quantity(
+        0.0,
+        "curvature of the unloaded thread, positive to the left, seen from the needle along it",
+        "1/m",
+        -2000.0,
+        2000.0,
+    )
+    fixed_nodes: tuple[int, ...] = quantity(
+        (), "nodes that stay where they are, as where tissue holds the thread", "", 1, 2000
+    )
+    medium: str = quantity(
+        "liquid", "liquid drags the thread, in air its inertia and weight count; for rod", choices=("liquid", "air")
+    )
+    viscosity: float = shared_parameter("viscosity")
+    wetted_fraction: float = quantity(
+        0.5, "part of the thread's surface in the liquid; half for a floating thread", "", 0.05, 1.0
+    )
+    drag_anisotropy: float = quantity(
+        0.5, "drag of the liquid along the thread over that across it; half for a slender body", "", 0.05, 1.0
+    )
+    attachment_offset: tuple[float, ...] = quantity(
+        (),
+        "where the thread is fixed, from the tracked tail: along the heading, and to its left",
+        "m",
+        -0.01,
+        0.01,
+        multiple=2,
+    )
+    paper_damping: float = quantity(
+        0.95, "kappa, part of its velocity that a node keeps from step to step; for paper", "", 0.0, 0.999
+    )
+    paper_stiffness_weight: float = quantity(0.0, "W_stiff; 0 takes the material's; for paper", "", 0.0, 1e12)
+    mass_per_length: float = quantity(4e-6, "mass of the thread in air per length", "kg/m", 1e-9, 10.0)
+    air_drag: float = quantity(1e-4, "drag of the thread in air per length and speed", "Pa s", 0.0, 10.0)
+    bending_damping: float = quantity(
+        0.0, "time in which bending in air is damped: its moment over its stiffness and rate", "s", 0.0, 10.0
+    )
+    gravity: tuple[float, ...] = quantity(
+        (), "weight in the plane of the camera, for a thread in air: x, y", "m/s^2", -20.0, 20.0, multiple=2
+    )
+    flow: tuple[float, ...] = quantity(
+        (),
+        "velocity of the liquid or air in the camera's plane, the same everywhere; for rod",
+        "m/s",
+        -0.1,
+        0.1,
+        multiple=2,
+    )
+    initial_shape: str = quantity(
+        "measured",
+        "where the thread starts: as first measured, or straight behind the needle",
+        choices=("measured", "straight"),
+    )
+    max_step: float = quantity(
+        0.02, "longest step; a longer interval between poses is divided into steps", "s", 1e-4, 0.1
+    )
+    margin_range: float = quantity(
+        5e-3, "margins are published of nodes that are closer to an obstacle or the wall than this", "m", 1e-4, 1.0
+    )
+    contact_tolerance: float = quantity(2e-6, "a node this close to an obstacle or the wall touches it", "m", 0.0, 1e-3)
+    residual_tolerance: float = quantity(
+        1e-6, "largest scaled residual with which a solution is accepted", "", 1e-12, 1e-2
+    )
+    friction_threshold: float = quantity(5e-4, "a node this close to two obstacles is under friction", "m", 0.0, 0.1)
+    friction_slowdown: float = quantity(
+        0.9, "beta: each node under friction slows the needle by this factor", "", 0.01, 1.0
+    )
+    stuck_speed: float = quantity(
+        2e-4, "a thread under friction whose nodes there are not faster rests, and slows nothing", "m/s", 0.0, 1.0
+    )
+    friction_averaging: float = quantity(
+        0.2, "time over which the nodes' velocities are averaged for that, as tracked poses tremble", "s", 0.0, 10.0
+    )
+    friction_by_bound: bool = quantity(
+        False, "whether the 99 % bound of an estimated clearance counts for friction, in place of the clearance"
+    )
+    estimator: bool = quantity(
+        True, "whether the thread is estimated too: the model corrected by the camera; for rod in liquid"
+    )
+    estimator_path_deviation: float = quantity(
+        2e-5, "deviation of points of thread/measured, used where nobody publishes thread/observation", "m", 1e-7, 0.01
+    )
+    estimator_history: float = quantity(
+        EstimatorOptions.history, "how late an observation of the thread may come", "s", 0.05, 5.0
+    )
+    estimator_slow_parameters: tuple[str, ...] = quantity(
+        EstimatorOptions.slow_parameters,
+        "what the estimator learns: stiffness_over_drag, nothing, or auto: that, once the model is found wrong",
+        choices=(AUTOMATIC, STIFFNESS_OVER_DRAG),
+    )
+    forecast_horizon: float = quantity(
+        0.0, "how far ahead thread/forecast looks, by the plan or the command held; 0 for none", "s", 0.0, 30.0
+    )
+    forecast_step: float = quantity(0.03, "duration of its steps", "s", 0.001, 0.5)
+    forecast_period: float = quantity(
+        0.0, "time between estimates that are forecast; 0 for every one, as time allows", "s", 0.0, 10.0
+    )
+    friction_feedback: str = shared_parameter("friction_feedback")
+    keep_out: float = shared_parameter("keep_out")
+    pose_margin: float = shared_parameter("pose_margin")
+    needle_length: float = shared_parameter("needle_length")
+    needle_curvature: float = shared_parameter("needle_curvature")
+
+    def check(self) -> None:
+        """Refuse a thread thicker than a segment is long, and values that contradict each other."""
+        if self.friction_threshold > self.margin_range:
+            raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
+        diameter, segments = self._material().diameter, self.segments
+        if self.thread_length / segments <= diameter:
+            most = math.ceil(self.thread_length / diameter) - 1
+            raise self.refused("segments", f"at most {most}, so that a segment is longer than thick")
+        pairs = {"attachment_offset": "along and to the left", "gravity": "x and y", "flow": "x and y"}
+        for name, words in pairs.items():
+            if len(getattr(self, name)) > 2:
+                raise self.refused(name, f"two numbers, {words}, or none")
+        if self.formulation == "paper" and self.medium != "liquid":
+            raise self.refused("medium", "liquid, as the formulation paper has no inertia")
+        if self.formulation == "paper" and self.flow:
+            raise self.refused("flow", "none, as the formulation paper has no drag")
+        if abs(self.rest_curvature) * self.thread_length / segments > MAX_REST_ANGLE:
+            limit = MAX_REST_ANGLE * segments / self.thread_length
+            words = f"at most {limit:.0f} 1/m with {segments} segments, which turn by half a radian then"
+            raise self.refused("rest_curvature", words)
+        for about in configuration_fields(type(self)):
+            other = OF_MEDIUM.get(about.name, self.medium)
+            if other != self.medium and getattr(self, about.name) != about.default:
+                words = f"{about.default}, its default: it counts for medium: {other} only"
+                raise self.refused(about.name, words)
+        if 0.0 < self.forecast_horizon < self.forecast_step:
+            raise self.refused("forecast_horizon", f"0, or at least forecast_step, {self.forecast_step:g} s")
+        if max(self.fixed_nodes, default=0) > segments:
+            raise self.refused("fixed_nodes", f"nodes from 1 to {segments}")
+        if len(self.estimator_slow_parameters) > 1:
+            raise self.refused("estimator_slow_parameters", "one name, or none")
+
+    def _material(self) -> Material:
+        material = MATERIALS[self.material]
+        return replace(
+            material,
+            diameter=self.diameter or material.diameter,
+            elastic_modulus=self.elastic_modulus or material.elastic_modulus,
+        )
+
+    def thread(self) -> Thread:
+        """Return the thread."""
+        thread = Thread.of(
+            self._material(),
+            length=self.thread_length,
+            segments=self.segments,
+            attachment=Attachment(self.attachment),
+            viscosity=self.viscosity,
+            wetted_fraction=self.wetted_fraction,
+            drag_anisotropy=self.drag_anisotropy,
+            rest_curvature=self.rest_curvature,
+        )
+        if self.medium == "air":
+            air = Medium.air(self.mass_per_length, self.gravity, self.air_drag, self.bending_damping)
+            thread = replace(thread, medium=air)
+        return replace(thread, medium=replace(thread.medium, flow=self.flow)) if self.flow else thread
+
+    def attachment_pose(self, pose: NeedlePose) -> NeedlePose:
+        """Return the pose of the point where the thread is fixed, from that of the needle's tail, in the plane."""
+        if not self.attachment_offset:
+            return pose
+        along, left = self.attachment_offset
+        x, y = pose.heading
+        lever, motion = np.array([along * x - left * y, along * y + left * x]), pose.motion
+        if motion is not None:
+            motion = motion._replace(velocity=motion.velocity + motion.turning * np.array([-lever[1], lever[0]]))
+        return replace(pose, tail=pose.tail + lever, motion=motion)
+
+    def predictor(self, scene: Scene | None) -> ThreadPredictor:
+        """Return a predictor of this thread in a scene, its kernels compiled.
+
+        They are loaded by steps where nothing is, as a scene may have no room for the thread of these steps.
+
+        Args:
+            scene: dish and obstacles; None for neither.
+
+        Raises:
+            ConfigurationError: a shape is too small for the segments; see `check_scene`.
+        """
+        self._in_the_void(scene).warm_up()
+        return self._predictor(scene, load_barriers(self.barriers, f"{self.GROUP}.barriers"))
+
+    def _in_the_void(self, scene: Scene | None) -> ThreadPredictor:
+        """Return a predictor for a warm-up, with the kernels of a scene and without its wall, shapes and barriers."""
+        thread = self.thread()
+        touches_itself = scene is not None and scene.dish.has_self_contact(thread.diameter)
+        return self._predictor(None, [SelfContact(thread)] if touches_itself and self.formulation == "rod" else [])
+
+    def _predictor(self, scene: Scene | None, barriers: Sequence[Barrier]) -> ThreadPredictor:
+        weight = self.paper_stiffness_weight or MATERIALS[self.material].stiffness_weight
+        paper = PaperOptions.tuned(weight)._replace(damping=self.paper_damping)
+        return ThreadPredictor(
+            self.thread(),
+            scene,
+            barriers,
+            formulation=self.formulation,
+            solver=self.solver,
+            paper=paper,
+            margin_range=self.margin_range,
+            contact_tolerance=self.contact_tolerance,
+            residual_tolerance=self.residual_tolerance,
+            max_step=self.max_step,
+            fixed_nodes=self.fixed_nodes,
+        )
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether the thread is estimated too."""
+        return self.estimator and self.formulation == "rod" and self.medium == "liquid"
+
+    def estimator_session(self, scene: Scene | None) -> EstimatorSession | None:
+        """Return an estimator of this thread in a scene, its kernels compiled; None where it is not estimated.
+
+        Args:
+            scene: dish and obstacles; None for neither.
+
+        Raises:
+            ConfigurationError: see `predictor`.
+        """
+        if not self.is_estimated:
+            return None
+        options = EstimatorOptions(self.estimator_history, self.estimator_slow_parameters)
+        ThreadEstimator(self._in_the_void(scene), options).warm_up()
+        barriers = load_barriers(self.barriers, f"{self.GROUP}.barriers")
+        return EstimatorSession(ThreadEstimator(self._predictor(scene, barriers), options))
+
+    def friction_law(self) -> FrictionLaw:
+        """Return the friction law."""
+        return FrictionLaw(self.friction_threshold, self.friction_slowdown, self.stuck_speed, self.friction_by_bound)
+
+
+def parse_material(message: Any) -> dict[str, Any]:
+    """Return the settings, by name, that a ThreadMaterial message changes.
+
+    What is 0, not a number or empty stays as it is; but a material that is named brings its own diameter, modulus
+    and weight of the stiffness. The message has the units of the settings.
+    """
+    values: dict[str, Any] = {}
+    if message.name:
+        values = {"material": message.name, "diameter": 0.0, "elastic_modulus": 0.0, "paper_stiffness_weight": 0.0}
+    for name in ("diameter", "elastic_modulus", "viscosity", "drag_anisotropy"):
+        number = getattr(message, name)
+        if number != 0.0 and not math.isnan(number):
+            values[name] = number
+    if len(message.rest_curvature):
+        values["rest_curvature"] = float(message.rest_curvature[0])
+    if message.attachment:
+        values["attachment"] = message.attachment
+    if len(message.attachment_offset):
+        values["attachment_offset"] = [float(part) for part in message.attachment_offset]
+    return values

@@ -1,0 +1,309 @@
+"""A scene: one dish with named shapes, identified by the hash of its content."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Annotated, Any
+
+import numpy as np
+import shapely
+
+from magnetosuture_thread.geometry.obstacles import MAX_FRICTION, Disc, Polygon
+from magnetosuture_thread.settings.arguments import bounded, checked_arguments
+from magnetosuture_thread.settings.errors import ConfigurationError
+
+KINDS = ("tissue", "instrument", "wall")
+"""What a shape is: tissue, an instrument or post, or a rigid wall inside of the dish."""
+
+MAX_SHAPES = 200
+# A coil bridge adopts a scene within 20 ms: that takes 4 us a vertex and 0.2 ms an outline.
+MAX_VERTICES = 1500  # of all polygons of a scene together
+MAX_OUTLINES = 40  # the same, holes included
+MIN_EDGE = 2e-6  # m; a 30th of the thinnest thread, and what arcs and contacts may be off
+MAX_NAME_CHARS = 64
+MAX_COORDINATE = 1.0  # m; anything larger is in another unit
+MIN_RADIUS = 1e-6  # m
+VERSION_CHARS = 16
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number, and not a boolean."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond any float
+        return False
+
+
+def _check_friction(name: str, value: Any) -> None:
+    if not (is_number(value) and 0.0 <= value <= MAX_FRICTION):
+        raise ConfigurationError(name, value, f"a coefficient of friction from 0 to {MAX_FRICTION:g}")
+
+
+@checked_arguments("dish")
+@dataclass(frozen=True)
+class Dish:
+    """The round petri dish; its centre is the origin of the dish frame.
+
+    Attributes:
+        diameter: inner diameter [m].
+        depth: of the liquid in it [m].
+        wall_friction: Coulomb's coefficient of the thread on the wall.
+        self_contact: whether a thread touches itself where it would cross itself; None where the depth decides, see
+            `has_self_contact`.
+
+    Raises:
+        ConfigurationError: a value is not finite or not within its bounds.
+    """
+
+    diameter: Annotated[float, bounded("m", 0.005, 0.5)] = 0.035
+    depth: Annotated[float, bounded("m", 1e-5, 0.1)] = 0.003
+    wall_friction: Annotated[float, bounded("", 0.0, MAX_FRICTION)] = 0.0
+    self_contact: bool | None = None
+
+    def has_self_contact(self, thread_diameter: float) -> bool:
+        """Return whether a thread touches itself where it would cross itself.
+
+        It passes over itself where the liquid is two diameters deep or more, unless `self_contact` is set.
+
+        Args:
+            thread_diameter: [m].
+        """
+        if self.self_contact is not None:
+            return self.self_contact
+        # In a liquid two diameters deep the thread can pass over itself.
+        return self.depth < 2.0 * thread_diameter
+
+    @property
+    def radius(self) -> float:
+        """Inner radius [m]."""
+        return 0.5 * self.diameter
+
+
+@checked_arguments("shape")
+@dataclass(frozen=True)
+class SceneShape:
+    """A named shape that stands in the dish.
+
+    Attributes:
+        name: unique within its scene.
+        kind: one of `KINDS`.
+        geometry: the shape itself, corners rounded already [m].
+        definition: how a scene file describes it, for example `{"disc": {"center": [0.0, 0.0], "radius": 0.001}}`;
+            empty where only the geometry is known, as of a message.
+        friction: Coulomb's coefficient of the thread on it.
+
+    Raises:
+        ConfigurationError: the name or the kind cannot be used, or the geometry is out of bounds.
+    """
+
+    name: str
+    kind: str
+    geometry: Disc | Polygon
+    definition: Mapping[str, Any] = field(default_factory=dict, compare=False, repr=False)
+    friction: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check name, kind and bounds."""
+        if not is_name(self.name):
+            raise ConfigurationError("shape.name", self.name, f"1 to {MAX_NAME_CHARS} printable characters")
+        if self.kind not in KINDS:
+            raise ConfigurationError(f"{self.name}.kind", self.kind, f"one of {', '.join(KINDS)}")
+        _check_friction(f"{self.name}.friction", self.friction)
+        if isinstance(self.geometry, Disc):
+            if len(self.geometry.centre) != 2:
+                raise ConfigurationError(f"{self.name}.disc.centre", self.geometry.centre, "two coordinates x, y [m]")
+            return
+        farthest = float(np.abs(self.geometry.outline).max())
+        if farthest > MAX_COORDINATE:
+            expectation = f"coordinates of at most {MAX_COORDINATE:g}, in metres"
+            raise ConfigurationError(f"{self.name}.polygon.outline", farthest, expectation)
+        shortest = min(float(np.hypot(*(ring - np.roll(ring, 1, axis=0)).T).min()) for ring in self.geometry.rings)
+        if shortest < MIN_EDGE:
+            raise ConfigurationError(f"{self.name}.polygon", shortest, f"edges of at least {MIN_EDGE:g} m")
+
+    @cached_property
+    def solid(self) -> shapely.Geometry:
+        """The shape as a shapely geometry; a disc as a polygon of 256 vertices."""
+        if isinstance(self.geometry, Disc):
+            return shapely.Point(self.geometry.centre).buffer(self.geometry.radius, quad_segs=64)
+        outline, *holes = self.geometry.rings
+        return shapely.Polygon(outline, holes)
+
+    @property
+    def area(self) -> float:
+        """Area, holes taken off [m^2]."""
+        if isinstance(self.geometry, Disc):
+            return math.pi * self.geometry.radius**2
+        return self.geometry.area
+
+    @cached_property
+    def label_point(self) -> tuple[float, float]:
+        """A point inside of the shape, well away from its boundary: where its name can stand [m]."""
+        if isinstance(self.geometry, Disc):
+            return self.geometry.centre[0], self.geometry.centre[1]
+        solid = self.solid
+        line = shapely.maximum_inscribed_circle(solid, tolerance=0.02 * math.sqrt(solid.area))
+        x, y = line.coords[0]
+        return float(x), float(y)
+
+    def outlines(self, tolerance: float) -> list[list[tuple[float, float]]]:
+        """Return the outline, then the holes, with no more vertices than it takes to draw them.
+
+        Args:
+            tolerance: by which the boundary may be off [m].
+        """
+        drawn = self.solid.simplify(tolerance)
+        return [[(x, y) for x, y in ring.coords[:-1]] for ring in (drawn.exterior, *drawn.interiors)]
+
+
+@checked_arguments("scene")
+@dataclass(frozen=True)
+class Scene:
+    """The dish and the shapes in it. Shapes are numbered in their order; margins name them by that index.
+
+    Attributes:
+        dish: the dish.
+        shapes: in order, names unique.
+
+    Raises:
+        ConfigurationError: two shapes have one name, a shape is outside of the dish, or there are too many.
+    """
+
+    dish: Dish = Dish()
+    shapes: tuple[SceneShape, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the shapes together."""
+        if len(self.shapes) > MAX_SHAPES:
+            raise ConfigurationError("shapes", f"{len(self.shapes)} shapes", f"at most {MAX_SHAPES}")
+        polygons = [shape.geometry for shape in self.shapes if isinstance(shape.geometry, Polygon)]
+        rings = [ring for polygon in polygons for ring in (polygon.outline, *polygon.holes)]
+        for count, what, most in (
+            (len(rings), "outlines and holes", MAX_OUTLINES),
+            (sum(map(len, rings)), "vertices", MAX_VERTICES),
+        ):
+            if count > most:
+                raise ConfigurationError("shapes", f"{count} {what}", f"at most {most} in all")
+        names = Counter(shape.name for shape in self.shapes)
+        for shape in self.shapes:
+            if names[shape.name] > 1:
+                raise ConfigurationError(shape.name, "a name given twice", "a name of its own for each shape")
+            near, far = _distance_and_coverage(shape, self.dish.radius)
+            if near >= self.dish.radius:
+                raise ConfigurationError(
+                    shape.name,
+                    f"a shape outside of the dish, {near:.4g} m from its centre",
+                    f"a part of it within the dish, less than {self.dish.radius:g} m",
+                )
+            if not far:
+                raise ConfigurationError(
+                    shape.name, "a shape that covers the whole dish", "room in the dish; lengths in metres"
+                )
+
+    @classmethod
+    @checked_arguments("scene")
+    def create(cls, *, dish_diameter: float = 0.035, shapes: Mapping[str, Disc | Polygon] | None = None) -> Scene:
+        """Return a scene with named shapes, all of them tissue.
+
+        >>> Scene.create(dish_diameter=0.035, shapes={"post": Disc((0.0, 0.0), 0.0025)}).names
+        ('post',)
+
+        Args:
+            dish_diameter: inner diameter of the dish [m].
+            shapes: by name.
+
+        Raises:
+            ConfigurationError: a shape cannot be used.
+        """
+        named = (shapes or {}).items()
+        return cls(Dish(dish_diameter), tuple(SceneShape(name, KINDS[0], geometry) for name, geometry in named))
+
+    @cached_property
+    def version(self) -> str:
+        """Hash of the content: equal for scenes with the same dish, names, kinds, geometry and friction, bit for bit.
+
+        A scene without friction, and where the depth decides on self-contact, has the version of before there was any.
+        """
+        digest = hashlib.sha256(struct.pack("<2d", self.dish.diameter, self.dish.depth))
+        for shape in self.shapes:
+            for text in (shape.name, shape.kind):
+                encoded = text.encode()
+                digest.update(struct.pack("<I", len(encoded)) + encoded)
+            if isinstance(shape.geometry, Disc):
+                digest.update(struct.pack("<B3d", 0, *shape.geometry.centre, shape.geometry.radius))
+                continue
+            for ring in shape.geometry.rings:
+                digest.update(struct.pack("<BI", 1, len(ring)) + np.asarray(ring, dtype="<f8").tobytes())
+        coefficients = (self.dish.wall_friction, *self.friction)
+        if any(coefficients):
+            digest.update(struct.pack(f"<B{len(coefficients)}d", 2, *coefficients))
+        if self.dish.self_contact is not None:
+            digest.update(struct.pack("<B?", 3, self.dish.self_contact))
+        return digest.hexdigest()[:VERSION_CHARS]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the shapes, in their order."""
+        return tuple(shape.name for shape in self.shapes)
+
+    @property
+    def obstacles(self) -> tuple[Disc | Polygon, ...]:
+        """Geometry of the shapes, in their order."""
+        return tuple(shape.geometry for shape in self.shapes)
+
+    @property
+    def friction(self) -> tuple[float, ...]:
+        """Coulomb's coefficient of each shape, in their order."""
+        return tuple(shape.friction for shape in self.shapes)
+
+    def add(self, shape: SceneShape) -> Scene:
+        """Return the scene with one more shape, at the end."""
+        return replace(self, shapes=(*self.shapes, shape))
+
+    def remove(self, name: str) -> Scene:
+        """Return the scene without a shape.
+
+        Raises:
+            ConfigurationError: there is no shape of this name.
+        """
+        self._require(name)
+        return replace(self, shapes=tuple(shape for shape in self.shapes if shape.name != name))
+
+    def replace(self, shape: SceneShape) -> Scene:
+        """Return the scene with another shape in the place of the one of the same name.
+
+        Raises:
+            ConfigurationError: there is no shape of this name.
+        """
+        self._require(shape.name)
+        return replace(self, shapes=tuple(shape if old.name == shape.name else old for old in self.shapes))
+
+    def _require(self, name: str) -> None:
+        if name not in self.names:
+            known = ", ".join(self.names) or "none: the scene has no shapes"
+            raise ConfigurationError("shape.name", name, f"one of {known}"[:400])
+
+
+def is_name(text: Any) -> bool:
+    """Return whether a text can name a shape."""
+    return isinstance(text, str) and 0 < len(text) <= MAX_NAME_CHARS and text.isprintable() and text == text.strip()
+
+
+def _distance_and_coverage(shape: SceneShape, dish_radius: float) -> tuple[float, bool]:
+    """Return a shape's distance from the dish's centre [m], and whether it leaves any of the dish uncovered."""
+    geometry, solid = shape.geometry, shape.solid
+    if isinstance(geometry, Disc):
+        away = math.hypot(*geometry.centre)
+        return max(0.0, away - geometry.radius), away + dish_radius > geometry.radius
+    near = float(solid.distance(shapely.Point(0.0, 0.0)))
+    if near > 0.0:
+        return near, True
+    return near, not solid.covers(shapely.Point(0.0, 0.0).buffer(dish_radius, quad_segs=32))

@@ -1,1 +1,0 @@
-"""What reproduces the results of the paper, all of it simulated."""

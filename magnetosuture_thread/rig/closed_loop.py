@@ -1,0 +1,306 @@
+"""The closed loop without a graph: rig, tracker or its noise, estimator, procedure, and bridge on simulated time."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magnetosuture_thread.bags import packing
+from magnetosuture_thread.bags.scene_message import packed_scene
+from magnetosuture_thread.bags.writer import BagWriter
+from magnetosuture_thread.coils.bridge import NEEDLE, BridgeOutput, CoilBridge
+from magnetosuture_thread.coils.drivers import DriverState
+from magnetosuture_thread.coils.latch import ArmingLatch
+from magnetosuture_thread.estimator.thread_session import PredictionResult, ThreadSession
+from magnetosuture_thread.geometry.polyline import Points, arc_lengths, points_at
+from magnetosuture_thread.geometry.thread_observation import PieceEnd, ThreadObservation, ThreadPiece
+from magnetosuture_thread.planning.executor import ThreadCondition
+from magnetosuture_thread.rig.camera import encode_jpeg
+from magnetosuture_thread.rig.rig import Rig, RigFrame, ground_truth_outputs
+from magnetosuture_thread.rig.setups import Setup
+from magnetosuture_thread.settings import interface
+from magnetosuture_thread.settings.errors import InvalidInputError
+from magnetosuture_thread.thread.prediction import NeedlePose
+from magnetosuture_thread.vision.tracker import TrackerSession
+
+Vector = NDArray[np.float64]
+
+START = 1.0  # s; simulated time of the first frame, as 0 is no time in ROS
+LATENCY = 0.02  # s; from a frame to the command that follows from it, as measured in the graph
+TAIL_DEVIATION, HEADING_DEVIATION = 1e-5, 5e-3  # m and rad; of a tracked needle, see docs/results.md
+THREAD_DEVIATION, THREAD_CORRELATION = 1e-5, 5e-4  # m; of a tracked centreline, and along it
+
+RECORDED = (  # what the bag of a run holds, besides frames
+    *(interface.SCENE, interface.GROUND_TRUTH_NEEDLE, interface.GROUND_TRUTH_THREAD, interface.GROUND_TRUTH_PULL),
+    *(interface.NEEDLE_POSE, interface.THREAD_OBSERVATION, interface.MEASURED_THREAD),
+    *(interface.PREDICTED_THREAD, interface.ESTIMATED_THREAD, interface.MARGINS),
+    *(interface.NEEDLE_COMMAND, interface.CURRENTS, interface.FILTER_STATE),
+)
+
+Controller = Callable[[float, Vector, Vector, ThreadCondition], Vector]
+"""From stamp [s], tail [m], heading and the thread's condition to the velocity commanded of the tip [m/s]."""
+
+
+@dataclass(frozen=True)
+class LoopFrame:
+    """The instant of a frame, as it is and as the nodes have it.
+
+    Attributes:
+        time: since the loop began [s].
+        tail: of the needle in truth, shape (2,) [m].
+        heading: of the needle in truth [rad].
+        thread: in truth, shape (n + 1, 2) [m].
+        tension: peak of the thread in truth [N].
+        condition: what the model knows of the thread.
+        commanded: velocity of the tip that the controller wants, shape (2,) [m/s].
+        reason: why the coils are at zero; empty if they are not.
+    """
+
+    time: float
+    tail: Vector
+    heading: float
+    thread: Points
+    tension: float
+    condition: ThreadCondition
+    commanded: Vector
+    reason: str
+
+
+@dataclass(order=True)
+class Measurement:
+    """Needle and thread as measured in a frame.
+
+    Attributes:
+        due: when it reaches the nodes [s].
+        stamp: of the frame [s].
+        tail: of the needle, shape (2,) [m].
+        heading: unit vector, shape (2,).
+        covariance: of x, y [m] and the angle of the heading [rad], shape (3, 3).
+        observation: of the thread; None where none was made.
+    """
+
+    due: float
+    stamp: float
+    tail: Vector = field(compare=False)
+    heading: Vector = field(compare=False)
+    covariance: Vector = field(compare=False)
+    observation: ThreadObservation | None = field(compare=False)
+
+
+class LoopRecorder(Protocol):
+    """Gets what the nodes and the rig would publish. Times are those of the loop's stamps [s]."""
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Take a frame with its ground truth."""
+
+    def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
+        """Take a measurement, what the thread model makes of it, and the commanded velocity of the tip [m/s]."""
+
+    def on_bridge(self, now: float, output: BridgeOutput) -> None:
+        """Take a step of the coil bridge."""
+
+
+class ClosedLoop:
+    """Runs rig, measurement, thread model and coil bridge, as the graph does, in one process and without clocks.
+
+    Args:
+        setup: what the nodes believe.
+        rig: the simulated rig, which may differ from that.
+        controller: commands the needle from each pose.
+        seed: of noise and lost frames.
+        camera: whether frames are rendered and tracked; else the tracker's noise is added to the truth.
+        losses: share of the frames that get lost, 0 to 1.
+        coil_gains: by which the coils are stronger than the bridge believes, shape (m,); all 1 if None.
+        recorder: gets what the nodes would publish; None for nobody.
+    """
+
+    def __init__(
+        self,
+        setup: Setup,
+        rig: Rig,
+        controller: Controller,
+        seed: int = 0,
+        *,
+        camera: bool = False,
+        losses: float = 0.0,
+        coil_gains: Vector | None = None,
+        recorder: LoopRecorder | None = None,
+    ) -> None:
+        self.setup, self.rig, self._controller = setup, rig, controller
+        self._recorder = recorder
+        self._random, self._losses = np.random.default_rng([seed, 1]), losses
+        self._gains = np.ones(len(rig.currents)) if coil_gains is None else coil_gains
+        latch, self._driver = ArmingLatch(), DriverState(True)
+        self.bridge = CoilBridge(setup.coils, latch, setup.scene)
+        latch.activate()
+        self.bridge.arm(self._driver)
+        self.session = ThreadSession(setup.model, setup.scene)
+        self._tracker = TrackerSession(setup.vision, setup.scene) if camera else None
+        self.now = self._next_frame = START
+        self._waiting: list[Measurement] = []
+        self._count = 0
+        self._condition = ThreadCondition(problem="no thread yet")
+        self._commanded = np.zeros(2)
+        self._reason, self._drift = "", 0.0
+
+    def step(self) -> LoopFrame | None:
+        """Go on by a period of the bridge; return the frame if one was taken.
+
+        Raises:
+            SolverError: the rig's mechanics find no next state.
+        """
+        frame = None
+        if self.now >= self._next_frame - 1e-9:
+            self._next_frame += 1.0 / self.setup.rig.frame_rate
+            frame = self._look()
+        else:
+            self.rig.advance(self.now - START)
+        while self._waiting and self._waiting[0].due <= self.now + 1e-9:
+            self._measured(heapq.heappop(self._waiting))
+        output = self.bridge.step(self.now, self.now, self._driver)
+        self._reason, self._drift = output.reason, output.drift
+        if self._recorder is not None:
+            self._recorder.on_bridge(self.now, output)
+        self.rig.apply(self._gains * output.allocation.currents, self.now - START)
+        self.now += 1.0 / self.setup.coils.rate
+        return frame
+
+    def _look(self) -> LoopFrame:
+        frame = self.rig.look(self.now - START, rendered=self._tracker is not None)
+        if self._recorder is not None:
+            self._recorder.on_frame(self.now, frame)
+        lost = self._random.uniform() < self._losses
+        if not lost and (measured := self._measure(frame)) is not None:
+            heapq.heappush(self._waiting, measured)
+        return LoopFrame(
+            self.now - START,
+            frame.tail.copy(),
+            frame.heading,
+            frame.thread.copy(),
+            float(self.rig.tension.max(initial=0.0)),
+            self._condition,
+            self._commanded,
+            self._reason,
+        )
+
+    def _measure(self, frame: RigFrame) -> Measurement | None:
+        due = self.now + LATENCY
+        if self._tracker is None:
+            tail = frame.tail + TAIL_DEVIATION * self._random.standard_normal(2)
+            angle = frame.heading + HEADING_DEVIATION * self._random.standard_normal()
+            covariance = np.diag([TAIL_DEVIATION**2, TAIL_DEVIATION**2, HEADING_DEVIATION**2])
+            heading = np.array([math.cos(angle), math.sin(angle)])
+            return Measurement(due, self.now, tail, heading, covariance, self._observe(frame.thread))
+        if frame.image is None:
+            return None
+        track = self._tracker.on_image(self.now, frame.image).track
+        if not len(track.tail) or len(track.heading) == 0:
+            return None
+        return Measurement(due, self.now, track.tail, track.heading, track.covariance, track.observation)
+
+    def _observe(self, thread: Points) -> ThreadObservation:
+        """Return the thread with the noise of a tracked centreline: alike over `THREAD_CORRELATION`."""
+        length = float(arc_lengths(thread)[-1])
+        at = np.linspace(0.0, length, 64)
+        points = points_at(thread, at)
+        knots = np.arange(0.0, length + THREAD_CORRELATION, THREAD_CORRELATION)
+        noise = np.column_stack([np.interp(at, knots, self._random.standard_normal(len(knots))) for _ in range(2)])
+        deviation, ends = np.full(len(points), THREAD_DEVIATION), (PieceEnd.TAIL, PieceEnd.FREE)
+        piece = ThreadPiece(points + THREAD_DEVIATION * noise, deviation, *ends, (0.0, 0.0))
+        return ThreadObservation((piece,), complete=True)
+
+    def _measured(self, measured: Measurement) -> None:
+        """Hand a measurement to bridge, thread model and controller, in the order of the graph."""
+        self._count += 1
+        stamp, now = measured.stamp, self.now
+        with suppress(InvalidInputError):  # the bridge's node reports it, and the others take the pose all the same
+            self.bridge.on_pose(measured.tail, measured.heading, stamp, self._count, now, now, measured.covariance)
+        nanoseconds = round(1e9 * stamp)
+        if measured.observation is not None:
+            list(self.session.on_observation(nanoseconds, measured.observation))
+        deviation = tuple(np.sqrt(np.maximum(0.0, np.diag(measured.covariance)[[0, 2]])).tolist())
+        pose = NeedlePose(1e-9 * nanoseconds, measured.tail, measured.heading, deviation)
+        result = self.session.on_pose(nanoseconds, pose)
+        self.session.late_estimates()
+        margins = result.margins
+        slowdown = margins.friction.slowdown if margins else 1.0
+        self.bridge.on_margins(stamp, margins is not None, slowdown, result.scene_version, now)
+        self._condition = replace(condition_of(result), drift=self._drift, age=now - stamp)
+        if self.setup.coils.friction_feedback != "all":
+            self._condition = replace(self._condition, slowdown=1.0)
+        self._commanded = self._controller(stamp, measured.tail, measured.heading, self._condition)
+        self.bridge.command(NEEDLE, self._commanded, now, self._count, now, now)
+        if self._recorder is not None:
+            self._recorder.on_measurement(now, measured, result, self._commanded)
+
+
+def condition_of(result: PredictionResult) -> ThreadCondition:
+    """Return what a prediction and an estimate say of the thread's condition."""
+    thread = result.estimate or result.prediction
+    if thread is None:
+        return ThreadCondition(problem=result.reason)
+    margins, estimate, forces = result.margins, result.estimate, result.prediction and result.prediction.forces
+    problem = result.reason if margins is None else ""
+    if estimate is not None and estimate.unmeasured_for > 1.0:  # s, after which it is unsure
+        problem = f"the thread has not been measured for {estimate.unmeasured_for:.1f} s"
+    tension, nodes, slowdown = forces.peak_tension if forces else 0.0, 0, 1.0
+    if margins is not None:
+        nodes, slowdown = len(margins.friction.nodes), margins.friction.slowdown
+    return ThreadCondition(thread.positions, tension, nodes, slowdown, problem)
+
+
+class RunBag:
+    """Records a run, as a `LoopRecorder`. Every message is logged at the simulated time at which a node would get it.
+
+    Args:
+        bag: to write to.
+        setup: what the nodes believe.
+        camera: whether frames are rendered.
+    """
+
+    def __init__(self, bag: BagWriter, setup: Setup, *, camera: bool) -> None:
+        self._bag, self._rig, self._material = bag, setup.rig, setup.model.material
+        for channel in (*RECORDED, *((interface.COMPRESSED_IMAGE, interface.CAMERA_INFO) if camera else ())):
+            bag.add_topic(channel.recorded, channel.type_name)
+        begin = round(1e9 * START)
+        bag.write(interface.SCENE.recorded, begin, packed_scene(begin, setup.scene))
+        self._view = setup.rig.view(setup.scene)
+        self._command = 0  # stamp of the last [ns]
+
+    def on_frame(self, now: float, frame: RigFrame) -> None:
+        """Write a frame, if it was rendered, and the ground truth."""
+        stamp, rig = round(1e9 * now), self._rig
+        if frame.image is not None:
+            jpeg, size = encode_jpeg(frame.image, rig.jpeg_quality), (rig.camera_width, rig.camera_height)
+            self._write(stamp, packing.camera_outputs(stamp, jpeg, size, self._view, rig.camera_distance))
+        self._write(stamp, ground_truth_outputs(stamp, frame))
+
+    def on_measurement(self, now: float, measured: Measurement, result: PredictionResult, commanded: Vector) -> None:
+        """Write what was measured, predicted and estimated in a frame, and the command that came of it."""
+        time, stamp, observation = round(1e9 * now), result.stamp, measured.observation
+        self._write(time, packing.pose_outputs(stamp, measured.tail, measured.heading, measured.covariance))
+        if observation is not None:
+            self._write(time, packing.thread_outputs(stamp, observation, observation.from_tail))
+        self._write(time, packing.prediction_outputs(result, self._material))
+        self._write(time, packing.estimate_outputs(result))
+        self._bag.write(interface.NEEDLE_COMMAND.recorded, time, packing.packed_twist(time, commanded))
+        self._command = time
+
+    def on_bridge(self, now: float, output: BridgeOutput) -> None:
+        """Write currents and what became of the command, from the first command on."""
+        time = round(1e9 * now)
+        if not (output.publish and self._command):
+            return
+        self._bag.write(interface.CURRENTS.recorded, time, packing.packed_currents(time, self._command, output))
+        self._bag.write(interface.FILTER_STATE.recorded, time, packing.packed_filter_state(self._command, output))
+
+    def _write(self, time: int, outputs: packing.Outputs) -> None:
+        for channel, data in outputs:
+            self._bag.write(channel.recorded, time, data)

@@ -1,0 +1,153 @@
+"""Setups: the settings of all nodes, from one YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from magnetosuture_thread.coils.settings import CoilBridgeSettings
+from magnetosuture_thread.console.settings import ConsoleSettings
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.geometry.scene import Scene
+from magnetosuture_thread.geometry.scene_files import SceneServerSettings, read_scene
+from magnetosuture_thread.planning.follower import PathFollowerSettings
+from magnetosuture_thread.planning.procedure import Procedure
+from magnetosuture_thread.planning.session import NeedlePlannerSettings
+from magnetosuture_thread.rig.settings import RigSettings
+from magnetosuture_thread.settings.configuration import Configuration
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.parameter_files import EVERY_NODE, load_setup
+from magnetosuture_thread.settings.resources import find_setup_file
+from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
+from magnetosuture_thread.vision.settings import VisionTrackerSettings
+
+SETTINGS_CLASSES = (
+    VisionTrackerSettings,
+    ThreadModelSettings,
+    CoilBridgeSettings,
+    RigSettings,
+    PathFollowerSettings,
+    NeedlePlannerSettings,
+    ConsoleSettings,
+)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The settings of all nodes, and their scene.
+
+    Attributes:
+        name: the file's name without its ending.
+        path: the file.
+        vision: settings of the vision tracker.
+        model: settings of the thread model.
+        coils: settings of the coil bridge.
+        rig: settings of the simulated rig.
+        follower: settings of the path follower.
+        planner: settings of the needle planner.
+        console: settings of the operator's page.
+    """
+
+    name: str
+    path: Path
+    vision: VisionTrackerSettings
+    model: ThreadModelSettings
+    coils: CoilBridgeSettings
+    rig: RigSettings
+    follower: PathFollowerSettings
+    planner: NeedlePlannerSettings
+    console: ConsoleSettings
+
+    def with_scene(self, scene: Scene) -> Setup:
+        """Return the setup with another scene, as that of a bag."""
+        other = replace(self)
+        other.__dict__["scene"] = scene  # where the cached property looks first
+        return other
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether the setup names a scene."""
+        return bool(self.model.scene)
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that all nodes start from.
+
+        Raises:
+            ConfigurationError: the setup names none, or its file cannot be used.
+        """
+        if not self.has_scene:
+            raise ConfigurationError("scene", "none", f"a scene file under {EVERY_NODE}", str(self.path))
+        try:
+            return read_scene(self.model.scene)
+        except ConfigurationError as error:
+            if error.source:
+                raise
+            raise ConfigurationError(error.name, error.value, error.expectation, str(self.path)) from None
+
+
+def _check_agreement(path: Path, settings: Mapping[str, Configuration]) -> None:
+    """Refuse two values of one shared parameter, as of `/**` and of a node's section; the rig's are the truth."""
+    first: dict[str, tuple[str, object]] = {}
+    for group, values in settings.items():
+        if group == RigSettings.GROUP:
+            continue
+        for name in SHARED_PARAMETERS:
+            if hasattr(values, name):
+                owner, expected = first.setdefault(name, (group, getattr(values, name)))
+                if getattr(values, name) != expected:
+                    words = f"{expected!r}, as {owner}.{name}; what nodes share is written once, under {EVERY_NODE}"
+                    raise ConfigurationError(f"{group}.{name}", getattr(values, name), words, str(path))
+
+
+def read_setup(name: str, scene: Scene | None = None) -> Setup:
+    """Read a setup, given as a path or as the name of one that ships with the package.
+
+    Args:
+        name: of the setup, or the path of its file.
+        scene: in place of the one that the file names.
+
+    Raises:
+        ConfigurationError: there is no such file, or it holds anything invalid.
+    """
+    path = find_setup_file(name)
+    settings = load_setup(path, (*SETTINGS_CLASSES, SceneServerSettings))
+    _check_agreement(path, settings)
+    setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
+    if scene is not None:  # as of a bag, of which no path is followed
+        return setup.with_scene(scene)
+    if setup.has_scene:
+        try:
+            setup.follower.check_path(setup.scene)
+        except ConfigurationError as error:
+            raise ConfigurationError(error.name, error.value, error.expectation, str(path)) from None
+    return setup
+
+
+def read_procedure_setup(procedure: Procedure, name: str = "") -> Setup:
+    """Read the setup of a procedure, with the procedure's scene if it names one.
+
+    Args:
+        procedure: to execute.
+        name: of another setup than the procedure's, or the path of its file.
+
+    Raises:
+        ConfigurationError: neither names a setup, a goal is to be pursued faster than the bridge allows, or the dish
+            reaches beyond the coils; or see `read_setup` and `read_scene`.
+    """
+    if not (name or procedure.setup):
+        raise ConfigurationError("setup", "nothing", f"a setup, as the procedure {procedure.name} names none")
+    setup = read_setup(name or procedure.setup)
+    for index, limits in enumerate(procedure.limits):
+        if limits.speed > setup.coils.max_speed:
+            expected = f"at most coil_bridge.max_speed of {setup.name}, {setup.coils.max_speed:g} m/s"
+            raise ConfigurationError(f"goals[{index}].limits.speed", limits.speed, expected)
+    if not procedure.scene:
+        return setup
+    scene, reach = read_scene(procedure.scene), setup.coils.reach
+    if scene.dish.radius > reach:
+        expected = f"at most {2e3 * reach:.3g} mm, which the coils of {setup.name} leave"
+        raise ConfigurationError("scene.dish.diameter", f"{1e3 * scene.dish.diameter:.3g} mm", expected)
+    return setup.with_scene(scene)

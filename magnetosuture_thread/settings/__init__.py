@@ -1,0 +1,1 @@
+"""Settings, errors, files and the table of topics: what every other subpackage builds on."""

@@ -1,0 +1,130 @@
+"""Errors with the value that was given, where, and what was expected."""
+
+from __future__ import annotations
+
+import copyreg
+import re
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, requires
+from typing import Any
+
+from magnetosuture_thread.settings.texts import shortened
+
+MAX_NAME_CHARS = 300  # of what an error is about; the name may hold the path of a file
+
+
+_DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "serial": "pyserial", "yaml": "PyYAML"}
+_ROS = re.compile(r"rcl.*|ros.*_(interfaces|py)|rpyutils|(ament|launch|tf2|rosidl)_?.*|.+_(msgs|srvs|interfaces)(_py)?")
+
+
+def missing_module(error: ModuleNotFoundError) -> str:
+    """Return what to do about a module that is not there: the line that installs it."""
+    module = str(error.name).split(".")[0]
+    # Modules of the extra `cluster`.
+    if module in ("dask", "distributed", "fsspec", "pyarrow", "s3fs", "upath"):
+        return f"{error}; clusters and bags by URL need the extra: pip install '.[cluster]'"
+    if _ROS.fullmatch(module):
+        sourced = "source the setup.bash of ROS, and of the workspace where this package is built"
+        return f"{error}; nodes and the live graph need ROS 2 Jazzy: {sourced}; without ROS: pip install '.[ros]'"
+    name = _DISTRIBUTIONS.get(module, module)
+    with suppress(PackageNotFoundError):
+        found = [each.split(";")[0].strip() for each in requires("magnetosuture_thread") or ()]
+        name = next((each for each in found if re.split("[^A-Za-z0-9_.-]", each)[0].lower() == name.lower()), name)
+    return f"{error}; a Python package is missing: pip install '{name}'; see docs/how_to/installation.md"
+
+
+class MagnetosutureError(Exception):
+    """Base of every error that this package raises on purpose; its text is one line for a person."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what it is unpickled from, as from a worker: `__init__` takes others than what is in `args`."""
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
+
+
+class ConfigurationError(MagnetosutureError):
+    """A configuration value that cannot be used.
+
+    Args:
+        name: the parameter, with the node or group it belongs to, for example `thread_model.length`.
+        value: the value that was given.
+        expectation: what would have been accepted, with its unit.
+        source: the file that the value came from, if there is one.
+    """
+
+    def __init__(self, name: str, value: object, expectation: str, source: str = "") -> None:
+        self.name = name
+        self.value = value
+        self.expectation = expectation
+        self.source = source
+        where = f"{shortened(source, MAX_NAME_CHARS)}: " if source else ""
+        super().__init__(
+            f"{where}{shortened(name, MAX_NAME_CHARS)}: got {shortened(repr(value))}, expected {expectation}"
+        )
+
+
+class BagError(MagnetosutureError):
+    """A bag or a reference file that cannot be read or written.
+
+    Args:
+        path: the file.
+        problem: what is wrong with it and what was expected.
+    """
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path = str(path)
+        self.problem = problem
+        super().__init__(f"{path}: {problem}")
+
+
+class InvalidInputError(MagnetosutureError):
+    """A message or sample that must not be used.
+
+    Args:
+        field: what is wrong, for example `needle/measured_cp.pose.position`.
+        value: the value that was given.
+        expectation: what would have been accepted, with its unit.
+    """
+
+    def __init__(self, field: str, value: object, expectation: str) -> None:
+        self.field = field
+        self.value = value
+        self.expectation = expectation
+        super().__init__(f"{shortened(field, MAX_NAME_CHARS)}: got {shortened(str(value))}, expected {expectation}")
+
+
+class SolverError(MagnetosutureError):
+    """A program whose solution did not pass its own residual check.
+
+    Args:
+        solver: the solver's name.
+        status: the solver's own word.
+        residual: the largest scaled residual.
+        tolerance: the largest residual that would have been accepted.
+    """
+
+    def __init__(self, solver: str, status: str, residual: float, tolerance: float) -> None:
+        self.solver = solver
+        self.status = status
+        self.residual = residual
+        self.tolerance = tolerance
+        super().__init__(
+            f"{solver} ended with status {status!r} and residual {residual:.1e}, expected at most {tolerance:.1e}"
+        )
+
+
+class GraphError(MagnetosutureError):
+    """A node or a part of the running graph that failed."""
+
+
+class DriverError(MagnetosutureError):
+    """A coil driver that can never work as it is configured.
+
+    Args:
+        driver: its name.
+        problem: what is wrong and what was expected.
+    """
+
+    def __init__(self, driver: str, problem: str) -> None:
+        self.driver = driver
+        self.problem = problem
+        super().__init__(f"driver {driver}: {problem}")

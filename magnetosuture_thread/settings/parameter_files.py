@@ -1,0 +1,144 @@
+"""ROS 2 parameter files: sections for nodes, and setups made of such sections.
+
+A section's key says for which nodes it is, as in ROS: `/**` for all, `/**/coil_bridge` for those of this name in any
+namespace, `/lab1/coil_bridge` for one. Of several sections for one node, a later one overrides an earlier one,
+whichever is the more specific: so rclpy has it, tried with `/**` before and after a node's own section.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from magnetosuture_thread.settings.configuration import (
+    ROS_PARAMETERS,
+    Configuration,
+    configuration_fields,
+    from_mapping,
+    read_yaml,
+    suggest_names,
+)
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
+
+PARAMETERS = "ros__parameters"
+EVERY_NODE = "/**"
+
+
+def read_sections(path: Path, what: str = "parameter file") -> list[tuple[str, dict[str, Any]]]:
+    """Return the sections of a parameter file in their order: key and parameters by name.
+
+    A namespace may be a level of its own, as in `lab1: {coil_bridge: {ros__parameters: {}}}`. Keys are returned with a
+    leading slash.
+
+    Args:
+        path: the file.
+        what: it is, for errors.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is no YAML, or is no parameter file.
+    """
+    content = read_yaml(path, what)
+    if not isinstance(content, Mapping):
+        # What the file holds is not shown: it may be none of ours.
+        found = None if content is None else f"content of type {type(content).__name__}"
+        raise ConfigurationError(what, found, f"sections by node, each with {PARAMETERS}", str(path))
+    return list(_sections("", content, str(path)))
+
+
+def _sections(above: str, content: Mapping[str, Any], source: str) -> Iterable[tuple[str, dict[str, Any]]]:
+    for name, section in content.items():
+        key = f"{above}/{str(name).strip('/')}"
+        if not isinstance(section, Mapping) or not section:
+            raise ConfigurationError(format_key(key), section, f"one key, {PARAMETERS}", source)
+        if PARAMETERS not in section:
+            yield from _sections(key, section, source)
+            continue
+        values = section[PARAMETERS]
+        if len(section) > 1:
+            raise ConfigurationError(format_key(key), list(section), f"one key, {PARAMETERS}", source)
+        if not isinstance(values, Mapping):
+            raise ConfigurationError(f"{format_key(key)}.{PARAMETERS}", values, "parameters by name", source)
+        yield key, {str(name): value for name, value in values.items()}
+
+
+def key_matches(key: str, node: str) -> bool:
+    """Return whether a section is for a node: `*` stands for one name, `**` for any number of them, none too.
+
+    Args:
+        key: of the section, with a leading slash.
+        node: its fully qualified name.
+
+    >>> key_matches("/**/coil_bridge", "/lab1/coil_bridge"), key_matches("/coil_bridge", "/lab1/coil_bridge")
+    (True, False)
+    """
+    parts = {"**": "(/[^/]+)*", "*": "/[^/]+"}
+    pattern = "".join(parts.get(part, "/" + re.escape(part)) for part in key.strip("/").split("/"))
+    return re.fullmatch(pattern, node) is not None
+
+
+def node_of_key(key: str) -> str:
+    """Return the name of the node that a section's key ends in, which may be a wildcard."""
+    return key.rpartition("/")[2]
+
+
+def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, Any]:
+    """Read a setup: a ROS 2 parameter file with shared parameters under `/**` and a section for each node.
+
+    Args:
+        path: the YAML file.
+        classes: the nodes' configuration classes; the `GROUP` of each is the name that its section's key ends in.
+
+    Returns:
+        A configuration object for each class, by its `GROUP`; what no section gives keeps its default.
+
+    Raises:
+        ConfigurationError: the file cannot be read, is no parameter file, or holds anything invalid.
+    """
+    known = {cls.GROUP: cls for cls in classes}
+    fields = {group: {about.name for about in configuration_fields(cls)} for group, cls in known.items()}
+    given: dict[str, dict[str, Any]] = {group: {} for group in known}
+    spaces: list[str] = []
+    for key, section in read_sections(path, "setup file"):
+        values = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
+        group = node_of_key(key)
+        for name, value in values.items():
+            check_list_value(f"{format_key(key)}.{name}", value, str(path))
+        if key == EVERY_NODE:
+            for name, value in values.items():
+                if name not in SHARED_PARAMETERS:
+                    known_shared = suggest_names(name, list(SHARED_PARAMETERS))
+                    expected = f"a shared parameter, {known_shared}; others in their node's section"
+                    raise ConfigurationError(f"{EVERY_NODE}.{name}", value, expected, str(path))
+                for owner in known:
+                    if name in fields[owner]:
+                        given[owner][name] = value
+            continue
+        if group not in known:
+            raise ConfigurationError(format_key(key), group, suggest_names(group, [EVERY_NODE, *known]), str(path))
+        space = key.rpartition("/")[0]
+        if space and "*" not in space:
+            spaces.append(space)
+        if len(set(spaces)) > 1:
+            raise ConfigurationError(
+                format_key(key), space, f"one namespace in a setup, as {spaces[0]} before", str(path)
+            )
+        given[group].update(values)
+    return {group: from_mapping(cls, given[group], str(path)) for group, cls in known.items()}
+
+
+def format_key(key: str) -> str:
+    """Return a key for an error text: a single name without its slash."""
+    return key[1:] if key.count("/") == 1 and "*" not in key else key
+
+
+def check_list_value(name: str, value: Any, source: str) -> None:
+    """Refuse a list that is not valid in ROS; an empty one is, and is what a dump of parameters holds.
+
+    Raises:
+        ConfigurationError: its entries are of several kinds.
+    """
+    if isinstance(value, list) and len({type(entry) for entry in value}) > 1:
+        raise ConfigurationError(name, value, "entries of one kind: 0.0, not 0", source)

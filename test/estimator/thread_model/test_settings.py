@@ -1,0 +1,104 @@
+"""Settings of the thread model: what they make, and what they refuse."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magnetosuture_thread.estimator.settings import ThreadModelSettings
+from magnetosuture_thread.geometry.obstacles import Disc
+from magnetosuture_thread.settings.configuration import from_mapping
+from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.thread.prediction import NeedleMotion, NeedlePose
+from test.thread.worlds import polygon, scene_with
+
+SQUARE = polygon(0.0, 0.0, 0.01, 0.0, 0.01, 0.01, 0.0, 0.01)
+
+
+def made(**values: Any) -> ThreadModelSettings:
+    """Return settings from what a setup file would hold."""
+    return from_mapping(ThreadModelSettings, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"fixed_nodes": [26]}, "nodes from 1 to 25"),
+        ({"fixed_nodes": [0]}, "from 1 to"),
+        ({"formulation": "magic"}, "one of rod, paper"),
+        ({"solver": "magic"}, "one of banded, osqp"),
+        ({"medium": "honey"}, "one of liquid, air"),
+        ({"gravity": [9.81]}, "multiple of 2"),
+        ({"medium": "air", "gravity": [0.0, -9.8, 1.0, 2.0]}, "two numbers"),
+        ({"gravity": [0.0, -9.81]}, "gravity.*medium: air only"),
+        ({"medium": "air", "viscosity": 0.5}, "viscosity.*medium: liquid only"),
+        ({"rest_curvature": 900.0}, "half a radian"),
+        ({"drag_anisotropy": 0.0}, "from 0.05 to 1"),
+        ({"drag_anisotropy": float("nan")}, "from 0.05 to 1"),
+        ({"medium": "air", "drag_anisotropy": 0.7}, "drag_anisotropy.*medium: liquid only"),
+        ({"attachment_offset": [1e-3]}, "multiple of 2"),
+        ({"attachment_offset": [1e-3, 0.0, 1e-3, 0.0]}, "attachment_offset.*two numbers, along and to the left"),
+        ({"attachment_offset": [1e-3, float("nan")]}, "from -0.01 to 0.01 m"),
+        ({"attachment_offset": [1.0, 0.0]}, "from -0.01 to 0.01 m"),
+        ({"paper_damping": 1.0}, "from 0 to 0.999"),
+        ({"paper_stiffness_weight": -1.0}, "from 0 to"),
+        ({"formulation": "paper", "medium": "air"}, "paper has no inertia"),
+        ({"formulation": "paper", "flow": [1e-3, 0.0]}, "paper has no drag"),
+        ({"flow": [1e-3]}, "multiple of 2"),
+        ({"flow": [1e-3, 1.0]}, "from -0.1 to 0.1 m/s"),
+        ({"segments": 400}, "longer than thick"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
+    with pytest.raises(ConfigurationError, match=words) as caught:
+        made(**values)
+    assert "thread_model." in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"formulation": "paper"},
+        {"solver": "osqp", "attachment": "clamped"},
+        {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
+        {"fixed_nodes": [20], "rest_curvature": 30.0},
+        {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
+        {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
+        {"margin_range": 0.02},
+        {"flow": [1e-3, -2e-3]},
+    ],
+)
+def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
+    predictor = made(**values).predictor(scene_with(SQUARE, diameter=0.06))
+    assert not predictor.started
+    east = np.array([1.0, 0.0])
+    tail = np.array([-0.005, -0.005])
+    predictor.start(NeedlePose(0.0, tail, east), np.array([tail, tail - 0.019 * east]))
+    for k in range(1, 6):
+        prediction = predictor.step(NeedlePose(k / 60.0, tail + k * 5e-5 * east, east))
+    assert prediction.formulation == values.get("formulation", "rod")
+    assert prediction.solver == values.get("solver", "banded")
+    assert np.isfinite(prediction.positions).all()
+    assert prediction.residual < 1e-6
+
+
+def test_a_scene_that_the_segments_do_not_resolve_is_refused():
+    with pytest.raises(ConfigurationError, match=r"scene\.shape_1: got 0\.0001, .* half of a segment"):
+        made().predictor(scene_with(Disc((0.0, 0.0), 1e-3), Disc((0.01, 0.0), 1e-4)))
+
+
+def test_the_attachments_velocity_is_the_rate_of_its_place():
+    settings, velocity, rate, step = made(attachment_offset=[0.01, -0.005]), np.array([2e-3, -1e-3]), 3.0, 1e-6
+
+    def after(time: float) -> NeedlePose:
+        heading = np.array([np.cos(0.4 + rate * time), np.sin(0.4 + rate * time)])
+        return settings.attachment_pose(
+            NeedlePose(1.0 + time, time * velocity, heading, motion=NeedleMotion(velocity, rate))
+        )
+
+    motion = after(0.0).motion
+    assert motion is not None
+    np.testing.assert_allclose(motion.velocity, (after(step).tail - after(-step).tail) / (2.0 * step), rtol=1e-6)
