@@ -1,10 +1,20 @@
-"""Build of the ament_python package, used by colcon; pip reads pyproject.toml instead."""
+"""Build of the ament_python package, used by colcon; pip reads pyproject.toml instead.
+
+`colcon build --symlink-install` links this file, not pyproject.toml, into its build folder, so that name, version and
+programs are read from there through the link.
+"""
 
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
-PACKAGE = "magnetosuture_thread"
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parent / "pyproject.toml").read_text())["project"]
+PACKAGE = PROJECT["name"]
 
 
 def files(pattern: str) -> list[str]:
@@ -13,6 +23,9 @@ def files(pattern: str) -> list[str]:
 
 
 setup(
+    name=PACKAGE,
+    version=PROJECT["version"],
+    entry_points={"console_scripts": [f"{name} = {target}" for name, target in PROJECT["scripts"].items()]},
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={
         PACKAGE: [

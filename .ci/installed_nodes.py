@@ -1,8 +1,7 @@
 """Starts every node as it is installed, from colcon's folder as `ros2 run` would, and ends it.
 
 Each gets a scene by its name, which is installed too, and the kernels of this tree. A node passes when it says on
-/diagnostics that it is
-there, and ends with exit code 0 when interrupted.
+/diagnostics that it is there, and ends with exit code 0 when interrupted.
 """
 
 from __future__ import annotations
@@ -80,13 +79,16 @@ def check_nodes(programs: dict[str, str], python: Path, state: Path, domain: int
     return 0
 
 
-def main(install: Path) -> int:
-    """Start every node from colcon's install folder; return 0 if all of them work."""
-    (package,) = install.glob("magnetosuture_thread/lib/python*/site-packages/magnetosuture_thread")
-    copy_kernels(package)
-    programs = f'. "{install}/setup.sh" && exec "{install}/magnetosuture_thread/lib/magnetosuture_thread/'
-    return check_nodes({name: f'{programs}{name}"' for name in NODES}, Path(sys.executable), install / "state", 101)
+def main(install: Path, names: list[str]) -> int:
+    """Start nodes, all of them where none is named, from colcon's install folder; return 0 if all of them work."""
+    (program,) = install.glob("**/lib/magnetosuture_thread/scene_server")  # in either layout of the folder
+    sourced = f'. "{install}/setup.sh" && exec '
+    where = "import os, magnetosuture_thread as package; print(os.path.dirname(package.__file__))"
+    found = subprocess.run(["sh", "-c", f"{sourced}{sys.executable} -c '{where}'"], check=True, capture_output=True)
+    copy_kernels(Path(found.stdout.decode().strip()))
+    programs = {name: f'{sourced}"{program.parent}/{name}"' for name in names or NODES}
+    return check_nodes(programs, Path(sys.executable), install / "state", 101)
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]).resolve()))
+    sys.exit(main(Path(sys.argv[1]).resolve(), sys.argv[2:]))

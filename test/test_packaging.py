@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import shlex
 import subprocess
@@ -152,3 +153,26 @@ def test_every_node_is_an_executable_and_launched(name: str):
 def test_shared_files_are_found():
     assert (share_directory("magnetosuture_thread") / "config").is_dir()
     assert (share_directory("magnetosuture_msgs") / "msg" / "SafetyMargins.msg").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["", "--symlink-install", "--merge-install"])
+def test_colcon_installs_programs_version_launch_file_and_settings(tmp_path: Path, layout: str):
+    """The messages are those of this environment; `.ci/run` builds them too, and starts every node."""
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "magnetosuture_thread").symlink_to(ROOT)
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "HOME": str(tmp_path)}
+    subprocess.run(["colcon", "build", *layout.split()], cwd=tmp_path, env=environment, check=True, timeout=600)
+    prefix = tmp_path / "install" / ("" if layout == "--merge-install" else "magnetosuture_thread")
+    programs, share = prefix / "lib" / "magnetosuture_thread", prefix / "share" / "magnetosuture_thread"
+    listed = re.search(r"^\[project\.scripts\]\n((?:.+\n)+)", PYPROJECT, re.MULTILINE)
+    assert listed is not None
+    assert {path.name for path in programs.iterdir()} == set(re.findall(r"^(\w+) =", listed[1], re.MULTILINE))
+    assert (share / "launch" / "magnetosuture.launch.py").is_file()
+    assert (share / "config" / "hernia_ring.yaml").is_file()
+
+    shell = f". {tmp_path}/install/setup.sh && exec {programs}/magnetosuture --version"
+    done = subprocess.run(["sh", "-c", shell], cwd="/", env=environment, check=True, timeout=300, capture_output=True)
+    assert done.stdout.decode().split()[-1] == magnetosuture_thread.__version__
+    start = [sys.executable, ROOT / ".ci" / "installed_nodes.py", tmp_path / "install", "scene_server"]
+    subprocess.run(start, env=environment, check=True, timeout=600)
