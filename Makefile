@@ -9,12 +9,14 @@
 # make peers  add the solvers of `python -m benchmarks solver --peers`
 # make clean  remove all that make made
 #
-# Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI. Needs Python 3.10 to 3.13
-# with venv and headers, a C and C++ compiler, and make; nothing of ROS.
+# Each sets up .venv the first time, over ROS 2 Jazzy as wheels from PyPI: `make demo` with what the package needs, the
+# others with what tests and documentation need too. Needs Python 3.10 to 3.13 with venv and headers, a C and C++
+# compiler, and make; nothing of ROS.
 
 PYTHON ?= python3
 VENV := .venv
 EXTRAS := ros dev docs colcon cluster
+INSTALLED := $(VENV)/.installed
 READY := $(VENV)/.ready
 RUN := $(VENV)/bin
 DEMO := output/demo
@@ -29,9 +31,9 @@ INSTALL = PIP_CONSTRAINT=constraints.txt PIP_NO_COMPILE=no $(RUN)/python -m pip 
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all kernels coverage lint docs colcon peers clean help
-.PHONY: .packages .messages
+.PHONY: .packages .messages .kernels
 
-demo: $(READY)
+demo: $(INSTALLED)
 	@rm -rf $(DEMO)
 	$(RUN)/magnetosuture replay examples/post_wrap --output $(DEMO)
 
@@ -42,7 +44,7 @@ test: $(READY)
 test-all: test
 	$(RUN)/python -m pytest -m slow test
 
-kernels: $(READY)
+kernels: $(INSTALLED)
 	$(RUN)/magnetosuture compile
 
 # Of the packages' own tests; those of the page in a browser run the server in the same process.
@@ -77,20 +79,30 @@ help:
 clean:
 	rm -rf $(VENV) build output
 
-# The packages, and the messages that pip builds in an environment of its own, at the same time: most of
-# either keeps one processor busy.
-$(READY): pyproject.toml constraints.txt $(MESSAGES)
-	@echo "Setting up $(VENV): ROS 2 Jazzy and the other packages, and building the messages (2 to 4 minutes)"
+# What the tests and the documentation need is added to what the package needs.
+$(READY): $(INSTALLED)
+	@echo "Adding to $(VENV) what tests and documentation need (1 minute)"
+	$(RUN)/python .ci/requirements.py $(EXTRAS) >$(VENV)/requirements.txt
+	$(INSTALL) --requirement $(VENV)/requirements.txt
+	@touch $@
+
+# The messages, which pip builds in an environment of its own, and the packages with the functions that they compile, at
+# the same time: either keeps one processor busy.
+$(INSTALLED): pyproject.toml constraints.txt $(MESSAGES)
+	@echo "Setting up $(VENV): ROS 2 Jazzy and the other packages, the messages and compiled functions (2 minutes)"
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(0 if (3, 10) <= v < (3, 14) else f"Python {v[0]}.{v[1]} found, 3.10 to 3.13 needed; name one by: make PYTHON=python3.12")'
 	@command -v c++ >/dev/null || { echo "no C++ compiler found; on Debian or Ubuntu: apt install build-essential python3-dev" >&2; exit 1; }
 	@rm -rf $(VENV)
 	$(PYTHON) -m venv $(VENV)
-	@$(MAKE) --no-print-directory --jobs=2 .packages .messages
+	@$(MAKE) --no-print-directory --jobs=2 .kernels .messages
 	@touch $@
 
 .packages:
-	$(RUN)/python .ci/requirements.py $(EXTRAS) >$(VENV)/requirements.txt
+	$(RUN)/python .ci/requirements.py ros >$(VENV)/requirements.txt
 	$(INSTALL) --requirement $(VENV)/requirements.txt
+
+.kernels: .packages
+	$(RUN)/python -m magnetosuture_thread.cli compile
 
 .messages:
 	$(INSTALL) --no-deps --editable .
