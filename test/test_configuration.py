@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import pytest
 
+from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import Configuration, from_mapping, quantity, read_yaml
 from magnetosuture_thread.settings.errors import ConfigurationError
 from magnetosuture_thread.settings.parameter_files import key_matches, load_setup
-from magnetosuture_thread.settings.shared_parameters import shared_parameter
 
 
 @dataclass(frozen=True)
@@ -110,23 +110,19 @@ def test_an_unreadable_setup_file_is_refused(tmp_path: Path):
 
 
 @dataclass(frozen=True)
-class Kettle(Configuration):
+class Kettle(shared.Viscosity):
     """Another example, with something that it shares."""
 
     GROUP: ClassVar[str] = "kettle"
 
     volume: float = quantity(0.001, "of the water", unit="m^3", minimum=0.0, maximum=0.01)
-    viscosity: float = shared_parameter("viscosity")
 
 
 @dataclass(frozen=True)
-class Pot(Configuration):
+class Pot(shared.Viscosity, shared.ThreadLength):
     """One more."""
 
     GROUP: ClassVar[str] = "pot"
-
-    viscosity: float = shared_parameter("viscosity")
-    thread_length: float = shared_parameter("thread_length")
 
 
 COMMON, OWN = "/**: {ros__parameters: {viscosity: 2.0}}\n", "/**/kettle: {ros__parameters: {viscosity: 3.0}}\n"

@@ -34,7 +34,7 @@ from magnetosuture_thread.bags import reading
 from magnetosuture_thread.bags.scene_message import parse_scene_message
 from magnetosuture_thread.geometry.compiled import compilations
 from magnetosuture_thread.nodes import topics
-from magnetosuture_thread.nodes.parameters import as_declared, declare, given_parameters, plain_value
+from magnetosuture_thread.nodes.parameters import declare, given_parameters, plain_value
 from magnetosuture_thread.settings import interface
 from magnetosuture_thread.settings.configuration import Configuration, configuration_fields, from_mapping, to_mapping
 from magnetosuture_thread.settings.errors import GraphError
@@ -363,7 +363,6 @@ class ManagedNode(GuardedNode, LifecycleNode, Generic[C]):
         except ConfigurationError:
             self._leave()
             raise
-        self.add_pre_set_parameters_callback(lambda parameters: as_declared(settings, parameters))
         self.add_on_set_parameters_callback(self._check_change)
         self.add_post_set_parameters_callback(self._put_in_force)
 

@@ -16,9 +16,9 @@ T = TypeVar("T")
 WORDS: dict[type, str] = {bool: "true or false", NoneType: "nothing"}
 
 
-def bounded(unit: str = "", minimum: float | None = None, maximum: float | None = None, **more: Any) -> Quantity:
-    """Return the quantity of an argument, with which its type is annotated, as in `Annotated[float, LENGTH]`."""
-    return Quantity("", unit, minimum, maximum, **more)
+def bounded(*arguments: Any, **options: Any) -> Quantity:
+    """Return a quantity without a description, to annotate an argument's type, as in `Annotated[float, LENGTH]`."""
+    return Quantity("", *arguments, **options)
 
 
 def checked_arguments(owner: str, kind: Callable[..., Exception] = ConfigurationError) -> Callable[[T], T]:
@@ -59,7 +59,7 @@ def checked_arguments(owner: str, kind: Callable[..., Exception] = Configuration
 
 def _checked_argument(name: str, value: Any, hint: Any) -> Any:
     """Return an argument as its annotation has it; what is neither class nor number is not, nor an array."""
-    hint, about = (hint.__origin__, hint.__metadata__[0]) if get_origin(hint) is Annotated else (hint, Quantity(""))
+    hint, about = get_args(hint)[:2] if get_origin(hint) is Annotated else (hint, Quantity(""))
     kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     lists = [kind for kind in kinds if {int, float} & {*get_args(kind)}]
     if lists or {int, float} & {*kinds}:
