@@ -19,25 +19,17 @@ SHIPPED = sorted(path.stem for path in (share_directory("magnetosuture_thread") 
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_setup_that_ships_loads(name: str):
-    setup = read_setup(name)
-    assert setup.name == name
-    assert setup.vision.thread_length == setup.model.thread_length
-    assert setup.model.thread().segment_length > setup.model.thread().diameter
-
-
-@pytest.mark.parametrize("name", SHIPPED)
 def test_in_every_setup_that_ships_the_rig_is_what_the_nodes_believe(name: str):
     setup = read_setup(name)
-    rig, vision, coils = setup.rig, setup.vision, setup.coils
-    for name in SHARED_PARAMETERS:
-        if hasattr(rig, name) and hasattr(vision, name):
-            assert getattr(rig, name) == getattr(vision, name)
-    assert (rig.thread_length, rig.thread_attachment) == (setup.model.thread_length, setup.model.attachment)
-    assert (rig.viscosity, rig.driver_timeout) == (setup.model.viscosity, coils.driver_timeout)
+    rig, vision, coils, thread = setup.rig, setup.vision, setup.coils, setup.model.thread()
+    assert setup.name == name
+    assert thread.segment_length > thread.diameter
+    for shared in SHARED_PARAMETERS:
+        others = [getattr(other, shared) for other in (vision, setup.model, coils) if hasattr(other, shared)]
+        assert not others or not hasattr(rig, shared) or set(others) == {getattr(rig, shared)}
+    assert rig.thread_attachment == setup.model.attachment
     rig.check_scene(setup.scene)
-    for name in ("coil_angles", "coil_distance", "coil_radius"):
-        assert getattr(rig, name) == getattr(coils, name)
+    assert (rig.coil_distance, rig.coil_radius) == (coils.coil_distance, coils.coil_radius)
     body = NeedleBody(
         rig.needle_length, rig.needle_width, rig.needle_curvature, rig.needle_magnetisation, rig.viscosity
     )

@@ -16,7 +16,16 @@ from magnetosuture_thread.geometry.scene import Scene
 from magnetosuture_thread.settings import shared_parameters as shared
 from magnetosuture_thread.settings.configuration import configuration_fields, quantity
 from magnetosuture_thread.thread.margins import FrictionLaw
-from magnetosuture_thread.thread.material import MATERIALS, MAX_REST_ANGLE, Attachment, Material, Medium, Thread
+from magnetosuture_thread.thread.material import (
+    MATERIALS,
+    MAX_ELASTIC_MODULUS,
+    MAX_REST_ANGLE,
+    MIN_ELASTIC_MODULUS,
+    Attachment,
+    Material,
+    Medium,
+    Thread,
+)
 from magnetosuture_thread.thread.paper import PaperOptions
 from magnetosuture_thread.thread.prediction import NeedlePose
 from magnetosuture_thread.thread.predictor import FORMULATIONS, ThreadPredictor
@@ -63,7 +72,7 @@ class ThreadModelSettings(
     material: str = quantity("polyamide_7_0", "the thread's material", choices=tuple(MATERIALS))
     diameter: float = quantity(0.0, "of the thread; 0 takes the material's", "m", 0.0, 0.01)
     elastic_modulus: float = quantity(
-        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, 1e12
+        0.0, "effective modulus of the thread in bending; 0 takes the material's", "Pa", 0.0, MAX_ELASTIC_MODULUS
     )
     segments: int = quantity(25, "number of segments, n", "", 3, 2000)
     attachment: str = quantity(
@@ -172,6 +181,9 @@ class ThreadModelSettings(
         """Refuse a thread thicker than a segment is long, and values that contradict each other."""
         if self.friction_threshold > self.margin_range:
             raise self.refused("friction_threshold", f"at most {self.GROUP}.margin_range, {self.margin_range:g} m")
+        if 0.0 < self.elastic_modulus < MIN_ELASTIC_MODULUS:
+            words = f"at least {MIN_ELASTIC_MODULUS:g} Pa, as of silicone rubber, or 0 for the material's"
+            raise self.refused("elastic_modulus", words)
         diameter, segments = self._material().diameter, self.segments
         if self.thread_length / segments <= diameter:
             most = math.ceil(self.thread_length / diameter) - 1

@@ -35,7 +35,7 @@ from magnetosuture_thread.settings.configuration import (
     parse_parameter_value,
     suggest_names,
 )
-from magnetosuture_thread.settings.parameter_files import EVERY_NODE, format_key, key_matches, names_of, read_sections
+from magnetosuture_thread.settings.parameter_files import EVERY_NODE, key_matches, names_of, read_sections
 from magnetosuture_thread.settings.shared_parameters import SHARED_PARAMETERS
 
 C = TypeVar("C", bound=Configuration)
@@ -64,23 +64,46 @@ def init(arguments: Sequence[str] | None = None, context: Context | None = None,
     _ARGUMENTS[context] = line
 
 
-def given_parameters(node: Node, kind: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that are meant for a node, by name, without those of rclpy; what comes later counts.
+def declare(
+    node: Node,
+    cls: type[C],
+    options: Mapping[str, Any],
+    *,
+    read_only: bool = True,
+    fixed: Mapping[str, str] = MappingProxyType({}),
+) -> C:
+    """Declare every field of a configuration class and return the settings in force.
 
-    `use_sim_time` is put in force here, as rcl does not know sections by a node's kind.
+    Their values are those of the parameter files and the command line that are meant for this node, of which the later
+    one counts. Shared parameters that the class does not know are meant for others, and left aside. `use_sim_time` is
+    put in force, as rcl does not know sections by a node's kind.
 
     Args:
-        node: in any namespace and under any name.
-        kind: the node's own name, under which parameter files know it whatever it is renamed to.
+        node: that gets the parameters, in any namespace and under any name.
+        cls: the configuration class; by its `GROUP` parameter files know the node whatever it is renamed to.
         options: as given to the node: `cli_args`, `parameter_overrides` and others of rclpy.
+        read_only: whether they stay as they are for good.
+        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
+            descriptions.
 
     Raises:
-        ConfigurationError: a parameter file cannot be used, or nothing in it is for this node.
+        ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds, a parameter file cannot be
+            used, or nothing in it is for this node.
     """
-    values = _parameters(kind, node.get_fully_qualified_name(), options)
+    values = _parameters(cls.GROUP, node.get_fully_qualified_name(), options)
     if isinstance(clock := values.get("use_sim_time"), bool):
         node.set_parameters([Parameter("use_sim_time", value=clock)])
-    return {name: value for name, value in values.items() if name.split(".")[0] not in ROS_PARAMETERS}
+    others = {*SHARED_PARAMETERS, *ROS_PARAMETERS} - names_of(cls)
+    settings = from_mapping(cls, {name: value for name, value in values.items() if name.split(".")[0] not in others})
+    fields = configuration_fields(cls)
+    for about in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
+        node.declare_parameter(about.name, _type(about), ignore_override=True)
+    node.set_parameters_atomically([_parameter(about, getattr(settings, about.name)) for about in fields])
+    for about in fields:
+        node.set_descriptor(about.name, _descriptor(about, read_only, fixed.get(about.name)))
+    weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
+    node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
+    return settings
 
 
 def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
@@ -103,7 +126,7 @@ def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
 
 
 def _parameters(kind: str, node: str, options: Mapping[str, Any], *, is_required: bool = True) -> dict[str, Any]:
-    """Return the parameters for a node of a kind and a full name, by name; see `given_parameters`."""
+    """Return the parameters for a node of a kind and a full name, by name; what comes later counts."""
     arguments = list(_flags(options.get("cli_args") or []))  # the node's own override the process's
     if options.get("use_global_arguments", True):
         context, default = options.get("context"), get_default_context()
@@ -141,45 +164,9 @@ def _sections_for(path: Path, kind: str, node: str, is_required: bool) -> list[d
     # A section of its kind that is for another namespace only is as bad as none: the rest would be its defaults.
     if is_required and (not fitting or (of_kind and not fitting & of_kind)):
         expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if of_kind else f" or {EVERY_NODE}")
-        found = ", ".join(format_key(key) for key, _ in sections) or "none"
+        found = ", ".join(key for key, _ in sections) or "none"
         raise ConfigurationError("sections", found, expected, str(path))
     return [values for key, values in sections if key in fitting]
-
-
-def declare(
-    node: Node,
-    cls: type[C],
-    values: Mapping[str, Any],
-    *,
-    read_only: bool = True,
-    fixed: Mapping[str, str] = MappingProxyType({}),
-) -> C:
-    """Declare every field of a configuration class and return the settings in force.
-
-    Shared parameters that the class does not know are meant for others, and left aside.
-
-    Args:
-        node: that gets the parameters.
-        cls: the configuration class.
-        values: by name.
-        read_only: whether they stay as they are for good.
-        fixed: those that the node keeps while it is configured, by name, and why, or an empty text; for their
-            descriptions.
-
-    Raises:
-        ConfigurationError: a parameter is unknown, of the wrong type or out of its bounds.
-    """
-    others = set(SHARED_PARAMETERS) - names_of(cls)
-    settings = from_mapping(cls, {name: value for name, value in values.items() if name not in others})
-    fields = configuration_fields(cls)
-    for about in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
-        node.declare_parameter(about.name, _type(about), ignore_override=True)
-    node.set_parameters_atomically([_parameter(about, getattr(settings, about.name)) for about in fields])
-    for about in fields:
-        node.set_descriptor(about.name, _descriptor(about, read_only, fixed.get(about.name)))
-    weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
-    node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
-    return settings
 
 
 def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
@@ -194,7 +181,6 @@ def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -
         else:
             ranges["integer_range"] = [IntegerRange(**limits, step=1)]
     return ParameterDescriptor(
-        name=about.name,
         type=_type(about).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=constraints,

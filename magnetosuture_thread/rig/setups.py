@@ -57,11 +57,6 @@ class Setup:
         other.__dict__["scene"] = scene  # where the cached property looks first
         return other
 
-    @property
-    def has_scene(self) -> bool:
-        """Whether the setup names a scene."""
-        return bool(self.model.scene)
-
     @cached_property
     def scene(self) -> Scene:
         """The scene that all nodes start from.
@@ -69,7 +64,7 @@ class Setup:
         Raises:
             ConfigurationError: the setup names none, or its file cannot be used.
         """
-        if not self.has_scene:
+        if not self.model.scene:
             raise ConfigurationError("scene", "none", f"a scene file under {EVERY_NODE}", str(self.path))
         with errors_of_file(str(self.path)):
             return read_scene(self.model.scene)
@@ -109,7 +104,7 @@ def read_setup(name: str, scene: Scene | None = None) -> Setup:
         setup = Setup(path.stem, path, *(settings[cls.GROUP] for cls in SETTINGS_CLASSES))
         if scene is not None:  # as of a bag, of which no path is followed
             return setup.with_scene(scene)
-        if setup.has_scene:
+        if setup.model.scene:
             setup.follower.check_path(setup.scene)
     return setup
 

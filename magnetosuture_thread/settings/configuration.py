@@ -23,7 +23,7 @@ from typing import Any, ClassVar, TypeVar, cast, get_args, get_origin, get_type_
 
 import yaml
 
-from magnetosuture_thread.settings.errors import ConfigurationError
+from magnetosuture_thread.settings.errors import MAX_NAME_CHARS, ConfigurationError
 from magnetosuture_thread.settings.files import read_regular
 from magnetosuture_thread.settings.untrusted import MAX_TEXT_BYTES, MAX_YAML_DEPTH, BudgetError, check_yaml
 
@@ -305,6 +305,7 @@ def parse_parameter_value(text: str) -> Any:
 
 def suggest_names(name: str, known: Sequence[str]) -> str:
     """Return known names as text, the most similar ones of many, with the closest match as a hint."""
+    name = name[:MAX_NAME_CHARS]  # to compare long texts takes long
     close = difflib.get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
     similar = difflib.get_close_matches(name, known, n=MAX_SUGGESTIONS, cutoff=0.0)

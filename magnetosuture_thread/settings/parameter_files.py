@@ -53,18 +53,18 @@ def _sections(above: str, content: Mapping[str, Any], source: str) -> Iterable[t
     for name, section in content.items():
         key = f"{above}/{str(name).strip('/')}"
         if not isinstance(section, Mapping) or not section:
-            raise ConfigurationError(format_key(key), section, f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(key, section, f"one key, {PARAMETERS}", source)
         if PARAMETERS not in section:
             yield from _sections(key, section, source)
             continue
         values = section[PARAMETERS]
         if len(section) > 1:
-            raise ConfigurationError(format_key(key), list(section), f"one key, {PARAMETERS}", source)
+            raise ConfigurationError(key, list(section), f"one key, {PARAMETERS}", source)
         if not isinstance(values, Mapping):
-            raise ConfigurationError(f"{format_key(key)}.{PARAMETERS}", values, "parameters by name", source)
+            raise ConfigurationError(f"{key}.{PARAMETERS}", values, "parameters by name", source)
         for parameter, value in values.items():
             if isinstance(value, list) and len({type(entry) for entry in value}) > 1:  # ROS takes no such file
-                at = f"{format_key(key)}.{parameter}"
+                at = f"{key}.{parameter}"
                 raise ConfigurationError(at, value, "entries of one kind: 0.0, not 0", source)
         yield key, {str(parameter): value for parameter, value in values.items()}
 
@@ -113,9 +113,9 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
                     values[group].update((name, own[name]) for name in own.keys() & names_of(cls))
                 continue
             if group not in known:
-                raise ConfigurationError(format_key(key), group, suggest_names(group, [EVERY_NODE, *known]))
+                raise ConfigurationError(key, group, suggest_names(group, [EVERY_NODE, *known]))
             if above and "*" not in above and above != (space := space or above):
-                raise ConfigurationError(format_key(key), above, f"one namespace in a setup, as {space} before")
+                raise ConfigurationError(key, above, f"one namespace in a setup, as {space} before")
             values[group].update(own)
         return {group: from_mapping(cls, values[group]) for group, cls in known.items()}
 
@@ -123,8 +123,3 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
 def names_of(cls: type[Configuration]) -> set[str]:
     """Return the names of the parameters of a configuration class."""
     return {about.name for about in configuration_fields(cls)}
-
-
-def format_key(key: str) -> str:
-    """Return a key for an error text: a single name without its slash."""
-    return key[1:] if key.count("/") == 1 and "*" not in key else key
