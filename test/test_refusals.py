@@ -71,7 +71,6 @@ def made(kind: Callable[..., Any], /, **arguments: Any) -> Callable[..., Any]:
 
 CREATE = made(ThreadPredictor.create, material="polyamide_7_0", length=0.019, segments=25)
 FILTER = made(NeedleSafetyFilter, scene=EMPTY, needle_length=0.004)
-PREDICTOR = made(ThreadPredictor, thread=THREAD, scene=EMPTY)
 FORECASTER = made(ThreadForecaster, thread=THREAD, scene=EMPTY)
 MATERIAL = made(Material, name="x", diameter=6e-5, elastic_modulus=2e9, source="")
 MEDIUM = made(Medium, drag_across=1.0, drag_along=0.5)

@@ -93,7 +93,8 @@ def test_two_values_of_what_nodes_share_are_refused(tmp_path: Path, section: str
 def test_what_nodes_share_is_written_once(tmp_path: Path):
     path = tmp_path / "shared.yaml"
     path.write_text(
-        "/**: {ros__parameters: {scene: dish_150mm, needle_length: 0.004, needle_curvature: 8.0, driver_timeout: 0.3}}"
+        "/**: {ros__parameters: {scene: dish_150mm, needle_length: 0.004, needle_curvature: 8, driver_timeout: 0.3}}\n"
+        "/**/rig_simulator: {ros__parameters: {needle_width: 0.0006}}\n"  # which may be another than nodes believe
     )
     setup = read_setup(str(path))
     for part in (setup.vision, setup.coils, setup.rig, setup.follower, setup.console):
@@ -101,13 +102,8 @@ def test_what_nodes_share_is_written_once(tmp_path: Path):
         assert part.scene == "dish_150mm"
     assert setup.console.needle_curvature == setup.coils.needle_curvature == setup.rig.needle_curvature == 8.0
     assert setup.coils.driver_timeout == setup.rig.driver_timeout == 0.3
+    assert (setup.rig.needle_width, setup.coils.needle_width) == (0.0006, 0.0004)
     assert setup.scene.dish.diameter == 0.15
-
-
-def test_the_rig_alone_may_be_another_than_the_nodes_believe(tmp_path: Path):
-    path = tmp_path / "wrong.yaml"
-    path.write_text("/**/rig_simulator: {ros__parameters: {needle_length: 0.008}}\n")
-    assert read_setup(str(path)).rig.needle_length == 0.008
 
 
 def test_an_unknown_setup_is_refused_with_the_known_ones():

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary, ref
 
@@ -70,7 +69,7 @@ def declare(
     options: Mapping[str, Any],
     *,
     read_only: bool = True,
-    fixed: Mapping[str, str] = MappingProxyType({}),
+    fixed: Mapping[str, str] | None = None,
 ) -> C:
     """Declare every field of a configuration class and return the settings in force.
 
@@ -100,7 +99,7 @@ def declare(
         node.declare_parameter(about.name, _type(about), ignore_override=True)
     node.set_parameters_atomically([_parameter(about, getattr(settings, about.name)) for about in fields])
     for about in fields:
-        node.set_descriptor(about.name, _descriptor(about, read_only, fixed.get(about.name)))
+        node.set_descriptor(about.name, _descriptor(about, read_only, (fixed or {}).get(about.name)))
     weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
     node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
     return settings

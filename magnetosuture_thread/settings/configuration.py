@@ -15,7 +15,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -237,16 +237,8 @@ _RosLoader.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in entries if not tag.endswith((":float", ":timestamp"))]
     for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-_RosLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"),
-    list("-+0123456789."),
-)
-
-
-def _load(text: str, *, plain: bool = False) -> Any:
-    check_yaml(text, plain=plain)
-    return yaml.load(text, _RosLoader)
+_NUMBER = r"^[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|^\.(?:nan|NaN|NAN)$"
+_RosLoader.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(_NUMBER), list("-+0123456789."))
 
 
 def read_yaml(path: Path, what: str, *, plain: bool = False) -> Any:
@@ -283,7 +275,8 @@ def read_yaml_text(text: str, what: str, source: str = "", *, plain: bool = Fals
     if len(text) > MAX_TEXT_BYTES:
         raise ConfigurationError(what, f"{len(text)} characters", f"at most {MAX_TEXT_BYTES}", source)
     try:
-        return _load(text, plain=plain)
+        check_yaml(text, plain=plain)
+        return yaml.load(text, _RosLoader)
     except BudgetError as error:
         raise ConfigurationError(what, str(error), f"plain YAML, at most {MAX_YAML_DEPTH} deep", source) from None
     except yaml.YAMLError as error:
@@ -297,10 +290,9 @@ def read_yaml_text(text: str, what: str, source: str = "", *, plain: bool = Fals
 
 def parse_parameter_value(text: str) -> Any:
     """Return the value of a text as in a parameter file; the text itself where it is no YAML."""
-    try:
-        return _load(text)
-    except (yaml.YAMLError, BudgetError):
-        return text
+    with suppress(ConfigurationError):
+        return read_yaml_text(text, "parameter")
+    return text
 
 
 def suggest_names(name: str, known: Sequence[str]) -> str:

@@ -69,10 +69,7 @@ class CommandFilter(Configuration):
         0.0, "clearance beside keep_out, for the error of a pose that is extrapolated to the present", "m", 0.0, 0.005
     )
     friction_feedback: str = quantity(
-        "all",
-        "which commands the thread's friction slows: all, or those of the operator only, while procedures and paths "
-        "keep limits of their own",
-        choices=("all", "operator"),
+        "all", "which commands the thread's friction slows: all, or the operator's alone", choices=("all", "operator")
     )
 
 

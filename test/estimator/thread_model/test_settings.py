@@ -50,13 +50,10 @@ def test_what_cannot_be_is_refused_by_name(values: dict[str, Any], words: str):
     [
         {},
         {"formulation": "paper"},
-        {"solver": "osqp", "attachment": "clamped"},
         {"medium": "air", "mass_per_length": 1e-5, "gravity": [0.0, -9.81], "bending_damping": 0.01},
-        {"fixed_nodes": [20], "rest_curvature": 30.0},
-        {"drag_anisotropy": 1.0, "attachment_offset": [1e-3, 5e-4]},
+        {"fixed_nodes": [20], "rest_curvature": 30.0, "attachment_offset": [1e-3, 5e-4], "flow": [1e-3, -2e-3]},
+        {"solver": "osqp", "attachment": "clamped", "drag_anisotropy": 1.0, "margin_range": 0.02},
         {"formulation": "paper", "paper_damping": 0.0, "paper_stiffness_weight": 2.0},
-        {"margin_range": 0.02},
-        {"flow": [1e-3, -2e-3]},
     ],
 )
 def test_every_choice_makes_a_predictor_that_steps(values: dict[str, Any]):
