@@ -95,11 +95,11 @@ def declare(
     others = {*SHARED_PARAMETERS, *ROS_PARAMETERS} - names_of(cls)
     settings = from_mapping(cls, {name: value for name, value in values.items() if name.split(".")[0] not in others})
     fields = configuration_fields(cls)
-    for about in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
-        node.declare_parameter(about.name, _type(about), ignore_override=True)
-    node.set_parameters_atomically([_parameter(about, getattr(settings, about.name)) for about in fields])
-    for about in fields:
-        node.set_descriptor(about.name, _descriptor(about, read_only, (fixed or {}).get(about.name)))
+    for setting in fields:  # by their types: by its value rclpy would take an empty list for one of bytes, for good
+        node.declare_parameter(setting.name, _type(setting), ignore_override=True)
+    node.set_parameters_atomically([_parameter(setting, getattr(settings, setting.name)) for setting in fields])
+    for setting in fields:
+        node.set_descriptor(setting.name, _descriptor(setting, read_only, (fixed or {}).get(setting.name)))
     weak = ref(node)  # where a constructor fails, nothing may keep the node: it would stay in the graph
     node.add_pre_set_parameters_callback(lambda parameters: _as_declared(weak(), cls, parameters))
     return settings
@@ -118,7 +118,7 @@ def settings_of(node: Node, cls: type[C], options: Mapping[str, Any]) -> C:
     Raises:
         ConfigurationError: a value is invalid.
     """
-    overrides = [each for each in options.get("parameter_overrides") or [] if each.name in SHARED_PARAMETERS]
+    overrides = [item for item in options.get("parameter_overrides") or [] if item.name in SHARED_PARAMETERS]
     name = f"{node.get_fully_qualified_name().rpartition('/')[0]}/{cls.GROUP}"
     values = _parameters(cls.GROUP, name, {**options, "parameter_overrides": overrides}, is_required=False)
     return from_mapping(cls, {name: values[name] for name in values.keys() & names_of(cls)})
@@ -142,7 +142,7 @@ def _parameters(kind: str, node: str, options: Mapping[str, Any], *, is_required
             owner, _, name = left.rpartition(":")
             if owner in ("", kind, node.rpartition("/")[2]):
                 values[name] = parse_parameter_value(right)
-    return values | {each.name: plain_value(each) for each in options.get("parameter_overrides") or []}
+    return values | {override.name: plain_value(override) for override in options.get("parameter_overrides") or []}
 
 
 def _flags(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -163,24 +163,24 @@ def _sections_for(path: Path, kind: str, node: str, is_required: bool) -> list[d
     # A section of its kind that is for another namespace only is as bad as none: the rest would be its defaults.
     if is_required and (not fitting or (of_kind and not fitting & of_kind)):
         expected = f"one for {node}: {EVERY_NODE}/{kind} or {node}" + ("" if of_kind else f" or {EVERY_NODE}")
-        found = ", ".join(key for key, _ in sections) or "none"
-        raise ConfigurationError("sections", found, expected, str(path))
+        keys = ", ".join(key for key, _ in sections) or "none"
+        raise ConfigurationError("sections", keys, expected, str(path))
     return [values for key, values in sections if key in fitting]
 
 
-def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
-    quantity, constraints = about.quantity, about.quantity.expectation(about.kind, entry=about.entry)
+def _descriptor(setting: ConfigurationField, read_only: bool, fixed: str | None) -> ParameterDescriptor:
+    quantity, constraints = setting.quantity, setting.quantity.expectation(setting.kind, entry=setting.entry)
     if fixed is not None:
         constraints += "; stays while the node is configured" + (f": {fixed}" if fixed else "")
     ranges: dict[str, Any] = {}
-    if about.kind in (float, int) and math.isfinite(quantity.maximum):
-        limits = {"from_value": about.kind(quantity.minimum), "to_value": about.kind(quantity.maximum)}
-        if about.kind is float:
+    if setting.kind in (float, int) and math.isfinite(quantity.maximum):
+        limits = {"from_value": setting.kind(quantity.minimum), "to_value": setting.kind(quantity.maximum)}
+        if setting.kind is float:
             ranges["floating_point_range"] = [FloatingPointRange(**limits)]
         else:
             ranges["integer_range"] = [IntegerRange(**limits, step=1)]
     return ParameterDescriptor(
-        type=_type(about).value,
+        type=_type(setting).value,
         description=f"{quantity.description} [{quantity.unit}]" if quantity.unit else quantity.description,
         additional_constraints=constraints,
         read_only=read_only,
@@ -188,13 +188,13 @@ def _descriptor(about: ConfigurationField, read_only: bool, fixed: str | None) -
     )
 
 
-def _type(about: ConfigurationField) -> Parameter.Type:
-    is_list = about.kind is tuple
-    return Parameter.Type[_TYPES[about.entry if is_list else about.kind] + "_ARRAY" * is_list]
+def _type(setting: ConfigurationField) -> Parameter.Type:
+    is_list = setting.kind is tuple
+    return Parameter.Type[_TYPES[setting.entry if is_list else setting.kind] + "_ARRAY" * is_list]
 
 
-def _parameter(about: ConfigurationField, value: Any) -> Parameter:
-    return Parameter(about.name, _type(about), list(value) if about.kind is tuple else value)
+def _parameter(setting: ConfigurationField, value: Any) -> Parameter:
+    return Parameter(setting.name, _type(setting), list(value) if setting.kind is tuple else value)
 
 
 def _as_declared(node: Any, cls: type[Configuration], parameters: Sequence[Parameter]) -> list[Parameter]:
@@ -207,17 +207,17 @@ def _as_declared(node: Any, cls: type[Configuration], parameters: Sequence[Param
         ParameterNotDeclaredException: an unknown name. The services of rclpy answer its text; by itself rclpy forgets
             the name.
     """
-    fields = {about.name: about for about in configuration_fields(cls)}
+    fields = {setting.name: setting for setting in configuration_fields(cls)}
     converted = []
     for parameter in parameters:
-        name, value, about = parameter.name, plain_value(parameter), fields.get(parameter.name)
-        if about is None and not (name and node.has_parameter(name)):
+        name, value, setting = parameter.name, plain_value(parameter), fields.get(parameter.name)
+        if setting is None and not (name and node.has_parameter(name)):
             expected = suggest_names(name, list(fields))
             raise ParameterNotDeclaredException(str(ConfigurationError(f"{cls.GROUP}.{name}", value, expected)))
-        if about is not None and value is not None:
-            text = isinstance(value, str) and about.kind is float
+        if setting is not None and value is not None:
+            text = isinstance(value, str) and setting.kind is float
             with suppress(ConfigurationError):
-                parameter = _parameter(about, about.checked(parse_parameter_value(value) if text else value))
+                parameter = _parameter(setting, setting.checked(parse_parameter_value(value) if text else value))
         converted.append(parameter)
     return converted
 

@@ -78,7 +78,7 @@ SETTINGS_CLASSES: tuple[type[Configuration], ...] = tuple(
 def _check_agreement(settings: Mapping[str, Configuration]) -> None:
     """Refuse two values of one shared parameter, as of `/**` and of a node's section; the rig's are the truth."""
     for name in SHARED_PARAMETERS:
-        values = {group: getattr(each, name) for group, each in settings.items() if hasattr(each, name)}
+        values = {group: getattr(node, name) for group, node in settings.items() if hasattr(node, name)}
         values.pop(RigSettings.GROUP, None)
         owner, *others = values
         for group in others:

@@ -131,8 +131,8 @@ class Configuration:
 
     def __post_init__(self) -> None:
         """Check every field by its quantity, then the fields together."""
-        for about in configuration_fields(type(self)):
-            object.__setattr__(self, about.name, about.checked(getattr(self, about.name)))
+        for setting in configuration_fields(type(self)):
+            object.__setattr__(self, setting.name, setting.checked(getattr(self, setting.name)))
         for cls in reversed(type(self).__mro__):
             if "check" in vars(cls):
                 cls.check(self)  # type: ignore[attr-defined]
@@ -202,7 +202,7 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
     Raises:
         ConfigurationError: a key is unknown, or a value is of the wrong type or out of its bounds.
     """
-    known = [about.name for about in configuration_fields(cls)]
+    known = [setting.name for setting in configuration_fields(cls)]
     with errors_of_file(source):
         for name, value in values.items():
             if name not in known:
@@ -212,7 +212,7 @@ def from_mapping(cls: type[C], values: Mapping[str, Any], source: str = "") -> C
 
 def to_mapping(settings: Configuration) -> dict[str, Any]:
     """Return a configuration object's values by field name, tuples as lists."""
-    values = {about.name: getattr(settings, about.name) for about in configuration_fields(type(settings))}
+    values = {setting.name: getattr(settings, setting.name) for setting in configuration_fields(type(settings))}
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 

@@ -44,8 +44,8 @@ def read_sections(path: Path, what: str = "parameter file") -> list[tuple[str, d
     content = read_yaml(path, what)
     if not isinstance(content, Mapping):
         # What the file holds is not shown: it may be none of ours.
-        found = None if content is None else f"content of type {type(content).__name__}"
-        raise ConfigurationError(what, found, f"sections by node, each with {PARAMETERS}", str(path))
+        shown = None if content is None else f"content of type {type(content).__name__}"
+        raise ConfigurationError(what, shown, f"sections by node, each with {PARAMETERS}", str(path))
     return list(_sections("", content, str(path)))
 
 
@@ -103,23 +103,24 @@ def load_setup(path: Path, classes: Sequence[type[Configuration]]) -> dict[str, 
     with errors_of_file(str(path)):
         for key, section in read_sections(path, "setup file"):
             above, _, group = key.rpartition("/")
-            own = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
+            section = {name: value for name, value in section.items() if name.split(".")[0] not in ROS_PARAMETERS}
             if key == EVERY_NODE:
-                for name in own.keys() - set(SHARED_PARAMETERS):
-                    expected = f"a shared parameter, {suggest_names(name, SHARED_PARAMETERS)}"
-                    where = f"{EVERY_NODE}.{name}"
-                    raise ConfigurationError(where, own[name], f"{expected}; others in their node's section")
+                for name in section:
+                    if name not in SHARED_PARAMETERS:
+                        expected = f"a shared parameter, {suggest_names(name, SHARED_PARAMETERS)}"
+                        expected += "; others in their node's section"
+                        raise ConfigurationError(f"{EVERY_NODE}.{name}", section[name], expected)
                 for group, cls in known.items():
-                    values[group].update((name, own[name]) for name in own.keys() & names_of(cls))
+                    values[group].update((name, section[name]) for name in section.keys() & names_of(cls))
                 continue
             if group not in known:
                 raise ConfigurationError(key, group, suggest_names(group, [EVERY_NODE, *known]))
             if above and "*" not in above and above != (space := space or above):
                 raise ConfigurationError(key, above, f"one namespace in a setup, as {space} before")
-            values[group].update(own)
+            values[group].update(section)
         return {group: from_mapping(cls, values[group]) for group, cls in known.items()}
 
 
 def names_of(cls: type[Configuration]) -> set[str]:
     """Return the names of the parameters of a configuration class."""
-    return {about.name for about in configuration_fields(cls)}
+    return {setting.name for setting in configuration_fields(cls)}

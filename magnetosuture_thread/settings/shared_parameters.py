@@ -106,7 +106,7 @@ class CoilDrivers(Configuration):
 
 
 SHARED = (SceneName, NeedleArc, NeedleWidth, CommandFilter, ThreadLength, Viscosity, CoilDrivers)
-SHARED_PARAMETERS = tuple(about.name for cls in SHARED for about in configuration_fields(cls))
+SHARED_PARAMETERS = tuple(setting.name for cls in SHARED for setting in configuration_fields(cls))
 """Names of the shared parameters."""
 
 
